@@ -10,29 +10,6 @@ costs next to nothing.
 
 from astropolcal.version import version as __version__
 
-__all__ = [
-    "Calibration",
-    "Diagnosis",
-    "Library",
-    "Observations",
-    "__version__",
-    "calibrate",
-    "chain",
-    "correct",
-    "diagnose",
-    "gap",
-    "half_wave_plate_cycles",
-    "instruments",
-    "load",
-    "materials",
-    "mueller",
-    "optics",
-    "plotting",
-    "reduce_cubes",
-    "simulate",
-    "standards",
-]
-
 _WHERE = {
     "Calibration": "calibration",
     "Diagnosis": "gap",
@@ -46,7 +23,7 @@ _WHERE = {
     "reduce_cubes": "reduction",
     "simulate": "simulation",
 }
-_MODULES = {
+_ROOMS = (
     "chain",
     "gap",
     "instruments",
@@ -55,13 +32,15 @@ _MODULES = {
     "optics",
     "plotting",
     "standards",
-}
+)
+
+__all__ = ["__version__", *_WHERE, *_ROOMS]
 
 
 def __getattr__(name):
     from importlib import import_module
 
-    if name in _MODULES:
+    if name in _ROOMS:
         return import_module(f"astropolcal.{name}")
     if name in _WHERE:
         return getattr(import_module(f"astropolcal.{_WHERE[name]}"), name)
@@ -70,4 +49,4 @@ def __getattr__(name):
 
 def __dir__():
     # a module that has been imported is among the globals, too
-    return sorted({*globals(), *_WHERE, *_MODULES})
+    return sorted({*globals(), *_WHERE, *_ROOMS})

@@ -19,7 +19,6 @@ from astropolcal.words import did_you_mean
 
 __all__ = [
     "IsotropicMaterial",
-    "Metal",
     "TabulatedLaw",
     "UniaxialMaterial",
     "get_material",
@@ -50,6 +49,11 @@ class SellmeierLaw:
             self.constant
             + sum(strength * square / (square - pole) for strength, pole in self.terms)
         ) ** 0.5
+
+
+def _sellmeier(*terms):
+    """Return a law of strengths and resonances (um)."""
+    return SellmeierLaw(tuple((strength, resonance**2) for strength, resonance in terms))
 
 
 def _range_um(limits, name):
@@ -342,9 +346,9 @@ class TabulatedLaw:
     An own ellipsometry of a mirror; `register_material` gives it a name:
 
     >>> import astropy.units as u
-    >>> from astropolcal.materials import Metal, TabulatedLaw
+    >>> from astropolcal.materials import IsotropicMaterial, TabulatedLaw
     >>> law = TabulatedLaw([1.1, 1.7, 2.4] * u.um, [0.3 + 7.5j, 0.5 + 11j, 0.8 + 15j])
-    >>> Metal("aged silver", law, measured_range=[1.1, 2.4] * u.um).index(1.4 * u.um)
+    >>> IsotropicMaterial("aged silver", law, measured_range=[1.1, 2.4] * u.um).index(1.4 * u.um)
     <Quantity 0.4+9.25j>
     """
 
@@ -370,70 +374,6 @@ class TabulatedLaw:
         return np.interp(wavelength_um, self._wavelength, self._index)
 
 
-class Metal(IsotropicMaterial):
-    """
-    A metal with a complex refractive index.
-
-    Parameters
-    ----------
-    name : str
-        What the metal is called in the registry and in messages.
-    law : BrendelBormannLaw or TabulatedLaw
-        Law of the index.
-    measured_range : `~astropy.units.Quantity`
-        The two ends of the wavelengths of the measurements behind the law.
-    valid_range : `~astropy.units.Quantity`, optional
-        The two ends between which the law is evaluated; the measured range
-        if left out.
-    doi : str
-        Source of the law.
-    aliases : tuple of str
-        Other names in the registry.
-
-    Raises
-    ------
-    ParameterError
-        If a range is not two positive, increasing wavelengths.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.materials import GOLD
-    >>> GOLD.index([1.2, 2.2] * u.um).round(2)
-    <Quantity [0.39 +7.56j, 0.97+14.03j]>
-    """
-
-    def permittivity(self, wavelength):
-        r"""
-        Return the complex permittivity :math:`\epsilon = (n + ik)^2`.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Wavelength in vacuum, any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Complex and dimensionless, of the shape of ``wavelength``.
-
-        Raises
-        ------
-        WavelengthRangeError
-            If a wavelength lies outside ``valid_range`` or is not a number.
-        ParameterError
-            If the wavelength has no unit of length.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.materials import SILVER
-        >>> SILVER.permittivity(1.6 * u.um).round(1)
-        <Quantity -107.6+8.9j>
-        """
-        return self.index(wavelength) ** 2
-
-
 _RAKIC = "10.1364/AO.37.005271"
 
 #: Silver; Rakić et al. 1998, Brendel-Bormann parameters, 0.1 to 5 eV.
@@ -441,7 +381,7 @@ _RAKIC = "10.1364/AO.37.005271"
 #: Films differ: at 1.6 um, n is 0.43 here, 0.27 in Yang et al. (2015,
 #: doi:10.1103/PhysRevB.91.235137) and 0.15 in Johnson & Christy (1972,
 #: doi:10.1103/PhysRevB.6.4370); k is 10.4, 11.3 and 11.8.
-SILVER = Metal(
+SILVER = IsotropicMaterial(
     "silver",
     BrendelBormannLaw(
         plasma=9.01,
@@ -463,7 +403,7 @@ SILVER = Metal(
 #:
 #: Films differ: at 1.6 um, n is 0.61 here and 0.34 in Olmon et al. (2012,
 #: evaporated, doi:10.1103/PhysRevB.86.235147); k is 10.2 and 11.0.
-GOLD = Metal(
+GOLD = IsotropicMaterial(
     "gold",
     BrendelBormannLaw(
         plasma=9.03,
@@ -482,7 +422,7 @@ GOLD = Metal(
 )
 
 #: Aluminium; Rakić et al. 1998, Brendel-Bormann parameters, 0.005 to 20 eV.
-ALUMINIUM = Metal(
+ALUMINIUM = IsotropicMaterial(
     "aluminium",
     BrendelBormannLaw(
         plasma=14.98,
@@ -525,20 +465,8 @@ QUARTZ = UniaxialMaterial(
 #: Dodge 1984, Appl. Opt. 23, 1980, doi:10.1364/AO.23.001980.
 MGF2 = UniaxialMaterial(
     "MgF2",
-    SellmeierLaw(
-        terms=(
-            (0.48755108, 0.04338408**2),
-            (0.39875031, 0.09461442**2),
-            (2.3120353, 23.793604**2),
-        )
-    ),
-    SellmeierLaw(
-        terms=(
-            (0.41344023, 0.03684262**2),
-            (0.50497499, 0.09076162**2),
-            (2.4904862, 23.771995**2),
-        )
-    ),
+    _sellmeier((0.48755108, 0.04338408), (0.39875031, 0.09461442), (2.3120353, 23.793604)),
+    _sellmeier((0.41344023, 0.03684262), (0.50497499, 0.09076162), (2.4904862, 23.771995)),
     measured_range=[0.2, 7.04] * u.um,
     doi="10.1364/AO.23.001980",
     aliases=("magnesium fluoride",),
@@ -549,13 +477,7 @@ MGF2 = UniaxialMaterial(
 #: Malitson 1965, J. Opt. Soc. Am. 55, 1205, doi:10.1364/JOSA.55.001205.
 FUSED_SILICA = IsotropicMaterial(
     "fused silica",
-    SellmeierLaw(
-        terms=(
-            (0.6961663, 0.0684043**2),
-            (0.4079426, 0.1162414**2),
-            (0.8974794, 9.896161**2),
-        )
-    ),
+    _sellmeier((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161)),
     measured_range=[0.21, 3.71] * u.um,
     doi="10.1364/JOSA.55.001205",
     aliases=("silica", "silica glass", "vitreous silica"),
@@ -568,13 +490,7 @@ FUSED_SILICA = IsotropicMaterial(
 #: infrared, that of the crystal 1.75.
 AL2O3 = IsotropicMaterial(
     "Al2O3",
-    SellmeierLaw(
-        terms=(
-            (1.023798, 0.06144821**2),
-            (1.058264, 0.1106997**2),
-            (5.280792, 17.92656**2),
-        )
-    ),
+    _sellmeier((1.023798, 0.06144821), (1.058264, 0.1106997), (5.280792, 17.92656)),
     measured_range=[0.2652, 5.577] * u.um,
     doi="10.1364/JOSA.52.001377",
     aliases=("alumina", "sapphire", "aluminium oxide", "aluminum oxide"),
@@ -585,7 +501,7 @@ AL2O3 = IsotropicMaterial(
 #: Luke et al. 2015, Opt. Lett. 40, 4823, doi:10.1364/OL.40.004823.
 SI3N4 = IsotropicMaterial(
     "Si3N4",
-    SellmeierLaw(terms=((3.0249, 0.1353406**2), (40314.0, 1239.842**2))),
+    _sellmeier((3.0249, 0.1353406), (40314.0, 1239.842)),
     measured_range=[0.310, 5.504] * u.um,
     doi="10.1364/OL.40.004823",
     aliases=("silicon nitride",),
@@ -623,7 +539,7 @@ def register_material(material):
     >>> import astropy.units as u
     >>> from astropolcal import materials
     >>> law = materials.TabulatedLaw([0.9, 2.5] * u.um, [0.2 + 6j, 0.8 + 16j])
-    >>> mine = materials.Metal("mirror of 2025", law, measured_range=[0.9, 2.5] * u.um)
+    >>> mine = materials.IsotropicMaterial("mirror of 2025", law, measured_range=[0.9, 2.5] * u.um)
     >>> materials.register_material(mine)
     >>> materials.get_material("mirror of 2025") is mine
     True
@@ -665,7 +581,7 @@ def get_material(name):
     >>> get_material("SiO2")
     <UniaxialMaterial 'quartz', 0.198 to 2.5 um, doi:10.1016/S0030-4018(99)00091-7>
     >>> get_material("Ag")
-    <Metal 'silver', 0.248 to 12.398 um, doi:10.1364/AO.37.005271>
+    <IsotropicMaterial 'silver', 0.248 to 12.398 um, doi:10.1364/AO.37.005271>
     """
     if str(name).strip().startswith(DATABASE_PREFIX):
         return database_material(str(name).strip())

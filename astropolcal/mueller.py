@@ -28,11 +28,10 @@ def _mueller_array(matrix, name="matrix"):
     matrix = to_unit(matrix, None, name)
     if matrix.shape[-2:] != (4, 4):
         raise ParameterError(f"{name} has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
-    if not np.isfinite(matrix).all():
-        where = np.unravel_index(np.argmin(np.isfinite(matrix)), matrix.shape)
-        raise ParameterError(
-            f"{name} = {matrix[where]} at index {tuple(int(i) for i in where)} must be finite"
-        )
+    bad = np.argwhere(~np.isfinite(matrix)).tolist()
+    if bad:
+        where = tuple(bad[0])
+        raise ParameterError(f"{name} = {matrix[where]} at index {where} must be finite")
     return matrix
 
 
@@ -73,33 +72,17 @@ def _rotate(matrix, theta):
 
 def _linear_retarder(retardance):
     """Return a linear retarder for floats in radian."""
-    retardance = np.asarray(retardance, dtype=float)
-    sine = np.sin(retardance)
-    matrix = np.zeros((*retardance.shape, 4, 4))
-    matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
-    matrix[..., 2, 2] = matrix[..., 3, 3] = np.cos(retardance)
-    matrix[..., 2, 3] = sine
-    matrix[..., 3, 2] = -sine
-    return matrix
-
-
-def _diattenuator(diattenuation):
-    """Return a linear diattenuator, unchecked."""
-    return _diattenuator_retarder(diattenuation, 0.0)
+    return _diattenuator_retarder(0.0, retardance)
 
 
 def _diattenuator_retarder(diattenuation, retardance):
     """Return a linear diattenuator-retarder for floats, radian."""
-    diattenuation = np.asarray(diattenuation, dtype=float)
-    # the product keeps the digits that 1 - D^2 loses near D = 1
-    transverse = np.sqrt((1 - diattenuation) * (1 + diattenuation))
-    cosine, sine = transverse * np.cos(retardance), transverse * np.sin(retardance)
-    matrix = np.zeros((*np.shape(cosine), 4, 4))
+    diattenuation, retardance = (np.asarray(x, float) for x in (diattenuation, retardance))
+    transverse = transverse_share(diattenuation)
+    matrix = blank(diattenuation, retardance)
     matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
     matrix[..., 0, 1] = matrix[..., 1, 0] = diattenuation
-    matrix[..., 2, 2] = matrix[..., 3, 3] = cosine
-    matrix[..., 2, 3] = sine
-    matrix[..., 3, 2] = -sine
+    fill_phase_block(matrix, transverse * np.cos(retardance), transverse * np.sin(retardance))
     return matrix
 
 
@@ -172,7 +155,7 @@ def rotate(matrix, angle):
 
 def linear_polarizer():
     """Return an ideal polarizer that passes +Q and half of unpolarized light."""
-    return 0.5 * _diattenuator(1.0)
+    return 0.5 * _diattenuator_retarder(1.0, 0.0)
 
 
 def diattenuator(diattenuation):
@@ -181,7 +164,7 @@ def diattenuator(diattenuation):
 
     Positive where +Q passes better, of unit transmission for unpolarized light.
     """
-    return _diattenuator(_fraction(diattenuation, "diattenuation"))
+    return diattenuator_retarder(diattenuation, 0 * u.rad)
 
 
 def linear_retarder(retardance):
@@ -329,10 +312,7 @@ def retardance_slope(retardance):
     """Return the derivative of a linear retarder to its retardance."""
     out = blank(retardance)
     # of the block [[cos, sin], [-sin, cos]] of (U, V)
-    out[..., 2, 2] = out[..., 3, 3] = -np.sin(retardance)
-    cosine = np.cos(retardance)
-    out[..., 2, 3] = cosine
-    out[..., 3, 2] = -cosine
+    fill_phase_block(out, -np.sin(retardance), np.cos(retardance))
     return out
 
 
@@ -467,16 +447,14 @@ def retardance_vector(matrix):
     to the depolarizer.
     """
     matrix = _transmitting(matrix)
-    mean = matrix[..., :1, :1]
-    row, column = matrix[..., 0, 1:] / mean[..., 0], matrix[..., 1:, 0] / mean[..., 0]
+    matrix = matrix / matrix[..., :1, :1]
+    row, column = matrix[..., 0, 1:], matrix[..., 1:, 0]
     strength = np.linalg.norm(row, axis=-1, keepdims=True)
     if (strength > 1 + _EXCESS).any():
         raise ParameterError(f"diattenuation = {strength.max()} must be at most 1")
-    axis = _unit(row, np.array([1.0, 0.0, 0.0]))
-    pure = strength >= 1 - _POLARIZER
-    block = _without_diattenuator(
-        matrix[..., 1:, 1:] / mean, column, axis, np.where(pure, 0.0, strength)
-    )
+    axis, pure = _unit(row, np.array([1.0, 0.0, 0.0])), strength >= 1 - _POLARIZER
+    attenuation = np.where(pure, 0.0, strength)
+    block = _without_diattenuator(matrix[..., 1:, 1:], column, axis, attenuation)
     turn = _smallest_rotation(axis, _unit(column, axis))
     return _rotation_vector(np.where(pure[..., None], turn, _polar_rotation(block))) * u.rad
 

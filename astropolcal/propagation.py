@@ -166,11 +166,9 @@ class Propagator:
         return Sweep(self, self._own_values() if values is None else values)
 
     def _own_values(self):
-        """Return the chain's values; refuse those that are on another wavelength grid."""
-        values = self.values()
-        for leaf, own in zip(self.leaves, values, strict=True):
-            leaf._check_grid(self.wavelength, own)
-        return values
+        """Return the chain's values at the wavelengths; refuse those known at other ones only."""
+        pairs = zip(self.leaves, self.values(), strict=True)
+        return [leaf.values_at(self.wavelength, own) for leaf, own in pairs]
 
 
 def splits(found):

@@ -8,6 +8,7 @@ own tests.
 
 import inspect
 import io
+import re
 import warnings
 from dataclasses import dataclass, field
 
@@ -62,36 +63,33 @@ def optic_names(chain):
     return [leaf.name for leaf in leaves(chain)]
 
 
+def limits(parameter):
+    """Return the bounds of a parameter as numbers."""
+    low, high = parameter.bounds
+    return -np.inf if low is None else low, np.inf if high is None else high
+
+
 def check_values(label, chain, size):
     """Require values that are finite, within their bounds and as many as the wavelengths."""
     for leaf in leaves(chain):
         for key in leaf.param_names:
-            parameter, name = getattr(leaf, key), f"{label}: {leaf.name}.{key}"
-            value = np.asarray(parameter.value)
-            low, high = (
-                np.inf * sign if bound is None else bound
-                for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
-            )
+            name, value = f"{label}: {leaf.name}.{key}", np.asarray(getattr(leaf, key).value)
+            low, high = limits(getattr(leaf, key))
             good = np.isfinite(value) & (value >= low) & (value <= high)
-            require(
-                good.all(), f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
-            )
-            require(
-                value.size in (1, size), f"{name} has {value.size} values; allowed are 1 or {size}"
-            )
+            outside = f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
+            require(good.all(), outside)
+            words = f"{name} has {value.size} values; allowed are 1 or {size}"
+            require(value.size in (1, size), words)
 
 
 def check_keyword(column, keyword):
     """Require a keyword of FITS, perhaps a hierarchical one."""
     require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
-    plain = keyword.replace("-", "").replace("_", "")
-    short = len(keyword) <= 8 and plain.isalnum()
     # a keyword of several words is a hierarchical one
     words = keyword.split(" ")
-    long = len(words) > 1 and all(w.replace("-", "").replace("_", "").isalnum() for w in words)
-    require(
-        keyword == keyword.upper() and (short or long), f"{column}: {keyword!r} is no FITS keyword"
-    )
+    known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
+    short = len(keyword) <= 8 or len(words) > 1
+    require(known and short, f"{column}: {keyword!r} is no FITS keyword")
 
 
 def check_same(source, optic, old, new):
@@ -125,21 +123,17 @@ def read_back(chain):
 
 def moved_value(parameter, rng):
     """Return a value of a parameter a little off, within its bounds."""
-    low, high = (
-        np.inf * sign if bound is None else bound
-        for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
-    )
-    value = np.asarray(parameter.value, dtype=float)
-    angle = parameter.unit is not None and parameter.unit.is_equivalent(u.rad)
+    low, high = limits(parameter)
+    value, unit = np.asarray(parameter.value, dtype=float), parameter.unit
     step = rng.normal(size=value.shape)
-    if angle:
-        step = (_MOVED * step * u.rad).to_value(parameter.unit)
+    if unit is not None and unit.is_equivalent(u.rad):
+        step = (_MOVED * step * u.rad).to_value(unit)
     else:
-        step = step * (_MOVED if parameter.unit is None else _MOVED_SHARE * np.abs(value))
+        step = step * (_MOVED if unit is None else _MOVED_SHARE * np.abs(value))
     # at a bound the other way, so that every free parameter moves
     moved = np.where((value + step < low) | (value + step > high), value - step, value + step)
     moved = np.clip(moved, low, high)
-    return moved if parameter.unit is None else moved * parameter.unit
+    return moved if unit is None else moved * unit
 
 
 # optics behind which nothing is left of what polarization the light had
@@ -177,13 +171,10 @@ class Probe:
             require(instrument.answers_to(spelled), f"it does not answer to {spelled!r}")
 
     def check_documentation(self):
-        cls = type(self.instrument)
+        cls, references = type(self.instrument), self.instrument.references
         require((cls.__dict__.get("__doc__") or "").strip(), f"class {cls.__name__}: no docstring")
-        references = self.instrument.references
-        require(
-            not isinstance(references, str) and len(references) > 0,
-            f"references = {references!r}; a tuple of at least one text is needed",
-        )
+        words = f"references = {references!r}; a tuple of at least one text is needed"
+        require(not isinstance(references, str) and len(references) > 0, words)
         require(all(str(text).strip() for text in references), "one of its references is empty")
 
     def check_wavelengths(self):
@@ -228,7 +219,7 @@ class Probe:
 
     def check_names(self):
         for source, chain in self.chains():
-            found = [leaf.name for leaf in leaves(chain)]
+            found = optic_names(chain)
             require(all(found), f"{source}: an optic has no name: {found}")
             odd = [name for name in found if not name.replace("-", "_").isidentifier()]
             require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
@@ -262,13 +253,8 @@ class Probe:
             require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
 
     def _positions(self, chain, n=16):
-        found = {}
-        for stage in stages(chain):
-            number = stage in COORDINATES
-            found[stage] = (
-                self.rng.uniform(0.1, 1, n) * (1 if number else 180) * (u.one if number else u.deg)
-            )
-        return found
+        draws = {stage: self.rng.uniform(0.1, 1, n) for stage in stages(chain)}
+        return {s: x * u.one if s in COORDINATES else 180 * x * u.deg for s, x in draws.items()}
 
     def check_on_sky(self):
         if not self.instrument.has_telescope:
@@ -291,19 +277,13 @@ class Probe:
         kept = [leaf.name for leaf in inner[first:]]
         lights = [o.name for o in found if isinstance(o, _LIGHTS) and o.name not in kept]
         require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
-        require(
-            names[-len(kept) :] == kept,
-            f"{source}: on sky there are {', '.join(names)}; the last must be {', '.join(kept)}",
-        )
+        words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
+        require(names[-len(kept) :] == kept, f"{source}: {words}")
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
-        require(
-            "parallactic" in front,
-            f"{source}: no optic in front of {kept[0]} stands on the stage parallactic",
-        )
-        require(
-            optic_names(self.instrument.on_sky(sky)) == names,
-            f"{source}: a chain from the sky gets another telescope",
-        )
+        words = f"no optic in front of {kept[0]} stands on the stage parallactic"
+        require("parallactic" in front, f"{source}: {words}")
+        again = optic_names(self.instrument.on_sky(sky))
+        require(again == names, f"{source}: a chain from the sky gets another telescope")
 
     # ---- tables and headers
 
@@ -312,16 +292,11 @@ class Probe:
         known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
         for source, chain in self.chains():
             angles = [s for s in stages(chain) if s not in COORDINATES]
-            lost = [s for s in angles if s not in known]
-            require(
-                not lost,
-                f"{source}: the stage {', '.join(lost)} is no column of tables and in no keyword; "
-                f"known are {', '.join(sorted(known))}",
-            )
-            require(
-                not is_star(source) or self.instrument.location is not None or not angles,
-                f"{source}: a star needs the site of the telescope",
-            )
+            lost = ", ".join(s for s in angles if s not in known)
+            words = f"the stage {lost} is no column of tables and in no keyword; known are "
+            require(not lost, f"{source}: {words}{', '.join(sorted(known))}")
+            placed = not is_star(source) or self.instrument.location is not None or not angles
+            require(placed, f"{source}: a star needs the site of the telescope")
 
     def check_headers(self):
         keywords, layout = self.instrument.keywords, self.instrument.files
@@ -392,9 +367,8 @@ class Probe:
         largest = 0.0
         for source, chain in self.chains(self.few):
             observations = self._observe(chain, source, noise=False)
-            measurement = Measurement(
-                chain, observations, positions=[self.instrument.positions(observations, chain)]
-            )
+            positions = [self.instrument.positions(observations, chain)]
+            measurement = Measurement(chain, observations, positions=positions)
             off = np.abs(measurement.residuals()).max()
             require(
                 off < 1e-9,
@@ -402,11 +376,9 @@ class Probe:
                 "do stages stand where its positions say?",
             )
             left = 1.0 if observations.single_beam else observations.flux_left
-            change = np.ptp(observations.flux_right / left) / np.mean(
-                observations.flux_right / left
-            )
+            ratio = observations.flux_right / left
             # an unpolarized lamp may give the same in all frames; one source that varies is enough
-            largest = max(largest, float(change))
+            largest = max(largest, float(np.ptp(ratio) / np.mean(ratio)))
         require(largest > 1e-6, "no source gives fluxes that change with the modulator")
 
     def check_calibrates(self):
@@ -459,16 +431,9 @@ class Probe:
             if column != "beam":
                 frames = frames[np.repeat(np.arange(len(frames)), len(states))]
                 frames[column] = np.tile(states, len(frames) // len(states))
-        return simulate(
-            chain,
-            self.few if grid is None else grid,
-            frames,
-            flux=1e8,
-            noise=noise,
-            seed=self.seed,
-            meta=meta,
-            name=f"simulated {source}",
-        )
+        settings = {"flux": 1e8, "noise": noise, "seed": self.seed, "meta": meta}
+        grid = self.few if grid is None else grid
+        return simulate(chain, grid, frames, name=f"simulated {source}", **settings)
 
     def _frames(self, chain, shift):
         # a derotator that turns by 75 deg sees both of its axes; six cycles are enough for a fit
@@ -543,8 +508,8 @@ class Conformance:
 
     def __str__(self):
         count = len(self.passed) + len(self.failed)
-        words = f"fails {len(self.failed)} of {count} rules" if self.failed else "passes"
-        lines = [f"{self.name} {words}" + ("" if self.failed else f" {count} rules")]
+        words = f"fails {len(self.failed)} of {count}" if self.failed else f"passes {count}"
+        lines = [f"{self.name} {words} rules"]
         lines += [f"- {rule}: {what}" for rule, what in self.failed.items()]
         lines += [f"- {rule} not checked: {why}" for rule, why in self.skipped.items()]
         return "\n".join(lines)

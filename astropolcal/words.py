@@ -4,6 +4,7 @@ Words that messages share: near matches of a name, and numbers with their nouns.
 """
 
 import difflib
+from html import escape
 
 __all__ = []
 
@@ -27,3 +28,9 @@ def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
 def counted(number, noun, plural=None):
     """Return a number and its noun, which is singular for one only: "1 frame", "0 frames"."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def html(text, table=None):
+    """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
+    shown = "" if table is None else table._repr_html_()
+    return f"<p>{escape(text.removeprefix('<').removesuffix('>'))}</p>{shown}"

@@ -30,7 +30,7 @@ MAX_MODULE_LINES = 600
 MAX_FUNCTION_LINES = 60
 # these were longer when the limit was set; the list may only shrink
 LONG_MODULES = set()
-LONG_FUNCTIONS = {"scripts/_challenge.py: add_parser"}
+LONG_FUNCTIONS = set()
 
 FORBIDDEN_IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve"}
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load"}

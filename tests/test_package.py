@@ -22,9 +22,8 @@ def test_no_more_names_than_a_user_keeps_in_mind():
 
 def test_every_name_knows_where_it_comes_from():
     """What is listed is what is looked up, and nothing else."""
-    known = {*astropolcal._WHERE, *astropolcal._MODULES, "__version__"}
+    known = {*astropolcal._WHERE, *astropolcal._ROOMS, "__version__"}
     assert known == set(astropolcal.__all__)
-    assert astropolcal.__all__ == sorted(astropolcal.__all__)
 
 
 def test_name_is_that_of_its_module():
@@ -37,7 +36,7 @@ def test_name_is_that_of_its_module():
 def test_modules_are_attributes_without_an_import_of_their_own():
     """In a process in which nothing else has imported them."""
     code = "import astropolcal; print(*(getattr(astropolcal, n).__name__ for n in {!r}))"
-    names = sorted(astropolcal._MODULES)
+    names = sorted(astropolcal._ROOMS)
     command = [sys.executable, "-c", code.format(names)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [f"astropolcal.{name}" for name in names]

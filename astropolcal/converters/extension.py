@@ -108,9 +108,27 @@ class OpticConverter(Converter):
         return optic_from_node(self.name, node)
 
 
+class ChainConverter(Converter):
+    """Leave chains to the converter of astropy's compound models, which are read as chains."""
+
+    tags = ()
+    types = ["astropolcal.optics._modelling.Chain"]
+
+    def select_tag(self, obj, tags, ctx):
+        return None
+
+    def to_yaml_tree(self, obj, tag, ctx):
+        from astropy.modeling import CompoundModel
+
+        return CompoundModel(obj.op, obj.left, obj.right, name=obj.name)
+
+    def from_yaml_tree(self, node, tag, ctx):
+        raise NotImplementedError
+
+
 def get_converters():
-    """Return the converter of calibrations, and one for each class of optics."""
-    return [CalibrationConverter(), *map(OpticConverter, OPTIC_MODULES)]
+    """Return the converters of calibrations and of chains, and one for each class of optics."""
+    return [CalibrationConverter(), ChainConverter(), *map(OpticConverter, OPTIC_MODULES)]
 
 
 def get_resource_mappings():

@@ -7,6 +7,7 @@ and the settings that rebuild it (name, mount, beam and what else its class has)
 its stage belongs to a frame and is not stored.
 """
 
+import astropy.units as u
 import numpy as np
 
 from astropolcal.converters.nodes import prior_from_node, prior_node
@@ -53,6 +54,8 @@ def _parameter_node(optic, key):
     node = {"value": _stored(np.reshape(parameter.value, parameter.shape), label)}
     if declared is not None:
         node["unit"] = declared.to_string()
+    if parameter.grid is not None:
+        node["wavelength"] = np.array(parameter.grid)
     node |= {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
     known = {} if parameter.prior is None else {"prior": prior_node(parameter.prior, label)}
     return node | known
@@ -89,13 +92,13 @@ def optic_from_node(name, node):
         parameter = getattr(optic, key)
         parameter.fixed = entry["fixed"]
         parameter.bounds = tuple(entry["bounds"])
+        if "wavelength" in entry:
+            parameter.wavelength = np.array(entry["wavelength"]) * u.um
         if "prior" in entry:
             parameter.prior = prior_from_node(entry["prior"], f"{node.get('name')}.{key}")
     return optic
 
 
 def _value(entry):
-    import astropy.units as u
-
     value = np.array(entry["value"], dtype=float)
     return value * u.Unit(entry["unit"]) if "unit" in entry else value

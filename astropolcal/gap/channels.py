@@ -15,6 +15,7 @@ share its brightness, a number for each wavelength.
 """
 
 import numpy as np
+from scipy.linalg import qr
 
 from astropolcal.exceptions import FitError
 from astropolcal.observations.quality import MAD_TO_SIGMA
@@ -418,5 +419,6 @@ def orthonormal(columns, keep=1e-9):
     columns = columns[:, norm > 0] / norm[norm > 0]
     if not columns.shape[1]:
         return np.zeros((len(columns), 0))
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > keep * singular[0]]
+    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
+    size = np.abs(np.diag(triangle))
+    return basis[:, : len(size)][:, size > keep * size[0]]

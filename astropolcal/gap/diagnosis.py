@@ -22,7 +22,7 @@ from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
-from astropolcal.words import counted
+from astropolcal.words import counted, html
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
@@ -183,6 +183,11 @@ class Diagnosis:
             f"<Diagnosis: {self.verdict} ({names}); gap {self.gap_before_percent:.3g} % -> "
             f"{self.gap_after_percent:.3g} %>"
         )
+
+    def _repr_html_(self):
+        from astropolcal.gap.report import causes_table
+
+        return html(repr(self), causes_table(self))
 
 
 def _gap_of_fit(model):

@@ -167,9 +167,9 @@ def foreseen(model, groups):
         rows, scale = np.concatenate(rows), np.concatenate(scale)
         if not rows.size:
             continue
-        left, share, _ = np.linalg.svd(tangent[rows], full_matrices=False)
+        lever, left = np.linalg.eigh(tangent[rows] @ tangent[rows].T)
         # what the group alone determines cannot be foreseen at all; it is not counted
-        lever = np.minimum(share**2, _MOST_LEVER)
+        lever = np.clip(lever, 0.0, _MOST_LEVER)
         gap = residual[rows] + left @ ((lever / (1 - lever)) * (left.T @ residual[rows]))
         squares[i] = np.sum((gap * scale) ** 2)
         whitened[i] = np.sum(gap**2) / problem.channels[0].count

@@ -18,24 +18,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.layout import FileLayout, frame_time
-from astropolcal.instruments.telescope import (
-    CHANGES,
-    INTERNAL,
-    M3_MODELS,
-    SITE,
-    STARS,
-    fold_mirror,
-    k_mirror,
-    misaligned,
-    polarizer,
-    published_mirror,
-    star_source,
-    telescope,
-    tertiary_mirror,
-    two_layer_plate,
-)
 from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
@@ -129,16 +114,16 @@ class CHARIS(Instrument):
         star_offset=(63.5, 33.1),
         pixel_scale=16.2,
         edge=1.0,
-        site=SITE,
+        site=subaru.SITE,
     )
     references = (
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher",
         "'t Hart et al. 2021, Proc. SPIE 11833",
         "van Holstein et al. 2020, Proc. SPIE 11447",
     )
-    sources = (*INTERNAL, *STARS)
+    sources = (*subaru.INTERNAL, *subaru.STARS)
     optional_optics = ("nbs", "dichroic")
-    changes = CHANGES
+    changes = subaru.CHANGES
 
     def chain(
         self,
@@ -206,19 +191,15 @@ class CHARIS(Instrument):
         >>> chain["derotator"].retardance.shape
         (22,)
         """
-        self.check_choices(
-            source,
-            optics_in,
-            derotator=(derotator, ("elliptical", "linear", "kmirror")),
-            bounds=(bounds, tuple(_BOUNDS)),
-            m3=(m3, M3_MODELS),
-        )
+        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(_BOUNDS))}
+        self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
         grid = self.grid(wavelength)
-        train = [polarizer() if source == "polarized" else fold_mirror(grid.size)]
-        if source in STARS:
-            light = star_source(source, grid, star, target)
-            train = [light, *telescope(tertiary_mirror(m3, grid))]
-        train += [two_layer_plate(**misaligned(0)), _derotator(grid, derotator, _BOUNDS[bounds])]
+        train = subaru.entrance(source, grid, star, target, subaru.tertiary_mirror(m3, grid))
+        # the published retardances, in our sign, are where a fit starts
+        nm = CHARIS.wavelength.to_value(u.nm)
+        start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
+        train.append(subaru.two_layer_plate(**subaru.misaligned(0)))
+        train.append(subaru.derotator(derotator, start, _BOUNDS[bounds]))
         if "dichroic" in optics_in:
             # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
@@ -229,7 +210,7 @@ class CHARIS(Instrument):
 
     def telescope_optics(self, behind):
         """Return the telescope with the tertiary mirror that is published."""
-        return telescope(published_mirror())
+        return subaru.telescope(subaru.published_mirror())
 
     def published(self):
         """
@@ -272,7 +253,7 @@ class CHARIS(Instrument):
 
     def published_mirrors(self):
         """Return the law of M3 that is published, see ``published_mirror``."""
-        return {"m3": {"McIntosh et al. (2026)": published_mirror()}}
+        return {"m3": {"McIntosh et al. (2026)": subaru.published_mirror()}}
 
     def setup(self, observations):
         """
@@ -296,13 +277,10 @@ class CHARIS(Instrument):
             If the meta do not say, or name a source that is unknown.
         """
         meta, name = observations.meta, observations.name
+        inside = _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False})
+        present = {"dichroic": inside, "nbs": _beam_switcher(meta, name)}
         source = self.source_of(observations)
-        present = []
-        if _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False}):
-            present.append("dichroic")
-        if _beam_switcher(meta, name):
-            present.append("nbs")
-        return source, tuple(present)
+        return source, tuple(optic for optic, there in present.items() if there)
 
     def mode_header(self, wavelength):
         """Return the keyword of the mode, see the method of `Instrument`."""
@@ -357,23 +335,3 @@ def _switcher_by(day):
         return False
     # between the two runs it was installed on a day that no table tells
     return True if day >= _NBS_PRESENT_FROM else None
-
-
-def _derotator(grid, kind, bounds):
-    # the published retardances, in our sign, are where a fit starts
-    nm = CHARIS.wavelength.to_value(u.nm)
-    start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
-    settings = misaligned(0) | {"mount": "derotator", "name": "derotator"}
-    if kind == "kmirror":
-        return k_mirror(**settings)
-    if kind == "linear":
-        settings["bounds"] |= {"retardance": bounds["horizontal"]}
-        return optics.LinearRetarder(retardance=start, **settings)
-    settings["bounds"] |= bounds
-    # a start inside every set of bounds, off the point where the two small ones vanish
-    return optics.EllipticalRetarder(
-        horizontal=start,
-        diagonal=np.full(grid.size, -1.0) * u.deg,
-        circular=np.full(grid.size, 1.0) * u.deg,
-        **settings,
-    )

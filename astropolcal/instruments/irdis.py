@@ -24,7 +24,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
-from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
+from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
@@ -94,16 +94,13 @@ def frame_table(headers, location, filters, law):
     stars = [_PARALLACTIC in frame for frame in frames]
     if len(set(stars)) > 1:
         raise ObservationError(f"frame {stars.index(False)}: no keyword {_PARALLACTIC}")
-    shared = (
-        {_filter(frame, filters) for frame in frames},
-        {_tracking(frame, stars[0]) for frame in frames},
-    )
-    for what, found in zip(("filters", "kinds of tracking"), shared, strict=True):
+    bands = {_filter(frame, filters) for frame in frames}
+    trackings = {_tracking(frame, stars[0]) for frame in frames}
+    for what, found in (("filters", bands), ("kinds of tracking", trackings)):
         if len(found) > 1:
-            raise ObservationError(
-                f"frames of several {what}: {', '.join(sorted(map(str, found)))}"
-            )
-    (band,), (tracking,) = shared
+            names = ", ".join(sorted(map(str, found)))
+            raise ObservationError(f"frames of several {what}: {names}")
+    (band,), (tracking,) = bands, trackings
     rows = [_row(frame, tracking, location if stars[0] else None) for frame in frames]
     _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, law)
     table = QTable({key: [row[key] for row in rows] for key in rows[0]})
@@ -280,27 +277,14 @@ def _column(name, index):
     return _DATA[name][index]
 
 
-def _near(about):
-    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
-
-
-def half_wave_plate(index):
-    """Return the half-wave plate."""
-    return _retarder(index, "hwp")
-
-
 def _retarder(index, name):
+    """Return the half-wave plate or the derotator, by the name of its stage."""
     theta = _DATA.meta[f"{name}_theta_deg"]
-    held = _near(theta)
+    held = misaligned(theta)
     held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
-    return optics.DiattenuatorRetarder(
-        diattenuation=_column(f"{name}_diattenuation", index),
-        retardance=_column(f"{name}_retardance", index),
-        theta=theta * u.deg,
-        mount=name,
-        name=name,
-        **held,
-    )
+    values = {key: _column(f"{name}_{key}", index) for key in ("diattenuation", "retardance")}
+    settings = {"theta": theta * u.deg, "mount": name, "name": name}
+    return optics.DiattenuatorRetarder(**values, **settings, **held)
 
 
 def derotator(index):
@@ -313,15 +297,14 @@ def derotator(index):
 
 def polarizers(index):
     """Return the pair of polarizers before the halves of the detector."""
+    efficiency = _column("polarizer_efficiency", index)
     # the left beam passes +Q
-    return optics.WollastonPrism(
-        efficiency=_column("polarizer_efficiency", index), theta=90 * u.deg, name="wollaston"
-    )
+    return optics.WollastonPrism(efficiency=efficiency, theta=90 * u.deg, name="wollaston")
 
 
 def calibration_polarizer():
     """Return the polarizer of the internal source."""
-    return optics.LinearPolarizer(name="calibration_polarizer", **_near(0))
+    return optics.LinearPolarizer(name="calibration_polarizer", **misaligned(0))
 
 
 def telescope(index, coating):
@@ -449,7 +432,7 @@ class IRDIS(Instrument):
         grid = self.grid(wavelength)
         # published coefficients are of filters: nothing is interpolated between them
         index = filters_at(grid)
-        common = [half_wave_plate(index), derotator(index), polarizers(index)]
+        common = [_retarder(index, "hwp"), derotator(index), polarizers(index)]
         if source == "polarized":
             return join([calibration_polarizer(), *common])
         if source == "unpolarized":
@@ -507,8 +490,7 @@ class IRDIS(Instrument):
         """
         if wavelength is None:
             check_all_filters(behind)
-        index = filters_at(self.grid(wavelength))
-        return telescope(index, coating_of(coating, date))
+        return telescope(filters_at(self.grid(wavelength)), coating_of(coating, date))
 
     def setup(self, observations):
         """Return the source from the table's meta, and no optional optics."""

@@ -65,16 +65,12 @@ def tertiary_mirror(model, wavelength, name="m3"):
     around 1. All are ``mounted``.
     """
     if model == "power law":
-        bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
         # the bounds of the paper, half to twice its start
+        bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
         return mounted(optics.PowerLawMirror(name=name, bounds=bounds, **_START))
     if model == "metal":
-        free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
-        bounds = {"film_thickness": (0, 500), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
-        mirror = optics.MetalMirror(
-            material="silver", film_thickness=_FILM_START, name=name, fixed=free, bounds=bounds
-        )
-        return mounted(_with_metal_priors(mirror))
+        settings = {"material": "silver", "film_thickness": _FILM_START, "name": name}
+        return mounted(_metal(optics.MetalMirror, 500, **settings))
     mirror = optics.DiattenuatorRetarder(
         diattenuation=np.full(wavelength.size, 0.01),
         retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
@@ -84,22 +80,21 @@ def tertiary_mirror(model, wavelength, name="m3"):
     return mounted(mirror)
 
 
-def k_mirror(*, fixed, bounds, **settings):
+def k_mirror(**settings):
     """
     Return a derotator of three silver mirrors with films of silica, ready to be calibrated.
 
     Free are the thickness of the films and factors on n and k of silver, with normal priors of 0.5
     and 0.1 around 1, and what else ``fixed`` and ``bounds`` say; ``settings`` are of the optic.
     """
+    return _metal(optics.KMirror, 600, film_thickness=_DEROTATOR_FILM, **settings)
+
+
+def _metal(kind, thickest, *, fixed=(), bounds=(), **settings):
+    """Return mirrors with a film of up to so many nm, whose indices have priors."""
     free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
-    limits = {"film_thickness": (0, 600), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
-    mirror = optics.KMirror(
-        film_thickness=_DEROTATOR_FILM, fixed=free | fixed, bounds=limits | bounds, **settings
-    )
-    return _with_metal_priors(mirror)
-
-
-def _with_metal_priors(mirror):
+    limits = {"film_thickness": (0, thickest), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
+    mirror = kind(fixed=free | dict(fixed), bounds=limits | dict(bounds), **settings)
     mirror.n_scale.prior, mirror.k_scale.prior = _normal(1, _N_SPREAD), _normal(1, _K_SPREAD)
     return mirror
 
@@ -233,11 +228,8 @@ def _check_standard(source, target):
                 f"{target} as a polarized standard star: {error}; with the source 'star' its "
                 "polarization is fitted without a prior"
             ) from error
-        warnings.warn(
-            f"{error}; it is unpolarized because the table says so",
-            AstropolcalWarning,
-            stacklevel=2,
-        )
+        words = f"{error}; it is unpolarized because the table says so"
+        warnings.warn(words, AstropolcalWarning, stacklevel=2)
         return
     if not source.startswith(known.kind):
         raise InstrumentError(
@@ -310,3 +302,28 @@ def polarizer():
 def fold_mirror(size):
     """Return the mirror that polarizes the lamp where the polarizer is out."""
     return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))
+
+
+def entrance(source, grid, star, target, mirror):
+    """Return what stands before the half-wave plate: source, and for a star the telescope."""
+    if source in STARS:
+        return [star_source(source, grid, star, target), *telescope(mirror)]
+    return [polarizer() if source == "polarized" else fold_mirror(grid.size)]
+
+
+#: The models of the derotator.
+DEROTATORS = ("elliptical", "linear", "kmirror")
+
+
+def derotator(kind, start, bounds):
+    """Return a derotator of one of `DEROTATORS`, whose retardance starts so."""
+    settings = misaligned(0) | {"mount": "derotator", "name": "derotator"}
+    if kind == "kmirror":
+        return k_mirror(**settings)
+    if kind == "linear":
+        settings["bounds"] |= {"retardance": bounds["horizontal"]}
+        return optics.LinearRetarder(retardance=start, **settings)
+    settings["bounds"] |= bounds
+    # a start inside the bounds, off the point where the two small ones vanish
+    small = np.full(len(start), 1.0) * u.deg
+    return optics.EllipticalRetarder(horizontal=start, diagonal=-small, circular=small, **settings)

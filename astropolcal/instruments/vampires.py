@@ -22,24 +22,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import Instrument, check_choice
 from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut
-from astropolcal.instruments.telescope import (
-    CHANGES,
-    INTERNAL,
-    M3_MODELS,
-    SITE,
-    STARS,
-    _normal,
-    fold_mirror,
-    k_mirror,
-    misaligned,
-    polarizer,
-    star_source,
-    telescope,
-    tertiary_mirror,
-    two_layer_plate,
-)
 from astropolcal.observations.quality import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
@@ -120,7 +105,7 @@ LAYOUT = FileLayout(
     saturation=_FULL,
     pixel_scale=5.9,
     fwhm=3.5,
-    site=SITE,
+    site=subaru.SITE,
     beam_files=("cam1", "cam2"),
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
@@ -188,6 +173,7 @@ def _wavelengths(names):
 _START_AT = (610.0, 670.0, 725.0, 775.0)
 _HALF_WAVE_PLATE = (-158.0, -165.0, -171.0, -173.0)
 _DEROTATOR = (281.0, 245.0, 204.0, 176.0)
+_BOUNDS = {"horizontal": (0, 360), "diagonal": (-90, 90), "circular": (-90, 90)}
 
 
 def _silver(name):
@@ -196,7 +182,7 @@ def _silver(name):
 
 def _mirror(model, grid):
     """Return the tertiary mirror, ready to be calibrated."""
-    mirror = tertiary_mirror(model, grid)
+    mirror = subaru.tertiary_mirror(model, grid)
     if model == "free":
         mirror.diattenuation = _silver("m3").diattenuation(grid)
         mirror.retardance = _silver("m3").retardance(grid)
@@ -208,9 +194,9 @@ def _starts(grid, values):
 
 
 def _half_wave_plate(grid, kind):
-    settings = misaligned(0)
+    settings = subaru.misaligned(0)
     if kind == "two-layer":
-        return two_layer_plate(**settings)
+        return subaru.two_layer_plate(**settings)
     # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
     settings["bounds"] |= {"retardance": (-180, -90)}
     start = _starts(grid, _HALF_WAVE_PLATE)
@@ -218,22 +204,10 @@ def _half_wave_plate(grid, kind):
 
 
 def _derotator(grid, kind):
-    settings, start = misaligned(0), _starts(grid, _DEROTATOR)
-    main = "retardance" if kind == "linear" else "horizontal"
-    settings["bounds"] |= {main: (0, 360)}
-    settings |= {"mount": "derotator", "name": "derotator"}
-    if kind == "kmirror":
-        return k_mirror(**misaligned(0), mount="derotator", name="derotator")
-    if kind == "linear":
-        return optics.LinearRetarder(retardance=start, **settings)
-    settings["bounds"] |= {"diagonal": (-90, 90), "circular": (-90, 90)}
-    # off the point where the two small ones vanish
-    small = np.full(grid.size, 1.0) * u.deg
-    derotator = optics.EllipticalRetarder(
-        horizontal=start, diagonal=-small, circular=small, **settings
-    )
-    derotator.diagonal.prior = derotator.circular.prior = _normal(0, 10)
-    return derotator
+    turning = subaru.derotator(kind, _starts(grid, _DEROTATOR), _BOUNDS)
+    if kind == "elliptical":
+        turning.diagonal.prior = turning.circular.prior = subaru._normal(0, 10)
+    return turning
 
 
 def _relay(size):
@@ -245,12 +219,12 @@ def _relay(size):
         bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
     )
     # wide: a retarder here looks like one in the derotator, unless that turns far
-    relay.retardance.prior = _normal(0, 45)
+    relay.retardance.prior = subaru._normal(0, 45)
     return relay
 
 
 def _liquid_crystal(size):
-    settings = misaligned(0, most=20)
+    settings = subaru.misaligned(0, most=20)
     settings["bounds"] |= {"retardance": (90, 270), "switching_angle": (30, 60)}
     crystal = optics.FerroelectricLiquidCrystal(
         retardance=np.full(size, 180.0) * u.deg,
@@ -259,29 +233,29 @@ def _liquid_crystal(size):
         name="flc",
         **settings,
     )
-    crystal.retardance.prior, crystal.theta.prior = _normal(180, 15), _normal(0, 2)
+    crystal.retardance.prior, crystal.theta.prior = subaru._normal(180, 15), subaru._normal(0, 2)
     # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
-    crystal.switching_angle.prior = _normal(43, 2)
+    crystal.switching_angle.prior = subaru._normal(43, 2)
     return crystal
 
 
 def _cameras(size):
     cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
     # pairs of both states see it in second order only, hence the prior
-    cameras.imbalance.prior = _normal(0, 0.1)
+    cameras.imbalance.prior = subaru._normal(0, 0.1)
     return cameras
 
 
 def _splitter(size):
     """Return the polarizing beam splitter; an efficiency above one is none."""
     wollaston = optics.WollastonPrism(efficiency=np.full(size, 0.95), name="wollaston")
-    wollaston.efficiency.prior = _normal(0.95, 0.03)
+    wollaston.efficiency.prior = subaru._normal(0.95, 0.03)
     return wollaston
 
 
 # as tables may call them
-_SOURCES = {name: name for name in (*INTERNAL, *STARS)}
-_SOURCES |= {f"{name} internal": name for name in INTERNAL}
+_SOURCES = {name: name for name in (*subaru.INTERNAL, *subaru.STARS)}
+_SOURCES |= {f"{name} internal": name for name in subaru.INTERNAL}
 
 
 class VAMPIRES(Instrument):
@@ -309,9 +283,9 @@ class VAMPIRES(Instrument):
         "vampires_dpp, https://github.com/scexao-org/vampires_dpp (keywords and detectors)",
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher, appendix on VAMPIRES",
     )
-    sources = (*INTERNAL, *STARS)
+    sources = (*subaru.INTERNAL, *subaru.STARS)
     optional_optics = ("flc",)
-    changes = CHANGES
+    changes = subaru.CHANGES
 
     def chain(
         self,
@@ -381,33 +355,20 @@ class VAMPIRES(Instrument):
         >>> chain["derotator"].retardance.shape
         (4,)
         """
-        self.check_choices(
-            source,
-            optics_in,
-            derotator=(derotator, ("elliptical", "linear", "kmirror")),
-            plate=(plate, ("free", "two-layer")),
-            bounds=(bounds, ("physical",)),
-            m3=(m3, M3_MODELS),
-        )
+        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, ("physical",))}
+        known |= {"plate": (plate, ("free", "two-layer")), "m3": (m3, subaru.M3_MODELS)}
+        self.check_choices(source, optics_in, **known)
         grid = self.grid(wavelength)
-        train = [polarizer() if source == "polarized" else fold_mirror(grid.size)]
-        if source in STARS:
-            light = star_source(source, grid, star, target)
-            train = [light, *telescope(_mirror(m3, grid))]
-        train += [
-            _half_wave_plate(grid, plate),
-            _derotator(grid, derotator),
-            _relay(grid.size),
-        ]
+        train = subaru.entrance(source, grid, star, target, _mirror(m3, grid))
+        train.append(_half_wave_plate(grid, plate))
+        train += [_derotator(grid, derotator), _relay(grid.size)]
         if "flc" in optics_in:
             train.append(_liquid_crystal(grid.size))
-        train.append(_splitter(grid.size))
-        train.append(_cameras(grid.size))
-        return join(train)
+        return join([*train, _splitter(grid.size), _cameras(grid.size)])
 
     def telescope_optics(self, behind):
         """Return the telescope with a tertiary mirror of bare silver."""
-        return telescope(_silver("m3"))
+        return subaru.telescope(_silver("m3"))
 
     def published(self):
         """

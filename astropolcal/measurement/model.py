@@ -2,14 +2,16 @@
 """
 A measurement as one fittable model: index of a datum in, predicted datum out.
 
-Every stock astropy fitter takes it: the parameters are scalars (the free
-parameters of the chains, in radian, micrometre or 1), and ``fit_deriv`` is
-analytic.
+Every stock astropy fitter takes it: the parameters are scalars, the free
+parameters of the chains in their units, and ``fit_deriv`` is analytic. Inside
+of the package a measurement is asked for vectors, which are canonical: radian,
+micrometre or 1.
 """
 
 import copy as copy_module
 from itertools import pairwise
 
+import astropy.units as u
 import numpy as np
 from astropy.modeling import FittableModel, Parameter
 
@@ -18,7 +20,8 @@ from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.observables import default_observable, get_observable
 from astropolcal.observations.reading import common_wavelengths
-from astropolcal.optics._modelling import with_own_scalars
+from astropolcal.optics._modelling import LinearlyTied, with_own_scalars, without_units
+from astropolcal.units import to_unit
 
 __all__ = ["Measurement"]
 
@@ -26,6 +29,10 @@ __all__ = ["Measurement"]
 class Measurement(FittableModel):
     """
     Chains and their observations as a 1-input, 1-output fittable model.
+
+    Its parameters are the free ones of the chains, in their units, one for each value per
+    wavelength. What a fitter returns has them in its `chains` too, with their ``std`` where the
+    fitter works out uncertainties.
 
     Parameters
     ----------
@@ -71,6 +78,15 @@ class Measurement(FittableModel):
     ('hwp_retardance', 'wollaston_efficiency')
     >>> measurement.n_data
     16
+
+    Any fitter of astropy takes it:
+
+    >>> from astropy.modeling.fitting import TRFLSQFitter
+    >>> fitted = TRFLSQFitter()(measurement, measurement.index, measurement.observed)
+    >>> fitted.hwp_retardance.unit
+    Unit("deg")
+    >>> bool(fitted.chains[0]["hwp"].retardance == fitted.hwp_retardance)
+    True
     """
 
     n_inputs = 1
@@ -95,12 +111,13 @@ class Measurement(FittableModel):
         if copy:
             pairs = [(item.copy(), obs, position) for item, obs, position in pairs]
         self._chains = [item for item, _, _ in pairs]
-        self._chains_are_shared = False
+        self._chains_are_shared = self._fitted = False
         if observable is None:
             observable = default_observable([obs for _, obs, _ in pairs])
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
         self.free = FreeParameters(self._chains, len(self.wavelength), ties)
+        self.free.check_wavelengths(self.wavelength)
         self.datasets = [
             Dataset(item, obs, self.observable, self.free, self.wavelength, position)
             for item, obs, position in pairs
@@ -134,16 +151,19 @@ class Measurement(FittableModel):
 
     def _add_parameters(self):
         """Give this instance its own scalar parameters (astropy has them on the class)."""
-        low, high = self.free.bounds()
         self._param_names = tuple(self.free.labels)
-        start = self.free.start()
-        for label, value, a, b in zip(self._param_names, start, low, high, strict=True):
-            # astropy writes an open bound as None
-            bounds = (a if np.isfinite(a) else None, b if np.isfinite(b) else None)
-            parameter = Parameter(name=label, default=float(value), bounds=bounds)
+        #: Factor of each parameter from its unit to the canonical one.
+        self._factors = self.free.factors()
+        units = [slot.unit for slot in self.free.slots for _ in range(slot.size)]
+        bounds = _bounds(*(x / self._factors for x in self.free.bounds()))
+        # astropy sets a parameter to its default
+        start = (self.free.start() / self._factors).tolist()
+        entries = zip(self._param_names, start, units, bounds, strict=True)
+        for label, value, unit, bound in entries:
+            parameter = LinearlyTied(name=label, default=value, unit=unit, bounds=bound)
             parameter.model = self
-            parameter.value = float(value)
             self.__dict__[label] = parameter
+        self.stand_at(self.free.start())
 
     def __setattr__(self, attr, value):
         # astropy's own way to set a parameter searches all names, for each of the 93
@@ -151,7 +171,7 @@ class Measurement(FittableModel):
         if isinstance(parameter, Parameter) and isinstance(value, Parameter):
             self.__dict__[attr] = value
         elif isinstance(parameter, Parameter):
-            parameter.value = float(value)
+            parameter.value = float(to_unit(value, parameter.unit, attr))
         else:
             super().__setattr__(attr, value)
 
@@ -164,8 +184,8 @@ class Measurement(FittableModel):
     # in tables it builds anew; with one scalar a parameter, plain loops give the same.
     @property
     def parameters(self):
-        """Values of the scalar parameters, shape (n_free,)."""
-        return self.vector()
+        """Values of the scalar parameters in their units, shape (n_free,)."""
+        return np.array([self.__dict__[label].value for label in self._param_names], dtype=float)
 
     @parameters.setter
     def parameters(self, values):
@@ -190,6 +210,42 @@ class Measurement(FittableModel):
         """Whether a scalar parameter has a bound."""
         return any(self.__dict__[label].bounds != (None, None) for label in self._param_names)
 
+    @property
+    def sync_constraints(self):
+        """Whether astropy reads constraints from the parameters each time; not in a fit."""
+        return self.__dict__.get("_sync_constraints", True)
+
+    @sync_constraints.setter
+    def sync_constraints(self, value):
+        FittableModel.sync_constraints.fset(self, value)
+        # a fitter sets it last of all
+        self.__dict__["_fitted"] = value
+
+    def _parameter_units_for_data_units(self, input_units, output_units):
+        units = {label: self.__dict__[label].unit for label in self._param_names}
+        return {label: unit for label, unit in units.items() if unit is not None}
+
+    def without_units_for_data(self, **data):
+        """Return the measurement as a fitter takes it: itself, with numbers in its units."""
+        unit = getattr(data[self.outputs[0]], "unit", u.one)
+        if unit != u.one:
+            raise ParameterError(f"the data are in {unit}; observables are plain numbers")
+        return self
+
+    def with_units_from_data(self, **data):
+        """Return the fitted measurement: itself."""
+        return self
+
+    def canonical(self):
+        """Return a copy whose parameters are in canonical units, for fits of this package."""
+        new = with_own_scalars(self, self._param_names)
+        new._chains_are_shared = True
+        new._factors = np.ones_like(self._factors)
+        bounds = _bounds(*self.free.bounds())
+        without_units(new, self._param_names, self.vector().tolist(), bounds)
+        new.stand_at(self.vector())
+        return new
+
     def __deepcopy__(self, memo):
         # every fitter copies the model: what does not change is shared, and the chains are
         # copied when somebody looks at them
@@ -213,18 +269,27 @@ class Measurement(FittableModel):
                 new.datasets[i] = self.datasets[i].thinned(self._chains[i], groups)
         new._finish(self.name)
         # the thinned measurement starts where this one stands, not where the chains do
-        new.parameters = self.vector()
+        new.stand_at(self.vector())
         parts = zip(self.datasets, chosen, strict=True)
         kept = [np.isin(dataset.group_of_datum, groups) for dataset, groups in parts]
         return new, np.concatenate(kept)
 
     @property
     def chains(self):
-        """The chain of each dataset; `put_back` writes the values into them."""
+        """
+        The chain of each dataset.
+
+        Those of a measurement that a fitter returns have the values of the fit; otherwise
+        `put_back` writes the values into them.
+        """
         if self._chains_are_shared:
             self._chains = [chain.copy() for chain in self._chains]
             self.free = self.free.of_chains(self._chains)
             self._chains_are_shared = False
+        if self._fitted:
+            self._fitted = False
+            self.put_back()
+            self.free.put_stds([self.__dict__[label].std for label in self._param_names])
         return self._chains
 
     # ---- evaluation ---------------------------------------------------------
@@ -252,13 +317,14 @@ class Measurement(FittableModel):
 
     def evaluate(self, x, *parameters):
         """Return the predicted data of index ``x``; behind the data come the priors."""
-        vector = _vector(parameters)
+        vector = _numbers(parameters) * self._factors
         return self._pick(self.predict(vector), x, self.free.prior_residuals, vector)
 
     def fit_deriv(self, x, *parameters):
-        """Return the derivative of the data of index ``x``, (n_free, n_data)."""
-        vector = _vector(parameters)
-        return self._pick(self.jacobian(vector), x, self.free.prior_jacobian, vector)
+        """Return the derivative of the data of index ``x``, (n_free, n_data), per unit."""
+        vector = _numbers(parameters) * self._factors
+        slopes = self._pick(self.jacobian(vector), x, self.free.prior_jacobian, vector)
+        return slopes * self._factors[:, None]
 
     def _pick(self, values, x, prior, vector):
         # all data in order, without the priors: what `predict` asks for, and nothing to be picked
@@ -303,13 +369,24 @@ class Measurement(FittableModel):
     # ---- results --------------------------------------------------------------
 
     def vector(self):
-        """Return the current values of the scalar parameters, shape (n_free,)."""
-        return np.array([self.__dict__[label].value for label in self._param_names], dtype=float)
+        """Return the current values of the scalar parameters, canonical, shape (n_free,)."""
+        values, (there, vector) = self.parameters, self._stand
+        # what was set comes back to the last digit: it may be a bound
+        return vector.copy() if np.array_equal(values, there) else values * self._factors
+
+    def stand_at(self, vector):
+        """Set the scalar parameters to canonical values, shape (n_free,)."""
+        vector = np.array(vector, dtype=float).ravel()
+        if vector.size != len(self._param_names):
+            raise ParameterError(f"{vector.size} values for {len(self._param_names)} parameters")
+        self.parameters = vector / self._factors
+        self._stand = self.parameters, vector
 
     def put_back(self, vector=None):
         """Write values (by default the current ones) into the chains and return these."""
         chains = self.chains
         self.free.put_back(self.vector() if vector is None else vector)
+        self.free.put_wavelengths(self.wavelength)
         return chains
 
     def residuals(self, vector=None):
@@ -325,5 +402,13 @@ def _drawn(count, most):
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
-def _vector(parameters):
-    return np.array(parameters, dtype=float).reshape(-1)
+def _bounds(low, high):
+    """Return pairs of bounds; astropy writes an open one as None."""
+    low, high = (np.where(np.isfinite(x), x, None).tolist() for x in (low, high))
+    return list(zip(low, high, strict=True))
+
+
+def _numbers(parameters):
+    """Return values as astropy hands them over, arrays of one with or without unit."""
+    numbers = [getattr(value, "value", value) for value in parameters]
+    return np.array(numbers, dtype=float).reshape(-1)

@@ -348,3 +348,32 @@ class FreeParameters:
                 shape = np.shape(parameter.value)
                 value = canonical / canonical_factor(parameter.unit)
                 parameter.value = value.reshape(shape)
+
+    def put_stds(self, stds):
+        """Write standard deviations, in the units of the parameters, into the chains; or None."""
+        for slot in self.slots:
+            own = stds[slot.slice]
+            several = None if None in own else np.array(own, dtype=float)
+            for parameter in self._table[slot.name]:
+                parameter.std = several if several is None or slot.size > 1 else float(several[0])
+
+    def check_wavelengths(self, wavelength):
+        """Refuse parameters that are known at other wavelengths (um) than those of the data."""
+        for name, parameters in self._table.items():
+            for parameter in parameters:
+                grid = parameter.grid
+                if grid is not None and not (
+                    grid.shape == wavelength.shape and np.allclose(grid, wavelength, rtol=1e-3)
+                ):
+                    raise ParameterError(
+                        f"{name} has values at {grid.size} wavelengths from {grid[0]:g} to "
+                        f"{grid[-1]:g} um, which are not the {wavelength.size} of the data; "
+                        "optic.resampled(wavelength) interpolates them"
+                    )
+
+    def put_wavelengths(self, wavelength):
+        """Tell parameters with one value per wavelength (um) which these are."""
+        for parameters in self._table.values():
+            for parameter in parameters:
+                if parameter.shape == wavelength.shape and parameter.grid is None:
+                    parameter.wavelength = wavelength * u.um

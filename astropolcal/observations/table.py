@@ -25,7 +25,7 @@ from astropolcal.observations.reading import (
 )
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
-from astropolcal.words import counted
+from astropolcal.words import counted, html
 
 __all__ = ["Observations", "example_table"]
 
@@ -297,6 +297,9 @@ class Observations:
 
     def __repr__(self):
         return f"<Observations {self.name!r}: {self._headline()}>"
+
+    def _repr_html_(self):
+        return html(repr(self), self.frames)
 
     def _headline(self):
         counts = [f"{counted(self.n_frames, 'frame')} x {counted(self.n_bins, 'bin')}"]

@@ -37,7 +37,7 @@ from astropolcal.optics.retarders import (
     Rotator,
     TwoLayerWaveplate,
 )
-from astropolcal.optics.sources import PolarizedSource, StarSource
+from astropolcal.optics.sources import Light, PolarizedSource, StarSource
 from astropolcal.optics.states import StateAnalyser, StateRetarder
 
 __all__ = [
@@ -58,6 +58,7 @@ __all__ = [
     "HarmonicRetarder",
     "HarmonicRotator",
     "KMirror",
+    "Light",
     "LinearPolarizer",
     "LinearRetarder",
     "MetalMirror",
@@ -78,9 +79,9 @@ __all__ = [
     "WollastonPrism",
 ]
 
-#: Every optic by class name: all classes above but the two bases.
+#: Every optic by class name: all classes above but the two bases, and light, which meets no other.
 OPTICS = {
     name: globals()[name]
     for name in __all__
-    if not name.isupper() and name not in ("FrameOptic", "Optic")
+    if not name.isupper() and name not in ("FrameOptic", "Light", "Optic")
 }

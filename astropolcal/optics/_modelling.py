@@ -1,18 +1,30 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do otherwise than those of astropy: keywords only, settings, and cheap copies.
+What our models do otherwise than those of astropy: keywords, settings, units, chains, cheap copies.
 
-Copies touch what `astropy.modeling` keeps to itself, the dictionaries of models and parameters: a
-calibration copies chains and measurements thousands of times, and a deep copy of everything takes
-five times as long. Nothing else in the package does.
+Nothing else in the package touches what `astropy.modeling` keeps to itself. Copies do (the
+dictionaries of models and parameters), because a calibration copies chains and measurements
+thousands of times, and a deep copy of everything takes five times as long. Chains do, because a
+fitter asks every model of a compound for its units, and astropy's ``Mapping`` has no answer.
+Parameters do, because astropy drops the unit of a bound.
 """
 
 import inspect
+from collections import defaultdict
 from copy import copy, deepcopy
+from functools import partial, reduce
+from operator import or_
 
 import astropy.units as u
-from astropy.modeling import FittableModel, Parameter
+import numpy as np
+from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
 
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.units import length_to_um, to_unit
+from astropolcal.words import html
+
+# by how much two wavelengths may differ and be the same, as in tables of observations
+_SAME = 1e-5
 # what a copy of an optic may share with it
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
 
@@ -44,6 +56,13 @@ class KeywordOnly(type(FittableModel)):
     def __init__(cls, name, bases, members, **kwargs):
         # astropy's metaclass writes an __init__ for every class whose members have none
         super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
+        # and its own ``|`` into every class
+        cls.__or__ = joined
+        for parameter in cls._parameters_.values():
+            if type(parameter) is Parameter:
+                parameter.__class__ = OpticParameter
+                if any(isinstance(bound, u.Quantity) for bound in parameter.bounds):
+                    parameter.bounds = parameter.bounds
         # those of the bases first
         cls._declared_settings = {
             key: setting
@@ -71,6 +90,250 @@ class KeywordOnly(type(FittableModel)):
             if isinstance(base, KeywordOnly):
                 found |= getattr(base.__init__, "__kwdefaults__", None) or {}
         return found
+
+
+class OpticParameter(Parameter):
+    """A parameter that converts bounds and ties to its unit, and knows to what they belong."""
+
+    #: Wavelengths of its values in micrometre, or None where nobody has said.
+    grid = None
+
+    @property
+    def wavelength(self):
+        """Wavelengths of the values of a parameter that has several; None if they are not known."""
+        return None if self.grid is None else self.grid * u.um
+
+    @wavelength.setter
+    def wavelength(self, value):
+        grid = None if value is None else length_to_um(value, f"wavelengths of {self.name}")
+        if grid is not None and (
+            grid.shape != self.shape or not (np.all(grid > 0) and np.all(np.diff(grid) > 0))
+        ):
+            raise ParameterError(
+                f"wavelengths of {self.name} = {value}; allowed are {self.size} that increase"
+            )
+        self.grid = grid
+
+    def at(self, wavelength, values):
+        """Return values of the parameter at wavelengths (um), between its own on straight lines."""
+        grid = self.grid
+        if grid is None or np.size(values) == 1 or wavelength is None:
+            return values
+        if np.shape(wavelength) == grid.shape and np.allclose(wavelength, grid, rtol=_SAME, atol=0):
+            return values
+        low, high = grid[0] * (1 - _SAME), grid[-1] * (1 + _SAME)
+        outside = ~((wavelength >= low) & (wavelength <= high))
+        if np.any(outside):
+            raise WavelengthRangeError(
+                f"{self.name} is known from {grid[0]:g} to {grid[-1]:g} um, not at "
+                f"{np.ravel(wavelength)[np.argmax(outside)]:g} um"
+            )
+        return np.interp(wavelength, grid, values)
+
+    @Parameter.bounds.setter
+    def bounds(self, value):
+        unit = u.one if self.unit is None else self.unit
+        plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
+        Parameter.bounds.fset(self, plain)
+
+    @Parameter.tied.setter
+    def tied(self, value):
+        # a fitter puts what the callable returns into an array of plain numbers
+        wrap = callable(value) and not isinstance(value, partial)
+        Parameter.tied.fset(self, partial(_tied_value, value, self.unit) if wrap else value)
+
+
+class LinearlyTied(OpticParameter):
+    """A parameter of a measurement, which refuses a callable tie: its Jacobian is analytic."""
+
+    @Parameter.tied.setter
+    def tied(self, value):
+        if callable(value):
+            raise ParameterError(
+                f"{self.name}: a measurement takes no callable tie; give it "
+                "ties={name: Tie(source, factor, offset)}"
+            )
+        Parameter.tied.fset(self, value)
+
+
+def _tied_value(function, unit, model):
+    value = function(model)
+    return value if getattr(value, "unit", None) is None else to_unit(value, unit, "tied value")
+
+
+def values_text(model):
+    """Return the parameters of a model with their values and units."""
+    parameters = ((key, getattr(model, key)) for key in model.param_names)
+    return ", ".join(
+        f"{key}={np.array2string(p.value, precision=6, threshold=4)}"
+        + (f" {p.unit}" if p.unit else "")
+        for key, p in parameters
+    )
+
+
+def joined(left, right):
+    """Return ``left | right`` of two models as a chain."""
+    return Chain("|", left, right) if isinstance(right, Model) else NotImplemented
+
+
+class Chain(CompoundModel):
+    """
+    What ``|`` makes of optics, and of optics and other models of astropy.
+
+    Any of astropy's fitters takes one of one input and one output. Its parameters keep their units
+    in a fit, and their values are numbers in these.
+    """
+
+    def without_units_for_data(self, **data):
+        """Return the chain as a fitter takes it: itself, once data and parameters are checked."""
+        for key in self.param_names:
+            if np.size(getattr(self, key).value) > 1:
+                raise ParameterError(
+                    f"{key} has one value per wavelength, and no fitter of astropy takes a model "
+                    "with such a parameter, not even a fixed one; astropolcal.calibrate does"
+                )
+        inputs = [
+            data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
+            for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()
+        ]
+        outcome = self(*inputs)
+        key = self.outputs[0]
+        given, own = (getattr(value, "unit", u.one) for value in (data[key], outcome))
+        if isinstance(data[key], u.Quantity) and given != own:
+            raise ParameterError(
+                f"{key} is in {given}, but the chain gives {str(own) or 'plain numbers'}"
+            )
+        return self
+
+    def with_units_from_data(self, **data):
+        """Return the fitted chain: itself."""
+        return self
+
+    @property
+    def has_bounds(self):
+        """Whether a free parameter has a bound; what is fixed needs none."""
+        return any_free_bounds(self)
+
+    def __setattr__(self, attr, value):
+        if attr in (self.__dict__.get("_param_names") or ()):
+            # the optic checks value and unit
+            index, key = self._param_map[attr]
+            setattr(self._leaflist[index], key, value)
+        else:
+            super().__setattr__(attr, value)
+
+    def __iter__(self):
+        return iter(self._leaflist)
+
+    def _repr_html_(self):
+        from astropy.table import Table
+
+        rows = [
+            (i, m.name or "", type(m).__name__, getattr(m, "mount", None) or "", values_text(m))
+            for i, m in enumerate(self)
+        ]
+        names = ("place", "name", "kind", "mount", "parameters")
+        return html(" | ".join(row[1] or row[2] for row in rows), Table(rows=rows, names=names))
+
+    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
+        """Return a model of one input that draws what the chain does; see `Optic.curve`."""
+        from astropolcal.optics.curves import curve_of
+
+        return curve_of(self, list(self), what, element, against, wavelength, **positions)
+
+    def __getitem__(self, index):
+        if not isinstance(index, slice):
+            return super().__getitem__(index)
+        # astropy finds only what is one branch of its tree
+        models = self._leaflist[self._whole(index)]
+        if index.step not in (None, 1) or not models:
+            raise ChainError(f"no optics at {index} of a chain of {len(self._leaflist)}")
+        return reduce(or_, models)
+
+    def _whole(self, index):
+        """Return a slice by number; a name as its stop is the last optic, as astropy has it."""
+        start, stop = (
+            self._str_index_to_int(end) if isinstance(end, str) else end
+            for end in (index.start, index.stop)
+        )
+        return slice(start, stop + 1 if isinstance(index.stop, str) else stop)
+
+
+Chain.__or__ = joined
+
+
+class SharedParameters(FittableModel):
+    """
+    A model of one input and one output whose parameters are those of optics, the same objects.
+
+    A subclass says with `_adopt` which they are. Parameters keep their units in a fit, and their
+    values are numbers in these; the values of the model are numbers in ``_unit``.
+    """
+
+    n_inputs = 1
+    n_outputs = 1
+    standard_broadcasting = False
+    col_fit_deriv = True
+    _param_names = ()
+    _unit = None
+
+    def _adopt(self, owners):
+        """Take on parameters: of each name the optic that has it, and its name there."""
+        # only then: astropy sets what it knows in the beginning to its default
+        self._param_names, self._owners = tuple(owners), owners
+        self.__dict__ |= {name: getattr(*owner) for name, owner in owners.items()}
+        self._constraints_cache = {}
+        self._param_metrics = defaultdict(dict)
+        self._initialize_slices()
+
+    @property
+    def param_names(self):
+        """Names of the parameters."""
+        return self._param_names
+
+    @property
+    def has_bounds(self):
+        """Whether a free parameter has a bound; what is fixed needs none."""
+        return any_free_bounds(self)
+
+    def __setattr__(self, attr, value):
+        if attr in self._param_names:
+            setattr(*self._owners[attr], value)
+        else:
+            super().__setattr__(attr, value)
+
+    @property
+    def return_units(self):
+        """Unit of the values, where they have one."""
+        return None if self._unit is None else {self.outputs[0]: self._unit}
+
+    def _parameter_units_for_data_units(self, input_units, output_units):
+        units = {name: getattr(self, name).unit for name in self.param_names}
+        return {name: unit for name, unit in units.items() if unit is not None}
+
+    def without_units_for_data(self, **data):
+        """Return the model as a fitter takes it: with values in the unit of the data."""
+        values = data[self.outputs[0]]
+        if not isinstance(values, u.Quantity):
+            return self
+        own = u.one if self._unit is None else self._unit
+        if not values.unit.is_equivalent(own):
+            raise ParameterError(
+                f"the data are in {values.unit}, but the curve gives {str(own) or 'plain numbers'}"
+            )
+        model = self if values.unit == own else self.copy()
+        model._unit = values.unit
+        return model
+
+    def with_units_from_data(self, **data):
+        """Return the fitted model: itself."""
+        return self
+
+
+def any_free_bounds(model):
+    """Return whether a parameter that is not fixed has a bound."""
+    parameters = (getattr(model, key) for key in model.param_names)
+    return any(p.bounds != (None, None) and not p.fixed for p in parameters)
 
 
 def copied_attributes(optic, new, memo):
@@ -110,3 +373,11 @@ def with_own_scalars(model, labels):
         new.__dict__[label] = parameter
         parameter.value = float(model.__dict__[label].value)
     return new
+
+
+def without_units(model, labels, values, bounds):
+    """Give scalar parameters of a model, its own, plain values and bounds in place of units."""
+    for label, value, bound in zip(labels, values, bounds, strict=True):
+        parameter = model.__dict__[label]
+        parameter._unit = None
+        parameter.value, parameter.bounds = value, bound

@@ -18,7 +18,7 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
-from astropolcal.optics._modelling import KeywordOnly, copied_attributes
+from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined, values_text
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
@@ -92,8 +92,12 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         each frame is added to ``theta``; with a leading minus it is subtracted.
     name : str, optional
         Name of the optic in its chain.
-    **parameters : `~astropy.units.Quantity` or float
-        Values of the optic's parameters: a scalar, or one value per wavelength.
+    wavelength : `~astropy.units.Quantity`, optional
+        Wavelengths of the parameters with one value per wavelength, increasing. At others they
+        are interpolated; without them the optic is for as many wavelengths as there are values.
+    **parameters : `~astropy.units.Quantity`, `~specutils.Spectrum` or float
+        Values of the optic's parameters: a scalar, or one value per wavelength. A spectrum gives
+        values, their wavelengths and, with an uncertainty, the ``std`` of the parameter.
 
     Raises
     ------
@@ -145,12 +149,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         description="installed orientation, added to the position of the mount",
     )
 
-    def __init__(self, *args, mount=None, name=None, **kwargs):
+    def __init__(self, *args, mount=None, name=None, wavelength=None, **kwargs):
         if args:
             raise ParameterError(
                 f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
             )
         values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
+        spectra = {key: x for key, x in values.items() if hasattr(x, "spectral_axis")}
+        spectra = {key: _of_spectrum(spectrum) for key, spectrum in spectra.items()}
+        values |= {key: value for key, (_, value, _) in spectra.items()}
         values = {key: self._at_the_door(key, value) for key, value in values.items()}
         settings = {
             key: kwargs.pop(key, setting.default)
@@ -162,11 +169,18 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
-        self.inputs = self.outputs = LIGHT
+        self.inputs, self.outputs = LIGHT[: self.n_inputs], LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
         for key, value in settings.items():
             setattr(self, key, value)
+        for key in self.param_names if wavelength is not None else ():
+            if getattr(self, key).size > 1:
+                getattr(self, key).wavelength = wavelength
+        for key, (grid, _, std) in spectra.items():
+            parameter = getattr(self, key)
+            parameter.wavelength = grid if parameter.shape else None
+            parameter.std = None if std is None else to_unit(std, parameter.unit, f"{key}.std")
 
     def _check_names(self, kwargs):
         known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
@@ -215,13 +229,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return new
 
     def __repr__(self):
-        values = ", ".join(
-            f"{key}={np.array2string(getattr(self, key).value, precision=6, threshold=4)}"
-            + (f" {getattr(self, key).unit}" if getattr(self, key).unit else "")
-            for key in self.param_names
-        )
         settings = "".join(f", {key}={value!r}" for key, value in self._unlike_default().items())
-        return f"<{type(self).__name__}({values}{settings})>"
+        return f"<{type(self).__name__}({values_text(self)}{settings})>"
 
     def _unlike_default(self):
         """Return the settings that are not those of the class, name and mount last."""
@@ -233,6 +242,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             for key, value in (settings | last).items()
             if key not in known or value != known[key].default
         }
+
+    #: Methods of the wavelength that `curve` draws, with the unit of their values.
+    _laws = {}
 
     # ---- where the optic stands ------------------------------------------
 
@@ -294,7 +306,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return values
 
     def _check_unit(self, key, unit):
-        if unit != self._declared(key).unit:
+        # a fitter may leave a parameter behind without its unit
+        if unit is not None and unit != self._declared(key).unit:
             raise ParameterError(
                 f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
                 f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
@@ -381,18 +394,21 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _resolve(self, wavelength, position, parameters=None):
         """Bring wavelength, orientation and values to canonical floats."""
         lam, shift, values = self._read(wavelength, position, parameters)
-        dispersion = None if lam is None else self._dispersion(lam)
+        return (*self._moved(self._dispersion_at(lam), values[0], shift), values[1:])
+
+    def _dispersion_at(self, wavelength):
+        """Return the dispersion, or None without a wavelength where none is needed."""
         # only a law needs the wavelength; a constant matrix is the same at all
-        if lam is None and type(self)._dispersion is not Optic._dispersion:
+        if wavelength is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
-        return (*self._moved(dispersion, values[0], shift), values[1:])
+        return None if wavelength is None else self._dispersion(wavelength)
 
     def _read(self, wavelength, position, parameters):
         values = self.canonical_values() if parameters is None else parameters
         lam = None if wavelength is None else length_to_um(wavelength)
         if lam is not None and not np.all(lam > 0):
             raise ParameterError(f"wavelength = {wavelength} must be positive")
-        self._check_grid(lam, values)
+        values = self.values_at(lam, values)
         turned = self._position
         if position is not None:
             turned = finite_position(position, "position", self.stage)
@@ -402,6 +418,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _moved(self, dispersion, angle, shift):
         """Return what the matrix needs, and the orientation, once the stage has moved."""
         return dispersion, angle + shift
+
+    def values_at(self, lam, values):
+        """Return canonical values at wavelengths (um), where they are known."""
+        values = [
+            getattr(self, key).at(lam, value)
+            for key, value in zip(self.param_names, values, strict=True)
+        ]
+        self._check_grid(lam, values)
+        return values
 
     def _check_grid(self, lam, values):
         for key, value in zip(self.param_names, values, strict=True):
@@ -425,24 +450,43 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for derivative in self._derivatives(dispersion, *values):
             yield _rotate(derivative, angle)
 
+    @property
+    def input_units(self):
+        """Micrometre of the wavelength, which is what a fitter hands over without a unit."""
+        return {"wavelength": u.um} | dict.fromkeys(self.inputs[1:])
+
+    def _parameter_units_for_data_units(self, input_units, output_units):
+        # for compound models of astropy; a `Chain` has its own way
+        return {key: unit for key in self.param_names if (unit := self._declared(key).unit)}
+
+    def prepare_inputs(self, wavelength, *light, **kwargs):
+        """Return what `evaluate` takes, as astropy does; refuse a wavelength without unit."""
+        length_to_um(wavelength)
+        return super().prepare_inputs(wavelength, *light, **kwargs)
+
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
-        """Return ``wavelength`` and the Stokes parameters behind the optic."""
+        """
+        Return ``wavelength`` and the Stokes parameters behind the optic.
+
+        Without units wavelengths are in micrometre and parameters in their own units.
+        """
+        return wavelength, *self._light_behind(wavelength, (I, Q, U, V), parameters)
+
+    def _light_behind(self, wavelength, light, parameters):
         values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
         # elements first, (4, 4, ...), so that rows multiply the channels of the light
         matrix = np.moveaxis(
-            self._oriented(*self._resolve(wavelength, None, values)), (-2, -1), (0, 1)
+            self._oriented(*self._resolve(u.Quantity(wavelength, u.um), None, values)),
+            (-2, -1),
+            (0, 1),
         )
-        light = (I, Q, U, V)
         # astropy gives the outputs of scalar inputs back as scalars
         if matrix[0, 0].size > 1 and all(np.size(x) == 1 for x in (wavelength, *light)):
             raise ParameterError(
                 f"{self.name or type(self).__name__} stands at {matrix[0, 0].size} positions: "
                 f"give light of shape {matrix[0, 0].shape}"
             )
-        return (
-            wavelength,
-            *(sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix),
-        )
+        return [sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix]
 
     def _strip(self, key, value):
         """Undo the model-set axis and the unit that astropy adds in a call."""
@@ -453,6 +497,75 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # a model of astropy is a set of one model
         number = number[0] if number.ndim and number.shape[0] == 1 else number
         return np.asarray(number) * canonical_factor(unit)
+
+    @property
+    def inverse(self):
+        """
+        What gives the light before the optic from the light behind it, at the present values.
+
+        It raises NotImplementedError where no light can be told from what is left of it, and when
+        it is evaluated a ParameterError if that is so at a wavelength.
+        """
+        try:
+            matrix = self.mueller()
+        except ParameterError:  # it depends on the wavelength
+            matrix = np.eye(4)
+        if self.n_inputs < len(LIGHT) or _singular(matrix):
+            raise NotImplementedError(f"the Mueller matrix of {self!r} has no inverse")
+        return Inverse(self)
+
+    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
+        """
+        Return a model of one input and one output that draws what the optic does.
+
+        Parameters
+        ----------
+        what : str or Observable
+            ``"mueller"``, an element of the Mueller matrix; ``"I"``, ``"Q"``, ``"U"`` or ``"V"`` of
+            what unpolarized light of intensity one becomes; an
+            `~astropolcal.observations.Observable` where there is a beam splitter; of a single
+            optic also a method of the wavelength, such as ``"retardance"``, or a parameter.
+        element : tuple of int, optional
+            Row and column of the element.
+        against : str
+            ``"wavelength"``, or the stage whose position is the input.
+        wavelength : `~astropy.units.Quantity`, optional
+            The one wavelength of a curve against a stage.
+        **positions : `~astropy.units.Quantity`
+            Positions of other stages, by default those at which the optics stand. One position
+            or, for an observable of several frames, one for each; those of the stage ``against``
+            are added to the input.
+
+        Returns
+        -------
+        `~astropy.modeling.FittableModel`
+            Its parameters are the same objects as those of the optics, of a chain by
+            ``name_parameter``; those with one value per wavelength are left out. After a fit
+            the result has copies of the optics, as its ``chain``.
+
+        Raises
+        ------
+        ParameterError, ChainError
+            If there is no such curve.
+
+        Examples
+        --------
+        The thicknesses of a plate whose retardance was measured:
+
+        >>> import astropy.units as u
+        >>> import numpy as np
+        >>> from astropy.modeling.fitting import TRFLSQFitter
+        >>> from astropolcal.optics import TwoLayerWaveplate
+        >>> wavelength = np.linspace(1.1, 2.4, 9) * u.um
+        >>> measured = TwoLayerWaveplate(w_sio2=1.65 * u.mm).retardance(wavelength)
+        >>> curve = TwoLayerWaveplate().curve("retardance")
+        >>> found = TRFLSQFitter()(curve, wavelength, measured)
+        >>> found.w_sio2.quantity.round(4)
+        <Quantity 1.65 mm>
+        """
+        from astropolcal.optics.curves import curve_of
+
+        return curve_of(self, [self], what, element, against, wavelength, **positions)
 
     def with_parameters(self, **values):
         """
@@ -489,7 +602,43 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             old, fresh = getattr(self, key), getattr(new, key)
             fresh.fixed, fresh.bounds = old.fixed, old.bounds
             fresh.tied, fresh.prior = old.tied, old.prior
+            if fresh.shape == old.shape and fresh.grid is None:
+                fresh.grid = old.grid
         new._position = self._position
+        return new
+
+    def resampled(self, wavelength):
+        """
+        Return a copy with the values per wavelength interpolated at other wavelengths.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Increasing, shape (n_wavelengths,), within those of the values.
+
+        Returns
+        -------
+        Optic
+            Its ``std`` are interpolated too. specutils resamples spectra in other ways.
+
+        Raises
+        ------
+        WavelengthRangeError, ParameterError
+            If the values are not known at a wavelength, or nobody has said at which they are.
+        """
+        grid = np.atleast_1d(length_to_um(wavelength))
+        several = [key for key in self.param_names if getattr(self, key).size > 1]
+        values, stds = {}, {}
+        for key in several:
+            parameter = getattr(self, key)
+            if parameter.grid is None:
+                raise ParameterError(f"{key}: its wavelengths are not known; set {key}.wavelength")
+            values[key] = parameter.at(grid, parameter.value) * (parameter.unit or u.one)
+            stds[key] = None if parameter.std is None else parameter.at(grid, parameter.std)
+        new = self.with_parameters(**values)
+        for key in several:
+            getattr(new, key).wavelength = grid * u.um
+            getattr(new, key).std = stds[key]
         return new
 
     def loosened(self, wavelength):
@@ -500,3 +649,48 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
         own = {key: getattr(self, key) for key in self._declared_settings}
         return {"name": self.name, "mount": self.mount} | own
+
+
+class Inverse(FittableModel):
+    """The model that undoes an optic; it has no parameters of its own."""
+
+    n_inputs = n_outputs = 5
+    standard_broadcasting = False
+
+    def __init__(self, optic):
+        super().__init__(name=optic.name)
+        self.inputs = self.outputs = LIGHT
+        self._optic = optic.copy()
+
+    @property
+    def inverse(self):
+        """The optic."""
+        return self._optic.copy()
+
+    def evaluate(self, wavelength, *light):
+        """Return ``wavelength`` and the Stokes parameters before the optic."""
+        matrix = self._optic.mueller(u.Quantity(wavelength, u.um))
+        if _singular(matrix):
+            raise ParameterError(f"the Mueller matrix of {self._optic!r} has no inverse")
+        rows = np.moveaxis(np.linalg.inv(matrix), (-2, -1), (0, 1))
+        return wavelength, *(sum(m * s for m, s in zip(row, light, strict=True)) for row in rows)
+
+
+Inverse.__or__ = joined
+
+
+def _of_spectrum(spectrum):
+    """Return wavelengths, increasing, values and standard deviations (or None) of a spectrum."""
+    from astropy.nddata import StdDevUncertainty
+
+    wavelength = u.Quantity(spectrum.spectral_axis).to(u.um, u.spectral())
+    order, std = np.argsort(wavelength), spectrum.uncertainty
+    if spectrum.mask is not None and np.any(spectrum.mask):
+        raise ParameterError("a spectrum with masked values; cut or resample it first")
+    if std is not None:
+        std = u.Quantity(std.represent_as(StdDevUncertainty).quantity)[order]
+    return wavelength[order], u.Quantity(spectrum.flux)[order], std
+
+
+def _singular(matrix):
+    return np.any(np.linalg.cond(matrix) > 1e12)

@@ -70,6 +70,8 @@ class _Mirror(Optic):
     real part is the diattenuation -tanh(...), its imaginary part the retardance.
     """
 
+    _laws = {"diattenuation": None, "retardance": u.deg}
+
     @abstractmethod
     def _log_ratio(self, dispersion, *values):
         """Return ln(r_p / r_s)."""
@@ -114,17 +116,28 @@ class _Mirror(Optic):
         good = np.abs(incidence) < np.pi / 2
         self._check(good, "incidence", np.rad2deg(incidence), " deg", "less than 90 deg")
 
-    def _ratio_at(self, wavelength):
-        dispersion, _, values = self._resolve(wavelength, None)
-        return self._log_ratio(dispersion, *values)
+    def _diattenuation(self, dispersion, *values):
+        return -np.tanh(self._log_ratio(dispersion, *values).real)
+
+    def _retardance(self, dispersion, *values):
+        return _wrapped(self._log_ratio(dispersion, *values).imag)
 
     def diattenuation(self, wavelength):
         """Return the diattenuation, positive where s is better reflected than p."""
-        return -np.tanh(self._ratio_at(wavelength).real)
+        dispersion, _, values = self._resolve(wavelength, None)
+        return self._diattenuation(dispersion, *values)
 
     def retardance(self, wavelength):
         """Return the retardance, 0 to 360 deg (Quantity); 180 deg for an ideal mirror."""
-        return np.rad2deg(_wrapped(self._ratio_at(wavelength).imag)) * u.deg
+        dispersion, _, values = self._resolve(wavelength, None)
+        return np.rad2deg(self._retardance(dispersion, *values)) * u.deg
+
+    def _diattenuation_slopes(self, dispersion, *values):
+        ratio, slopes = self._log_slopes(dispersion, *values)
+        return [-(1 - np.tanh(ratio.real) ** 2) * slope.real for slope in slopes]
+
+    def _retardance_slopes(self, dispersion, *values):
+        return [slope.imag for slope in self._log_slopes(dispersion, *values)[1]]
 
     def law_slopes(self, wavelength):
         """
@@ -134,14 +147,15 @@ class _Mirror(Optic):
         ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
         """
         dispersion, _, values = self._resolve(wavelength, None)
-        ratio, slopes = self._log_slopes(dispersion, *values)
-        # as in _derivatives: slopes of ln(r_p / r_s) are per canonical unit
-        steepness = 1 - np.tanh(ratio.real) ** 2
-        found = {"diattenuation": {}, "retardance": {}}
-        for key, slope in zip(self.own_names, slopes, strict=True):
-            per_unit = slope * canonical_factor(getattr(self, key).unit)
-            found["diattenuation"][key] = -steepness * per_unit.real
-            found["retardance"][key] = np.rad2deg(per_unit.imag)
+        # slopes are per canonical unit
+        factors = [canonical_factor(getattr(self, key).unit) for key in self.own_names]
+        found = {}
+        for law, slopes_of, unit in (
+            ("diattenuation", self._diattenuation_slopes, 1.0),
+            ("retardance", self._retardance_slopes, np.rad2deg(1.0)),
+        ):
+            slopes = zip(self.own_names, slopes_of(dispersion, *values), factors, strict=True)
+            found[law] = {key: unit * factor * slope for key, slope, factor in slopes}
         return found
 
     def loosened(self, wavelength):

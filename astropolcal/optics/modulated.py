@@ -69,10 +69,9 @@ class FrameOptic(Optic):
     turns = False
     takes_numbers = True
 
-    def _resolve(self, wavelength, position, parameters=None):
+    def _dispersion_at(self, wavelength):
         # no law in wavelength: the coordinate takes the place of the dispersion
-        _, shift, values = self._read(wavelength, position, parameters)
-        return (*self._moved(0.0, values[0], shift), values[1:])
+        return 0.0
 
     def _moved(self, coordinate, angle, shift):
         # a rotator before the plate stays where it is while its amplitude follows the stage

@@ -291,7 +291,7 @@ class MuellerElement(Optic):
     >>> from astropolcal.optics import MuellerElement
     >>> element = MuellerElement.from_matrix(np.diag([1, 0.9, 0.9, 0.8]), name="window")
     >>> element.m33
-    Parameter('m33', value=0.8, fixed=True, bounds=(-1, 1))
+    OpticParameter('m33', value=0.8, fixed=True, bounds=(-1, 1))
     """
 
     m00, m01, m02, m03 = (_element(0, j) for j in range(4))

@@ -7,7 +7,6 @@ from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import (
-    _diattenuator,
     _diattenuator_retarder,
     blank,
     diattenuation_slope,
@@ -91,7 +90,7 @@ class Diattenuator(Optic):
     )
 
     def _matrix(self, dispersion, diattenuation):
-        return _diattenuator(diattenuation)
+        return _diattenuator_retarder(diattenuation, 0.0)
 
     def _derivatives(self, dispersion, diattenuation):
         return (diattenuation_slope(diattenuation, 1.0, 0.0),)

@@ -94,6 +94,8 @@ class TwoLayerWaveplate(Optic):
         default=1.27711, unit=u.mm, bounds=(0, None), description="thickness of the MgF2 layer"
     )
 
+    _laws = {"retardance": u.deg}
+
     def _dispersion(self, wavelength):
         # retardance per micrometre of each layer, shape (2, n_wavelengths); crossed axes subtract
         phase = 2 * np.pi / np.asarray(wavelength)
@@ -104,17 +106,23 @@ class TwoLayerWaveplate(Optic):
             ]
         )
 
-    def _matrix(self, dispersion, w_sio2, w_mgf2):
-        return _linear_retarder(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
+    def _retardance(self, dispersion, w_sio2, w_mgf2):
+        return w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]
 
-    def _derivatives(self, dispersion, w_sio2, w_mgf2):
-        slope = retardance_slope(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
+    def _retardance_slopes(self, dispersion, w_sio2, w_mgf2):
+        return tuple(dispersion)
+
+    def _matrix(self, dispersion, *thicknesses):
+        return _linear_retarder(self._retardance(dispersion, *thicknesses))
+
+    def _derivatives(self, dispersion, *thicknesses):
+        slope = retardance_slope(self._retardance(dispersion, *thicknesses))
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
         """Return the retardance at a wavelength of any shape, in degree and not wrapped."""
-        dispersion, _, (w_sio2, w_mgf2) = self._resolve(wavelength, None)
-        return (w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]) * u.rad.to(u.deg) * u.deg
+        dispersion, _, thicknesses = self._resolve(wavelength, None)
+        return self._retardance(dispersion, *thicknesses) * u.rad.to(u.deg) * u.deg
 
     def loosened(self, wavelength):
         """Return the linear retarder of the same retardances, free at each wavelength."""

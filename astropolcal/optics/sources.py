@@ -8,7 +8,59 @@ from astropy.modeling import Parameter
 from astropolcal.mueller import blank
 from astropolcal.optics.core import Optic
 
-__all__ = ["PolarizedSource", "StarSource"]
+__all__ = ["Light", "PolarizedSource", "StarSource"]
+
+
+class Light(Optic):
+    r"""
+    Light of given Stokes parameters: a model with one input, the wavelength.
+
+    .. math:: M = \begin{pmatrix}I&0&0&0\\Q&0&0&0\\U&0&0&0\\V&0&0&0\end{pmatrix}
+
+    First in a chain it takes the place of the light that arrives: the chain then has the
+    wavelength as its only input. Behind ``Mapping((1,), n_inputs=5)`` of astropy, which picks
+    the intensity, the chain is a model of one input and one output, which every fitter takes.
+
+    Parameters
+    ----------
+    I, Q, U, V : float or array_like
+        Stokes parameters; scalars, or one value per wavelength. All are fixed by default.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes of Q and U.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.modeling.models import Mapping
+    >>> from astropolcal.optics import Light, LinearRetarder
+    >>> plate = LinearRetarder(retardance=180 * u.deg, theta=20 * u.deg, name="plate")
+    >>> curve = Light(Q=1) | plate | Mapping((2,), n_inputs=5)
+    >>> curve([1.2, 1.6] * u.um).round(4)
+    array([0.1736, 0.1736])
+    """
+
+    n_inputs = 1
+
+    I = Parameter(default=1.0, bounds=(0, None), fixed=True, description="intensity")  # noqa: E741
+    Q = Parameter(default=0.0, fixed=True, description="Q of the light")
+    U = Parameter(default=0.0, fixed=True, description="U of the light")
+    V = Parameter(default=0.0, fixed=True, description="V of the light")
+
+    def _matrix(self, dispersion, *stokes):
+        out = blank(*stokes)
+        for i, value in enumerate(stokes):
+            out[..., i, 0] = value
+        return out
+
+    def _derivatives(self, dispersion, *stokes):
+        return tuple(_unit_element(row, *stokes) for row in range(4))
+
+    def evaluate(self, wavelength, *parameters):
+        """Return ``wavelength`` and the Stokes parameters of the light."""
+        stokes = self._light_behind(
+            wavelength, (np.ones(np.shape(wavelength)), 0, 0, 0), parameters
+        )
+        return wavelength, *stokes
 
 
 class PolarizedSource(Optic):
@@ -56,8 +108,8 @@ class PolarizedSource(Optic):
         return tuple(_unit_element(row, q, u) for row in (1, 2))
 
 
-def _unit_element(row, q, u):
-    out = blank(q, u)
+def _unit_element(row, *values):
+    out = blank(*values)
     out[..., row, 0] = 1.0
     return np.asarray(out)
 

@@ -22,6 +22,10 @@ MINUS, SIGMA = "\N{MINUS SIGN}", "\N{GREEK SMALL LETTER SIGMA}"
 # more names than this do not fit into a title
 _MAX_NAMES = 2
 _DPI = 150
+# a larger ratio between the extremes is drawn on a logarithmic axis
+_LOGARITHMIC_FROM = 6
+# more labels than these do not fit below a panel
+_MAX_GROUPS = 12
 
 _SETTINGS = {
     "font.size": 11,
@@ -123,6 +127,17 @@ def draw_band(axes, x, value, error, color, alpha, label=None):
     axes.fill_between(x, value - error, value + error, **look)
 
 
+def draw_points(axes, x, value, std, labels, **look):
+    """Draw points with their errors, and hollow ones where there is none; labels of both."""
+    known = np.isfinite(std)
+    look |= {"linestyle": "none"}
+    if known.any():
+        axes.errorbar(x[known], value[known], yerr=std[known], label=labels[0], **look)
+    if not known.all():
+        look |= {"markerfacecolor": "white", "label": labels[1]}
+        axes.plot(x[~known], value[~known], **look)
+
+
 def note(axes, text, **look):
     """Write a sentence where there is nothing to draw."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **look)
@@ -185,3 +200,72 @@ def legend_entries(panels):
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     return entries
+
+
+def grid(figure, count, columns, **share):
+    """Return ``count`` panels in rows of ``columns``, and those with none below them."""
+    panels = figure.subplots(-(-count // columns), columns, squeeze=False, **share).ravel()
+    for empty in panels[count:]:
+        empty.remove()
+    lowest = panels[:count][-columns:]
+    for axes in lowest:
+        axes.tick_params(labelbottom=True)
+    return panels[:count], lowest
+
+
+def scale_axis(axes, values):
+    """Use a logarithmic axis where the values need it, with plain numbers on it."""
+    # zero stands for what is missing and has no logarithm
+    known = values[np.isfinite(values) & (values > 0)]
+    if known.size and known.max() > _LOGARITHMIC_FROM * known.min():
+        axes.set_yscale("log")
+        axes.set_ylim(known.min() / 1.3, known.max() * 1.3)
+        plain_numbers(axes)
+    else:
+        # values of similar size are compared by their lengths from zero
+        axes.set_ylim(0, 1.08 * known.max() if known.size else None)
+
+
+def plain_numbers(axes):
+    """Write numbers on a logarithmic axis, and not only powers of ten, of which half has none."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def color_limit(values, covered):
+    """Return the end of a colour scale that covers a share (%) of the values, and if all."""
+    size = np.abs(values[np.isfinite(values)])
+    # exact data would leave a scale of no width
+    limit = max(np.percentile(size, covered), 1e-12)
+    return limit, bool(size.max() > limit)
+
+
+def draw_map(axes, values, nm, limit):
+    """Draw residuals (percent, (W, N)) in the order of the wavelength; what is masked is grey."""
+    order = np.argsort(nm)
+    look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "rasterized": True}
+    axes.grid(False)
+    axes.set_facecolor("0.75")
+    axes.set_ylabel("wavelength (nm)")
+    cells = np.ma.masked_invalid(values[order])
+    return axes.pcolormesh(np.arange(len(values.T) + 1), cell_edges(nm[order]), cells, **look)
+
+
+def color_bar(figure, drawn, panels, clipped, scale=";"):
+    """Add the bar of one or several maps."""
+    extend = "both" if clipped else "neither"
+    bar = figure.colorbar(drawn, ax=panels, extend=extend, shrink=0.8, aspect=35)
+    bar.set_label(f"observed {MINUS} model (%){scale} grey: masked")
+
+
+def name_groups(axes, ends, labels, label):
+    """Name runs of data, which end at these numbers, below their middles, as far as they fit."""
+    # rounded up, so that there are never more labels than fit
+    step = -(-len(ends) // _MAX_GROUPS)
+    middles = (np.concatenate([[0], ends[:-1]]) + ends) / 2
+    axes.set_xticks(middles[::step], labels=labels[::step])
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlabel(label)

@@ -28,6 +28,7 @@ from astropolcal.plotting._style import (
     legend_outside,
     looks,
     nanometres,
+    scale_axis,
     style,
     wavelength_label,
 )
@@ -46,11 +47,10 @@ _CURVES = {
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
 _NOT_KNOWN = "{}: not known (too few data or groups)"
+_PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
 _STANDARD_MARKERS = ("D", "v", "P", "X")
 _STANDARD_STYLES = ("-", "--", ":", "-.")
-_REFERENCE_STYLES = ("--", ":", "-.")
-# a larger ratio between the extremes is drawn on a logarithmic axis
-_LOGARITHMIC_FROM = 6
+_DASHES = ("--", ":", "-.")
 
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
@@ -108,48 +108,62 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     others = [entry for entry in standards if entry["source"] not in sources]
     count = len(records) + len(others)
     grids = [r.accuracy for r in records] + [entry["wavelength_nm"] for entry in standards]
-    if len(records) > 1 and not curves and all(len(grid) == 1 for grid in grids):
-        return _draw_side_by_side(figure, calibration, records, standards)
+    one_panel = len(records) > 1 and not curves and all(len(lam) == 1 for lam in grids)
     with style():
-        figure = canvas(figure, 8.5, 2.4 + 3.6 * count)
+        size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
+        figure = canvas(figure, *size)
         # one scale, so that datasets can be compared by eye
-        panels = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        # by name, for the curves of all panels look alike and share one legend
-        handles = {}
-        for axes, record in zip(panels, records, strict=False):
-            name = f"{record.name}: " if count > 1 else ""
-            k = np.max(record.accuracy["k"])
-            counts = f"n = {_span(record.accuracy['n'])} data a wavelength, k = {k} free parameters"
-            axes.set_title(name + counts)
-            handles |= _draw_record(axes, record, calibration)
-        looks = {
-            entry["content_hash"]: {"marker": marker, "linestyle": line}
-            for entry, marker, line in zip(
-                standards, cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False
-            )
-        }
-        own = [[e for e in standards if e["source"] == record.source] for record in records]
-        for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
-            for entry in entries:
-                handles |= _draw_standard(axes, entry, looks[entry["content_hash"]])
-        for axes, entry in zip(panels[len(records) :], others, strict=True):
-            axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
-            look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
-            lam, s_cv = entry["wavelength_nm"], entry["s_cv_percent"]
-            handles["s_cv for comparison"] = draw_line(axes, lam, s_cv, **look)
+        share = {"sharex": True, "sharey": True, "squeeze": False}
+        panels = figure.subplots(1 if one_panel else count, 1, **share)[:, 0]
+        if one_panel:
+            _draw_side_by_side(panels[0], calibration, records, standards)
+        else:
+            _draw_panels(panels, calibration, records, standards, others, curves)
+            wavelength_label(panels[-1])
         for axes in panels:
-            references = [
-                axes.plot(lam, value, color=BLACK, linestyle=line, label=label)[0]
-                for (label, (lam, value)), line in zip(
-                    curves.items(), cycle(_REFERENCE_STYLES), strict=False
-                )
-            ]
             axes.set_ylabel("accuracy (% of polarization)")
-        _scale_axis(panels[0], _all_values(records, standards, curves))
-        wavelength_label(panels[-1])
+        values = [record.accuracy[key].to_value(u.percent) for record in records for key in _CURVES]
+        values += [np.array(entry["s_standard_percent"]) for entry in standards]
+        scale_axis(panels[0], np.concatenate([*values, *(value for _, value in curves.values())]))
         heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
-        legend_outside(figure, [*handles.values(), *references])
+        # by label, for the curves of all panels look alike and share one legend
+        legend_outside(figure, list(legend_entries(panels).values()))
     return figure
+
+
+def _draw_panels(panels, calibration, records, standards, others, curves):
+    """Draw the accuracies of the datasets, then of what was not fitted, over the wavelength."""
+    for axes, record in zip(panels, records, strict=False):
+        name = f"{record.name}: " if len(panels) > 1 else ""
+        counts = f"n = {_span(record.accuracy['n'])} data a wavelength"
+        axes.set_title(f"{name}{counts}, k = {np.max(record.accuracy['k'])} free parameters")
+        lam = nanometres(record.accuracy["wavelength"])
+        for key, (color, marker, _) in _CURVES.items():
+            values = record.accuracy[key].to_value(u.percent)
+            # a curve that is missing is said to be so in the legend, not left out
+            label = _label(key, values, calibration)
+            draw_line(axes, lam, values, color=color, marker=marker, label=label)
+    own = [[e for e in standards if e["source"] == record.source] for record in records]
+    looks = zip(cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False)
+    looks = {id(entry): look for entry, look in zip(standards, looks, strict=False)}
+    for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
+        for entry in entries:
+            marker, line = looks[id(entry)]
+            look = {"color": PURPLE, "marker": marker, "linestyle": line}
+            look["label"] = _PREDICTED.format(entry["name"])
+            draw_line(axes, entry["wavelength_nm"], entry["s_standard_percent"], **look)
+    for axes, entry in zip(panels[len(records) :], others, strict=True):
+        axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
+        look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
+        draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
+    for axes in panels:
+        for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
+            axes.plot(lam, value, color=BLACK, linestyle=line, label=label)
+
+
+def _label(key, values, calibration):
+    label = _CURVES[key][2].format(what_is_left_out(calibration))
+    return label if np.isfinite(values).any() else _NOT_KNOWN.format(key)
 
 
 def _reference(label, pair):
@@ -169,91 +183,30 @@ def _reference(label, pair):
     return lam, value
 
 
-def _draw_side_by_side(figure, calibration, records, standards):
-    """Draw one panel of points over the datasets, then the standards."""
-    values = {
-        name: np.array([record.accuracy[name].to_value(u.percent)[0] for record in records])
-        for name in _CURVES
-    }
+def _draw_side_by_side(axes, calibration, records, standards):
+    """Draw points over the datasets, then over the standards."""
     at, after = np.arange(len(records)), len(records) + np.arange(len(standards))
-    with style():
-        figure = canvas(figure, max(8.5, 2.5 + 0.6 * (len(at) + len(after))), 7.0)
-        axes = figure.subplots()
-        for name, (color, marker, label) in _CURVES.items():
-            label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
-            if not np.isfinite(values[name]).any():
-                label, marker = _NOT_KNOWN.format(name), ""
-            axes.plot(at, values[name], marker=marker, ls="", color=color, label=label)
-        if standards:
-            predicted = [entry["s_standard_percent"][0] for entry in standards]
-            label = "s_standard: rms error when predicting a standard, which was not fitted"
-            axes.plot(after, predicted, "D", color=PURPLE, label=label)
-            compared = [entry["s_cv_percent"][0] for entry in standards]
-            axes.plot(after, compared, "_", color=GREEN, markersize=14, label=_COMPARED)
-        names = [
-            f"{record.name}\n{nanometres(record.accuracy['wavelength'])[0]:.0f} nm"
-            for record in records
-        ] + [f"{entry['name']}\n{entry['wavelength_nm'][0]:.0f} nm" for entry in standards]
-        axes.set_xticks([*at, *after], names, rotation=35, ha="right", fontsize=9.5)
-        axes.set_ylabel("accuracy (% of polarization)")
-        n = [count for record in records for count in record.accuracy["n"]]
-        k = _span([k for record in records for k in record.accuracy["k"]])
-        axes.set_title(f"n = {_span(n)} data a dataset, k = {k} free parameters")
-        _scale_axis(axes, _all_values(records, standards, {}))
-        heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
-        legend_outside(figure, axes.get_legend_handles_labels()[0])
-    return figure
-
-
-def _draw_record(axes, record, calibration):
-    """Draw the curves of a dataset; return them by name."""
-    drawn = {}
-    for name, (color, marker, label) in _CURVES.items():
-        values = record.accuracy[name].to_value(u.percent)
-        label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
-        # a curve that is missing is said to be so in the legend, not left out
-        if not np.isfinite(values).any():
-            label = _NOT_KNOWN.format(name)
-        lam = nanometres(record.accuracy["wavelength"])
-        drawn[name] = draw_line(axes, lam, values, color=color, marker=marker, label=label)
-    return drawn
-
-
-def _draw_standard(axes, entry, look):
-    label = f"s_standard: rms error when predicting {entry['name']}, which was not fitted"
-    line = draw_line(
-        axes, entry["wavelength_nm"], entry["s_standard_percent"], color=PURPLE, label=label, **look
-    )
-    return {entry["content_hash"]: line}
+    for key, (color, marker, _) in _CURVES.items():
+        values = np.array([record.accuracy[key].to_value(u.percent)[0] for record in records])
+        marker = marker if np.isfinite(values).any() else ""
+        label = _label(key, values, calibration)
+        axes.plot(at, values, marker=marker, ls="", color=color, label=label)
+    if standards:
+        predicted = [entry["s_standard_percent"][0] for entry in standards]
+        axes.plot(after, predicted, "D", color=PURPLE, label=_PREDICTED.format("a standard"))
+        compared = [entry["s_cv_percent"][0] for entry in standards]
+        axes.plot(after, compared, "_", color=GREEN, markersize=14, label=_COMPARED)
+    places = [(r.name, nanometres(r.accuracy["wavelength"])[0]) for r in records]
+    places += [(entry["name"], entry["wavelength_nm"][0]) for entry in standards]
+    names = [f"{name}\n{lam:.0f} nm" for name, lam in places]
+    axes.set_xticks([*at, *after], names, rotation=35, ha="right", fontsize=9.5)
+    n, k = (_span([i for r in records for i in r.accuracy[key]]) for key in "nk")
+    axes.set_title(f"n = {n} data a dataset, k = {k} free parameters")
 
 
 def _span(n):
     low, high = np.min(n), np.max(n)
     return f"{low}" if low == high else f"{low} to {high}"
-
-
-def _all_values(records, standards, curves):
-    values = [record.accuracy[name].to_value(u.percent) for record in records for name in _CURVES]
-    values += [np.array(entry["s_standard_percent"]) for entry in standards]
-    return np.concatenate([*values, *(value for _, value in curves.values())])
-
-
-def _scale_axis(axes, values):
-    """Use a logarithmic axis where the values need it, with plain numbers on it."""
-    # zero stands for what is missing and has no logarithm
-    known = values[np.isfinite(values) & (values > 0)]
-    if known.size and known.max() > _LOGARITHMIC_FROM * known.min():
-        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-        axes.set_yscale("log")
-        axes.set_ylim(known.min() / 1.3, known.max() * 1.3)
-        # powers of ten alone would give an axis over half a decade no number at all
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        # accuracies of similar size are compared by their lengths from zero
-        axes.set_ylim(0, 1.08 * known.max() if known.size else None)
 
 
 # ---- targets --------------------------------------------------------------------------------
@@ -347,7 +300,7 @@ def _draw_parts(axes, table):
         # what is exactly zero stands for a calibration that is missing
         handles.append(draw_line(axes, lam, value, label=label, **look))
         values.append(value)
-    _scale_axis(axes, np.concatenate(values))
+    scale_axis(axes, np.concatenate(values))
     return handles
 
 
@@ -363,7 +316,7 @@ def _draw_targets(axes, tables, key):
         look |= {"markerfacecolor": "none"} if below else {}
         lines.append(draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
         values.append(value)
-    _scale_axis(axes, np.concatenate(values))
+    scale_axis(axes, np.concatenate(values))
     return lines
 
 

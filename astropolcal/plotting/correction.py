@@ -13,10 +13,12 @@ from astropolcal.plotting._style import (
     VERMILION,
     canvas,
     draw_band,
+    legend_entries,
     legend_outside,
     mean_known,
     nanometres,
     note,
+    plain_numbers,
     style,
     wavelength_label,
 )
@@ -27,6 +29,9 @@ __all__ = ["plot_images"]
 _QUANTILE = 0.995
 _COLORS = {"q": BLUE, "u": VERMILION, "v": GREEN}
 _MARKERS = {"q": "o", "u": "s", "v": "^"}
+# statistical and systematic error of the degree
+_LINES = (("o-", BLACK), ("s--", GREEN))
+_POLARIZED = ("Q", "U", "Q$_\\phi$", "U$_\\phi$")
 
 
 def plot_corrected(corrected, **options):
@@ -75,12 +80,11 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     if corrected.stokes.ndim != 4:
         raise ParameterError("these are spectra; plot_spectrum draws them")
     panels = _panels(corrected, _chosen(corrected, wavelength))
+    # Q, U and their azimuthal components hold the same flux: one scale for all four
+    limit = _top(np.abs([panels[name] for name in _POLARIZED]))
     with style():
         figure = canvas(figure, 12.5, 8.2)
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
-        polarized = [np.abs(panels[name]) for name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$")]
-        # Q, U and their azimuthal components hold the same flux: one scale for all four
-        limit = _top(np.stack(polarized))
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             _panel(figure, axes, name, image, corrected, limit)
         for axes in grid[:, 0]:
@@ -104,22 +108,22 @@ def _chosen(corrected, wavelength):
 def _panels(corrected, chosen):
     """Return the images by name, in the order of the panels."""
     found = corrected.azimuthal()
-    images = {name: corrected[name][chosen] for name in "IQU"}
-    images |= {"Q$_\\phi$": found["q_phi"][chosen], "U$_\\phi$": found["u_phi"][chosen]}
-    panels = {name: mean_known(values) for name, values in images.items()}
-    error = corrected.error("Q")[chosen]
-    kind = "statistical error of Q"
+    images = [corrected[name][chosen] for name in "IQU"]
+    images += [found[name][chosen] for name in ("q_phi", "u_phi")]
+    panels = dict(zip(("I", *_POLARIZED), map(mean_known, images), strict=True))
+    error, kind = corrected.error("Q")[chosen], "statistical"
     if not np.isfinite(error).any():
-        error, kind = corrected.error("Q", "systematic")[chosen], "systematic error of Q"
+        error, kind = corrected.error("Q", "systematic")[chosen], "systematic"
     # errors of wavelengths are independent if they are statistical, and hardly if not
-    power = 2 if kind.startswith("stat") else 1
-    panels[kind] = mean_known(error**power) ** (1 / power) / len(chosen) ** (1 - 1 / power)
-    return panels
+    power = 2 if kind == "statistical" else 1
+    mean = mean_known(error**power) ** (1 / power) / len(chosen) ** (1 - 1 / power)
+    return panels | {f"{kind} error of Q": mean}
 
 
 def _panel(figure, axes, name, image, corrected, limit):
     """Draw one image with its own scale of brightness, or the common one of polarization."""
-    if name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$"):
+    look = {"cmap": "viridis", "vmin": 0.0, "vmax": _top(image)}
+    if name in _POLARIZED:
         look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     elif name == "I":
         from matplotlib.colors import LogNorm
@@ -130,19 +134,16 @@ def _panel(figure, axes, name, image, corrected, limit):
         look = {"cmap": "viridis", "norm": LogNorm(low, top)}
         # what is darker, or negative, gets the darkest colour, not that of missing pixels
         image = np.where(image < low, low, image)
-    else:
-        look = {"cmap": "viridis", "vmin": 0.0, "vmax": _top(image)}
     drawn = axes.imshow(image, origin="lower", extent=_extent(corrected), **look)
     axes.grid(False)
     axes.set_facecolor("0.75")
     axes.set_title(name)
-    axes.plot(0, 0, "+", color=BLACK if "cmap" in look and look["cmap"] == "RdBu_r" else "white")
+    axes.plot(0, 0, "+", color=BLACK if name in _POLARIZED else "white")
     low, high = drawn.get_clim()
     with np.errstate(invalid="ignore"):
         beyond = (image > high).any() + 2 * (image < low).any()
-    bar = figure.colorbar(
-        drawn, ax=axes, shrink=0.85, extend=("neither", "max", "min", "both")[beyond]
-    )
+    extend = ("neither", "max", "min", "both")[beyond]
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.85, extend=extend)
     bar.set_label(f"flux ({corrected.unit.to_string()} per pixel)")
 
 
@@ -156,18 +157,12 @@ def _extent(corrected):
     """Return the edges of the image about the star; east is positive and to the left."""
     height, width = corrected.stokes.shape[2:]
     x, y = corrected._middle()
-    step = _step(corrected)
+    # milliarcseconds to arcseconds
+    step = 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
     # pixel centres are whole numbers: the image reaches half a pixel further
     edges = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
-    if corrected.north_up:
-        # east is to the left on the sky
-        edges[:2] *= -1
-    return edges
-
-
-def _step(corrected):
-    # milliarcseconds to arcseconds
-    return 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
+    # east is to the left on the sky
+    return edges * ([-1, -1, 1, 1] if corrected.north_up else 1)
 
 
 def _axis_label(corrected, direction):
@@ -177,12 +172,9 @@ def _axis_label(corrected, direction):
 
 def _heading(corrected, wavelength):
     nm = nanometres(corrected.wavelength)
-    of = (
-        f"mean of {corrected.determined[:, :3].all(axis=1).sum()} wavelengths, "
-        f"{nm.min():.0f} to {nm.max():.0f} nm"
-        if wavelength is None
-        else f"{nm[wavelength]:.0f} nm"
-    )
+    count = corrected.determined[:, :3].all(axis=1).sum()
+    of = f"mean of {count} wavelengths, {nm.min():.0f} to {nm.max():.0f} nm"
+    of = of if wavelength is None else f"{nm[wavelength]:.0f} nm"
     return f"Corrected Stokes parameters ({_MODES[corrected.mode]})\n{of}"
 
 
@@ -204,10 +196,11 @@ def plot_spectrum(corrected, *, figure=None):
         _error_lines(middle, nm, corrected)
         bottom.plot(nm, corrected.condition, "o-", color=PURPLE)
         bottom.set_ylabel("condition")
-        # 1 is the condition of an ideal instrument, the best there is
-        bottom.set_ylim(bottom=1 if np.nanmax(corrected.condition) < 1e3 else None)
         if np.nanmax(corrected.condition) >= 1e3:
             bottom.set_yscale("log")
+        else:
+            # 1 is the condition of an ideal instrument, the best there is
+            bottom.set_ylim(bottom=1)
         wavelength_label(bottom)
         figure.suptitle(f"Corrected polarization ({_MODES[corrected.mode]})")
         legend_outside(figure, _handles(top, middle), columns=len(corrected.components))
@@ -217,12 +210,9 @@ def plot_spectrum(corrected, *, figure=None):
 
 def _handles(*all_axes):
     """Return what a legend shows: the errors of each quantity below each other."""
-    found = []
-    for axes in all_axes:
-        handles, labels = axes.get_legend_handles_labels()
-        # the statistical error comes first, in the order of q, u, v
-        found += [handle for _, handle in sorted(zip(labels, handles, strict=True), key=_first)]
-    return found
+    found = [sorted(legend_entries([axes]).items(), key=_first) for axes in all_axes]
+    # the statistical error comes first, in the order of q, u, v
+    return [handle for entries in found for _, handle in entries]
 
 
 def _first(labelled):
@@ -230,36 +220,29 @@ def _first(labelled):
 
 
 def _values(axes, nm, corrected, name):
-    value = 100 * getattr(corrected, name)
-    statistical = 100 * corrected.fractional_errors()[name]
-    systematic = 100 * corrected.fractional_errors("systematic")[name]
-    color = _COLORS[name]
+    value, color = 100 * getattr(corrected, name), _COLORS[name]
+    statistical, systematic = (
+        100 * corrected.fractional_errors(kind)[name] for kind in ("statistical", "systematic")
+    )
     known = np.isfinite(statistical)
     label = f"{name}, statistical error" if known.any() else name
     # a point without an error keeps its place and has no bar
     bars = np.where(known, statistical, 0.0)
     axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
-    if np.isfinite(systematic).any():
-        band = np.where(np.isfinite(systematic), systematic, np.nan)
+    if (known := np.isfinite(systematic)).any():
+        band = np.where(known, systematic, np.nan)
         draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")
 
 
 def _error_lines(axes, nm, corrected):
     known = corrected.polarization()
-    looks = {"statistical": (BLACK, "o-"), "systematic": (GREEN, "s--")}
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    drawn = False
-    for kind, (color, line) in looks.items():
-        values = 100 * known[f"s_p_{kind}"]
+    errors = [100 * known[f"s_p_{kind}"] for kind in ("statistical", "systematic")]
+    for values, label, look in zip(errors, ("statistical", "systematic"), _LINES, strict=True):
         if np.isfinite(values).any():
-            axes.plot(nm, values, line, color=color, label=f"$s_p$, {kind}")
-            drawn = True
+            axes.plot(nm, values, look[0], color=look[1], label=f"$s_p$, {label}")
     axes.set_ylabel("error of the degree (%)")
-    if drawn:
+    if axes.lines:
         axes.set_yscale("log")
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-            set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        plain_numbers(axes)
     else:
         note(axes, "no errors are known")

@@ -14,6 +14,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     GREY,
     canvas,
+    draw_line,
     legend_outside,
     looks,
     nanometres,
@@ -31,6 +32,7 @@ _MOST_LINES = 6
 _LEAST_SPECTRUM = 8
 # white contours on the dark end of the colours, black ones on the bright end
 _LEVELS = (0.2, 0.4, 0.6, 0.8, 0.9)
+_SHARE = "measured share of the polarization"
 
 
 def plot_polarimetric_efficiency(
@@ -41,10 +43,9 @@ def plot_polarimetric_efficiency(
     parallactic=0 * u.deg,
     derotator=90 * u.deg,
     shown=None,
-    instrument=None,
-    mode=None,
     title=None,
     figure=None,
+    **settings,
 ):
     """
     Draw the polarimetric efficiency of an instrument, see `polarimetric_efficiency`.
@@ -55,9 +56,8 @@ def plot_polarimetric_efficiency(
     the parallactic angle, or against the wavelength behind an internal source.
     """
     lam, moving = nanometres(wavelength), stages(chain)
-    at = {"altitude": altitude} if "altitude" in moving else {}
-    at |= {"parallactic": parallactic} if "parallactic" in moving else {}
-    settings = {"instrument": instrument, "mode": mode}
+    at = {"altitude": altitude, "parallactic": parallactic}
+    at = {key: angle for key, angle in at.items() if key in moving}
     asked = partial(polarimetric_efficiency, chain, wavelength, **settings)
     # without an altitude axis there is no pointing to map
     turns, maps = has_derotator(chain), "altitude" in at
@@ -90,19 +90,20 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
     """
     # offsets may have been tried in any order
     table = best.table[np.argsort(best.table["offset"])]
-    offset, marked = table["offset"].to_value(u.deg), best.offset.to_value(u.deg)
+    offset = table["offset"].to_value(u.deg)
+    # markers tell the lines apart without colour; at all offsets they would be a band
+    every = max(1, len(offset) // 12)
     with style():
         fig = canvas(figure, 6.5, 5.2)
         ax = fig.subplots()
         for (color, marker), name in zip(looks(2), ("mean", "least"), strict=True):
-            # markers tell the lines apart without colour; at all offsets they would be a band
-            every = max(1, len(offset) // 12)
             ax.plot(offset, table[name], color=color, marker=marker, markevery=every, label=name)
         words = f"best offset, {_degree(best.offset)}"
+        marked = best.offset.to_value(u.deg)
         ax.axvline(marked, color="black", linestyle="--", label=words, zorder=1)
         # optics before the analyzer may add polarization of their own
+        ax.set(xlabel="derotator offset (deg)", ylabel=_SHARE)
         ax.set(ylim=(-0.02, 1.02 * max(1.0, np.max(table["mean"]))))
-        ax.set(xlabel="derotator offset (deg)", ylabel="measured share of the polarization")
         ax.set_title(f"{best.law} still; over all times and wavelengths")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
         fig.suptitle(title or "Polarimetric efficiency of an observation")
@@ -116,9 +117,8 @@ def _without_derotator(ax, lam, asked, shown, on_sky):
         _lines(ax, lam, angles, asked(parallactic=angles * u.deg), shown)
         ax.set(xlabel="parallactic angle (deg)", xlim=(-180, 180), xticks=np.arange(-180, 181, 90))
         return
-    order = np.argsort(lam)
-    ax.plot(lam[order], np.atleast_2d(asked())[0][order], marker="o")
-    ax.set(xlabel="wavelength (nm)", ylabel="measured share of the polarization", ylim=(0, 1.02))
+    draw_line(ax, lam, np.atleast_2d(asked())[0], marker="o")
+    ax.set(xlabel="wavelength (nm)", ylabel=_SHARE, ylim=(0, 1.02))
 
 
 def _degree(angle):
@@ -132,16 +132,10 @@ def _lines(ax, lam, angles, values, shown):
         # two wavelengths asked for may be nearest to the same one
         rows = np.unique(np.abs(nanometres(shown)[:, None] - lam).argmin(axis=1))
     for (color, marker), row in zip(looks(len(rows)), rows, strict=True):
-        ax.plot(
-            angles,
-            values[:, row],
-            color=color,
-            marker=marker,
-            # markers tell the lines apart without colour; at all points they would be a band
-            markevery=6,
-            label=f"{lam[row]:.0f} nm",
-        )
-    ax.set(ylabel="measured share of the polarization", ylim=(0, 1.02))
+        # markers tell the lines apart without colour; at all points they would be a band
+        look = {"color": color, "marker": marker, "markevery": 6, "label": f"{lam[row]:.0f} nm"}
+        ax.plot(angles, values[:, row], **look)
+    ax.set(ylabel=_SHARE, ylim=(0, 1.02))
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
 
 
@@ -149,20 +143,26 @@ def _map_of_wavelengths(fig, ax, lam, values):
     order = np.argsort(lam)
     # between a few filters there is nothing to interpolate
     filters = lam.size < _LEAST_SPECTRUM
-    y = np.arange(lam.size) if filters else lam[order]
-    mesh = _mesh(ax, _DEROTATOR, y, values.T[order], contours=not filters)
+    y, values = np.arange(lam.size) if filters else lam[order], values.T[order]
+    # 0 to 1 in all maps of wavelengths, so that colours of two instruments mean the same
+    look = {"cmap": "cividis", "vmin": 0, "vmax": 1, "shading": "nearest"}
+    mesh = ax.pcolormesh(_DEROTATOR, y, values, **look)
+    for levels, color in () if filters else ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")):
+        # a level that no value reaches is no fault
+        inside = [level for level in levels if values.min() < level < values.max()]
+        if inside:
+            look = {"levels": inside, "colors": color, "linewidths": 0.8}
+            ax.clabel(ax.contour(_DEROTATOR, y, values, **look), fmt="%g", fontsize=9)
+    ax.grid(False)
     if filters:
         ax.set_yticks(y, [f"{value:.0f}" for value in lam[order]])
     ax.set(xlabel="derotator angle (deg)", ylabel="wavelength (nm)", xticks=np.arange(0, 181, 45))
-    fig.colorbar(mesh, ax=ax, label="measured share of the polarization")
+    fig.colorbar(mesh, ax=ax, label=_SHARE)
 
 
 def _map_of_pointings(fig, ax, asked, derotator):
-    values = asked(
-        derotator=derotator,
-        altitude=_ALTITUDE[:, None] * u.deg,
-        parallactic=_PARALLACTIC * u.deg,
-    ).min(axis=-1)
+    pointing = {"altitude": _ALTITUDE[:, None] * u.deg, "parallactic": _PARALLACTIC * u.deg}
+    values = asked(derotator=derotator, **pointing).min(axis=-1)
     mesh = ax.pcolormesh(_PARALLACTIC, _ALTITUDE, values, cmap="cividis", shading="nearest")
     # the cells of the last row reach beyond the zenith
     ax.set_ylim(_ALTITUDE[0], 90)
@@ -170,20 +170,7 @@ def _map_of_pointings(fig, ax, asked, derotator):
     ax.set(xticks=np.arange(-180, 181, 90))
     turned = "" if derotator is None else f"derotator at {_degree(derotator)}, "
     ax.set_title(f"{turned}worst wavelength")
-    fig.colorbar(mesh, ax=ax, label="measured share of the polarization")
-
-
-def _mesh(ax, x, y, values, contours):
-    # 0 to 1 in all maps of wavelengths, so that colours of two instruments mean the same
-    mesh = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=1, shading="nearest")
-    for levels, color in ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")) * contours:
-        # a level that no value reaches is no fault
-        inside = [level for level in levels if values.min() < level < values.max()]
-        if inside:
-            lines = ax.contour(x, y, values, levels=inside, colors=color, linewidths=0.8)
-            ax.clabel(lines, fmt="%g", fontsize=9)
-    ax.grid(False)
-    return mesh
+    fig.colorbar(mesh, ax=ax, label=_SHARE)
 
 
 # ---- instruments side by side ------------------------------------------------------------------
@@ -194,6 +181,13 @@ _DRAWN = (
     (2, "path_diattenuation", u.percent, {}),
     (3, "least_efficiency", u.one, {}),
     (3, "most_efficiency", u.one, {"markerfacecolor": "white"}),
+)
+# of each panel
+_TITLES = (
+    ("half-wave plate", "retardance (deg)"),
+    ("derotator", "retardance (deg)"),
+    ("half-wave plate to beam splitter, at 0°", "diattenuation (%)"),
+    ("efficiency: worst (filled) and best (open) derotator angle", _SHARE),
 )
 
 
@@ -246,42 +240,25 @@ def _draw_member(axes, rows, label, color, marker):
     lam, few = rows["wavelength"].to_value(u.nm), len(rows) < _LEAST_SPECTRUM
     settings = {"color": color, "marker": marker, "linestyle": ":" if few else "-"}
     settings |= {"markersize": 6.5 if few else 4.0}
+    bars = {"color": color, "elinewidth": 1.2, "zorder": 3, "fmt": "none"}
     handles = []
     for panel, key, unit, look in _DRAWN:
-        value, std = _column(rows, key, unit), _column(rows, f"{key}_std", unit)
+        value = u.Quantity(rows[key]).to_value(unit)
         handles += axes[panel].plot(lam, value, label=label, **settings | look)
-        _error_bars(axes[panel], lam, value, std, color)
+        # a table of before there were errors has none
+        if f"{key}_std" not in rows.colnames:
+            continue
+        std = u.Quantity(rows[f"{key}_std"]).to_value(unit)
+        known = np.isfinite(value) & np.isfinite(std)
+        axes[panel].errorbar(lam[known], value[known], std[known], **bars)
+        # a value that the data leave open may be anywhere
+        for x in lam[np.isinf(std)]:
+            axes[panel].axvline(x, color=color, linewidth=1.0, alpha=0.6)
     return handles[0]
 
 
-def _column(rows, key, unit):
-    """Return a column as plain numbers, NaN where a table of before there were errors has none."""
-    if key not in rows.colnames:
-        return np.full(len(rows), np.nan)
-    return u.Quantity(rows[key]).to_value(unit)
-
-
-def _error_bars(ax, lam, value, std, color):
-    """Draw the standard errors; a value that the data leave open may be anywhere."""
-    known = np.isfinite(value) & np.isfinite(std)
-    if known.any():
-        bars = {"color": color, "elinewidth": 1.2, "zorder": 3}
-        ax.errorbar(lam[known], value[known], std[known], fmt="none", **bars)
-    for x in lam[np.isinf(std)]:
-        ax.axvline(x, color=color, linewidth=1.0, alpha=0.6)
-
-
 def _label_panels(axes):
-    words = (
-        ("half-wave plate", "retardance (deg)"),
-        ("derotator", "retardance (deg)"),
-        ("half-wave plate to beam splitter, at 0°", "diattenuation (%)"),
-        (
-            "efficiency: worst (filled) and best (open) derotator angle",
-            "measured share of the polarization",
-        ),
-    )
-    for ax, (title, ylabel) in zip(axes, words, strict=True):
+    for ax, (title, ylabel) in zip(axes, _TITLES, strict=True):
         ax.set(title=title, ylabel=ylabel)
     axes[0].axhline(180, color="0.45", linewidth=0.9, linestyle="--")
     # what has none lies on the zero line, in full
@@ -292,7 +269,6 @@ def _label_panels(axes):
 
 
 # ---- standard stars over a night ---------------------------------------------------------------
-_WIDTH, _HEIGHT = 8.0, 6.4
 _MOST = 8
 # a marker every so many hours tells the curves apart without colour
 _EVERY = 1.0
@@ -339,24 +315,24 @@ def plot_observability(seen, *, total=None, figure=None):
     _check(seen)
     # UTC, before the first dark hour of the first star
     midnight = np.floor(seen[0].table["time"][0].mjd)
+    stars = list(zip(seen, looks(len(seen)), strict=True))
     with style():
-        figure = canvas(figure, _WIDTH, _HEIGHT)
+        figure = canvas(figure, 8.0, 6.4)
         upper, lower = figure.subplots(2, 1, sharex=True)
-        for star, look in zip(seen, looks(len(seen)), strict=True):
+        for star, look in stars:
             hours = (star.table["time"].mjd - midnight) * 24
-            _curve(upper, hours, star.table["altitude"].value, star, look)
-            _curve(lower, hours, star.table["parallactic"].value, star, look)
+            for axes, key in ((upper, "altitude"), (lower, "parallactic")):
+                _curve(axes, hours, star.table[key].value, star.table["observable"], *look)
         _finish(upper, lower, seen)
         handles = [
-            upper.plot([], [], color=c, marker=m, label=s.name)[0]
-            for s, (c, m) in zip(seen, looks(len(seen)), strict=True)
+            upper.plot([], [], color=color, marker=marker, label=star.name)[0]
+            for star, (color, marker) in stars
         ]
         dotted = upper.plot([], [], color=GREY, ls=":", label="too low to observe")
         legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
         few = total is not None and total > len(seen)
-        which = f"the first {len(seen)} of {total} standard stars" if few else "Standard stars"
-        title = f"{which[0].upper()}{which[1:]}, night of {seen[0].night}"
-        figure.suptitle(f"{title}\n{_place(seen[0].site)}")
+        which = f"The first {len(seen)} of {total} standard stars" if few else "Standard stars"
+        figure.suptitle(f"{which}, night of {seen[0].night}\n{_place(seen[0].site)}")
     return figure
 
 
@@ -378,31 +354,25 @@ def _place(site):
     return f"{name}{abs(lon):.2f}° {east}, {abs(lat):.2f}° {north}"
 
 
-def _curve(axes, hours, values, star, look):
+def _curve(axes, hours, values, good, color, marker):
     """Draw one star: faint below the limit, with markers where it is observable."""
-    color, marker = look
-    good = star.table["observable"]
+    seen = np.where(good, values, np.nan)
     axes.plot(hours, values, color=color, linestyle=":", linewidth=1)
-    axes.plot(hours, np.where(good, values, np.nan), color=color, linewidth=2)
-    count = max(len(hours) // max(int((hours[-1] - hours[0]) / _EVERY), 1), 1)
-    axes.plot(
-        hours[::count], np.where(good, values, np.nan)[::count], color=color, marker=marker, ls=""
-    )
+    axes.plot(hours, seen, color=color, linewidth=2)
+    every = max(len(hours) // max(int((hours[-1] - hours[0]) / _EVERY), 1), 1)
+    axes.plot(hours[::every], seen[::every], color=color, marker=marker, ls="")
 
 
 def _finish(upper, lower, seen):
-    limits = {float(star.min_altitude.value) for star in seen}
-    for limit in limits:
+    for limit in {float(star.min_altitude.value) for star in seen}:
         upper.axhline(limit, color=GREY, linestyle="--", linewidth=1)
-    upper.set_ylabel("altitude (deg)")
-    upper.set_ylim(0, 90)
-    upper.set_yticks(np.arange(0, 91, 15))
-    lower.set_ylabel("parallactic angle (deg)")
+    upper.set(ylabel="altitude (deg)", ylim=(0, 90), yticks=np.arange(0, 91, 15))
     angles = np.concatenate([star.table["parallactic"].value for star in seen])
     low = min(_TICK * np.floor(angles.min() / _TICK), -180)
     high = max(_TICK * np.ceil(angles.max() / _TICK), 180)
-    lower.set_ylim(low, high)
     # twice as wide where the labels would crowd
-    lower.set_yticks(np.arange(low, high + 1, _TICK if high - low <= _CROWDED else 2 * _TICK))
+    step = _TICK if high - low <= _CROWDED else 2 * _TICK
+    lower.set(ylabel="parallactic angle (deg)", ylim=(low, high))
+    lower.set_yticks(np.arange(low, high + 1, step))
     date = seen[0].table["time"][0].to_value("iso", "date")
     lower.set_xlabel(f"time on {date} (hours UTC)")

@@ -9,6 +9,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap._words import is_determined, labels, share, shortened
 from astropolcal.gap.cells import places
+from astropolcal.gap.residuals import frame_blocks
 from astropolcal.optics import GENERATORS
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.plotting._style import (
@@ -19,12 +20,17 @@ from astropolcal.plotting._style import (
     SKY,
     VERMILION,
     canvas,
-    cell_edges,
+    color_bar,
+    color_limit,
     draw_band,
     draw_line,
+    draw_map,
+    grid,
     legend_outside,
     mean_known,
+    name_groups,
     rms,
+    scale_axis,
     style,
     wavelength_label,
 )
@@ -37,20 +43,35 @@ _CHANNELS = {
 }
 # share of the residuals that the colour scale of the maps covers
 _COVERED = 99.5
-_MOST_TICKS = 10
 # characters of a dataset's name above a panel
 _LONGEST_NAME = 30
 
 
 def _gaps(model, noise):
     """Return residuals in percent without the lamp, one array (2, W, F) a dataset."""
-    found = []
     gaps = model.problem.differences(model.fit.coefficients)
-    for channel, gap in zip(noise.problem.channels, gaps, strict=True):
-        # whitened by the same noise before and after, lest the two differ by their lamps
-        percent = 100 * channel.whiten(gap) * channel.sigma
-        found.append(np.where(channel.valid, percent, np.nan))
-    return found
+    # whitened by the same noise before and after, lest the two differ by their lamps
+    return [
+        np.where(channel.valid, 100 * channel.whiten(gap) * channel.sigma, np.nan)
+        for channel, gap in zip(noise.problem.channels, gaps, strict=True)
+    ]
+
+
+def _datasets(diagnosis):
+    """Return short name, observations, wavelengths (nm), and gaps before and after, of each."""
+    nominal, improved = diagnosis.nominal, diagnosis.improved
+    names = [shortened(one.name, _LONGEST_NAME) for one in nominal.observations]
+    nm = [1000 * nominal.problem.wavelength[one.bins] for one in nominal.problem.datasets]
+    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
+    return list(zip(names, nominal.observations, nm, before, after, strict=True))
+
+
+def _finish(figure, axes, diagnosis, title):
+    """Add the legend of a panel, which is that of all, and the title with the verdict."""
+    if axes is not None:
+        legend_outside(figure, axes.get_legend_handles_labels()[0], columns=3)
+    figure.suptitle(f"{title}\n{_verdict_line(diagnosis)}")
+    return figure
 
 
 def plot_gap_spectrum(diagnosis, *, figure=None):
@@ -87,62 +108,28 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     >>> len(plot_gap_spectrum(diagnosis).axes)
     2
     """
-    nominal, improved = diagnosis.nominal, diagnosis.improved
-    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
-    n = len(before)
+    datasets, channels = _datasets(diagnosis), diagnosis.nominal.problem.channels
     with style():
-        figure = canvas(figure, 10, 1.6 + 3.3 * n)
-        grid = figure.subplots(n, 2, sharex=True, squeeze=False)
-        for i, row in enumerate(grid):
-            sigma = nominal.problem.channels[i].sigma
-            valid = nominal.problem.channels[i].valid
-            nm = _nm(nominal, i)
+        figure = canvas(figure, 10, 1.6 + 3.3 * len(datasets))
+        panels = figure.subplots(len(datasets), 2, sharex=True, squeeze=False)
+        for row, channel, dataset in zip(panels, channels, datasets, strict=True):
+            name, _, nm, before, after = dataset
             order = np.argsort(nm)
-            for c, axes in enumerate(row):
-                floor = rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
+            noise = np.where(channel.valid, 100 * channel.sigma, np.nan)
+            for c, (axes, (title, label)) in enumerate(zip(row, _CHANNELS.values(), strict=True)):
+                floor, one, two = (rms(v[c], axis=1)[order] for v in (noise, before, after))
                 axes.fill_between(nm[order], floor, color="0.85", label="noise")
                 axes.plot(nm[order], floor, color=GREY, linewidth=1)
-                one = rms(before[i][c], axis=1)[order]
-                two = rms(after[i][c], axis=1)[order]
                 axes.plot(nm[order], two, "o-", color=BLUE, markersize=4, label="after")
                 # hollow and larger, so that both are seen where they are the same
                 hollow = {"markerfacecolor": "none", "markersize": 8}
                 axes.plot(nm[order], one, "s--", color=VERMILION, label="before", **hollow)
-                _percent_axis(axes, np.concatenate([floor, one, two]))
-                title, label = list(_CHANNELS.values())[c]
-                name = shortened(nominal.observations[i].name, _LONGEST_NAME)
+                scale_axis(axes, np.concatenate([floor, one, two]))
                 axes.set_title(f"{name}\n{title}", loc="left")
                 axes.set_ylabel(f"rms of {label} (%)")
-                if i == n - 1:
-                    wavelength_label(axes)
-        handles = grid[0, 0].get_legend_handles_labels()[0]
-        legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Gap between model and data\n{_verdict_line(diagnosis)}")
-    return figure
-
-
-def _percent_axis(axes, values):
-    """Choose a logarithmic axis where the values need it."""
-    # a wavelength that is masked wholly has none
-    low, high = np.nanmin(values[values > 0]), np.nanmax(values)
-    if high > 5 * low:
-        axes.set_yscale("log")
-        axes.set_ylim(low / 1.6, high * 1.6)
-        # a handful of plain numbers rather than powers of ten
-        axes.yaxis.set_major_formatter(_plain())
-        axes.yaxis.set_minor_formatter(_plain((2, 5) if high < 30 * low else ()))
-    else:
-        axes.set_ylim(0, 1.15 * high)
-
-
-def _plain(digits=(1,)):
-    from matplotlib.ticker import FuncFormatter
-
-    def text(value, _):
-        first = value / 10 ** np.floor(np.log10(value))
-        return f"{value:g}" if np.any(np.isclose(first, digits)) else ""
-
-    return FuncFormatter(text)
+        for axes in panels[-1]:
+            wavelength_label(axes)
+        return _finish(figure, panels[0, 0], diagnosis, "Gap between model and data")
 
 
 def plot_gap_frames(diagnosis, *, figure=None):
@@ -178,18 +165,15 @@ def plot_gap_frames(diagnosis, *, figure=None):
     >>> plot_gap_frames(diagnosis).axes[0].get_xlabel()[:5]
     'frame'
     """
-    nominal, improved = diagnosis.nominal, diagnosis.improved
-    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
-    n = len(before)
+    datasets = _datasets(diagnosis)
     with style():
-        figure = canvas(figure, 9, 1.4 + 2.5 * n)
-        grid = figure.subplots(n, 1, squeeze=False)[:, 0]
-        for i, axes in enumerate(grid):
-            observations, nm = nominal.observations[i], _nm(nominal, i)
+        figure = canvas(figure, 9, 1.4 + 2.5 * len(datasets))
+        panels = figure.subplots(len(datasets), 1, squeeze=False)[:, 0]
+        for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=True):
             thirds = [part for part in np.array_split(np.argsort(nm), 3) if part.size]
-            does = [rms(before[i][0][part] - after[i][0][part]) for part in thirds]
+            does = [rms(before[0][part] - after[0][part]) for part in thirds]
             third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
-            old, new = (mean_known(gap[i][0][third]) for gap in (before, after))
+            old, new = (mean_known(gap[0][third]) for gap in (before, after))
             x = np.arange(len(old)) + 0.5
             axes.axhline(0, color=GREY, linewidth=0.8)
             look = {"markerfacecolor": "none", "markersize": 6}
@@ -197,19 +181,11 @@ def plot_gap_frames(diagnosis, *, figure=None):
             if diagnosis.causes:
                 axes.plot(x, old - new, color=BLACK, linewidth=1, label="what the causes do")
                 axes.plot(x, new, "o", color=BLUE, markersize=4, label="after")
-            name, of = shortened(observations.name, _LONGEST_NAME), nm[third]
+            of = nm[third]
             axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
             axes.set_ylabel(f"observed {MINUS} model (%)")
             _frame_axis(axes, observations)
-        handles = grid[0].get_legend_handles_labels()[0]
-        legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Residuals of the single differences\n{_verdict_line(diagnosis)}")
-    return figure
-
-
-def _nm(model, i):
-    """Return the wavelengths of a dataset."""
-    return 1000 * model.problem.wavelength[model.problem.datasets[i].bins]
+        return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
@@ -254,66 +230,35 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     """
     if channel not in _CHANNELS:
         raise ParameterError(f"channel = {channel!r}; allowed are {', '.join(_CHANNELS)}")
-    c = list(_CHANNELS).index(channel)
-    nominal, improved = diagnosis.nominal, diagnosis.improved
-    pairs = list(zip(_gaps(nominal, nominal), _gaps(improved, nominal), strict=True))
-    sizes = np.abs(np.concatenate([gap[c].ravel() for pair in pairs for gap in pair]))
-    # one hot pixel must not blank the maps
-    limit = max(np.nanpercentile(sizes, _COVERED), 1e-12)
+    c, datasets = list(_CHANNELS).index(channel), _datasets(diagnosis)
+    gaps = [(before[c], after[c]) for *_, before, after in datasets]
+    sizes = np.concatenate([gap.ravel() for pair in gaps for gap in pair])
+    limit, clipped = color_limit(sizes, _COVERED)
     with style():
-        figure = canvas(figure, 12, 1.5 + 3.2 * len(pairs))
-        grid = figure.subplots(len(pairs), 2, sharey="row", squeeze=False)
-        for i, (row, pair) in enumerate(zip(grid, pairs, strict=True)):
-            observations = nominal.observations[i]
+        figure = canvas(figure, 12, 1.5 + 3.2 * len(datasets))
+        panels = figure.subplots(len(datasets), 2, sharey="row", squeeze=False)
+        for row, pair, (name, observations, nm, *_) in zip(panels, gaps, datasets, strict=True):
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
-                drawn = _map(axes, gap[c], _nm(nominal, i), limit)
-                size = rms(gap[c])
-                name = shortened(observations.name, _LONGEST_NAME)
-                axes.set_title(f"{name}, {when}: rms {size:.2g} %", loc="left")
+                drawn = draw_map(axes, gap, nm, limit)
+                axes.set_title(f"{name}, {when}: rms {rms(gap):.2g} %", loc="left")
                 _frame_axis(axes, observations)
-            row[0].set_ylabel("wavelength (nm)")
-        extend = "both" if np.nanmax(sizes) > limit else "neither"
-        bar = figure.colorbar(drawn, ax=grid, extend=extend, shrink=0.85, aspect=35)
-        bar.set_label(f"observed {MINUS} model (%); grey: masked")
-        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{_verdict_line(diagnosis)}")
-    return figure
-
-
-def _map(axes, gap, nm, limit):
-    order = np.argsort(nm)
-    axes.grid(False)
-    axes.set_facecolor("0.75")
-    return axes.pcolormesh(
-        np.arange(gap.shape[1] + 1),
-        cell_edges(nm[order]),
-        np.ma.masked_invalid(gap[order]),
-        cmap="RdBu_r",
-        vmin=-limit,
-        vmax=limit,
-        rasterized=True,
-    )
+            row[1].set_ylabel("")
+        color_bar(figure, drawn, panels, clipped)
+        return _finish(figure, None, diagnosis, f"Residuals of the {_CHANNELS[channel][0]}")
 
 
 def _frame_axis(axes, observations):
     """Name the runs of frames at one derotator angle, or number the frames."""
-    from astropolcal.gap.residuals import frame_blocks
-
     blocks = frame_blocks(observations)
-    count = blocks.max() + 1
-    if count == blocks.size or "derotator" not in observations.frames.colnames:
+    starts = np.flatnonzero(np.diff(blocks, prepend=-1))
+    if len(starts) == len(blocks):
         axes.set_xlabel("frame")
         return
-    starts = np.searchsorted(blocks, np.arange(count))
-    ends = np.append(starts[1:], blocks.size)
     for edge in starts[1:]:
         axes.axvline(edge, color=BLACK, linewidth=0.6)
-    angles = np.rad2deg(observations.position("derotator")[starts])
-    # rounded up, so that there are never more labels than fit
-    step = -(-count // _MOST_TICKS)
-    labels = [f"{angle:.4g}" for angle in angles[::step]]
-    axes.set_xticks(((starts + ends) / 2)[::step], labels=labels)
-    axes.tick_params(axis="x", length=0)
-    axes.set_xlabel("frames by derotator angle (deg)")
+    angles = [f"{a:.4g}" for a in np.rad2deg(observations.position("derotator")[starts])]
+    ends = np.append(starts[1:], len(blocks))
+    name_groups(axes, ends, angles, "frames by derotator angle (deg)")
 
 
 # ---- the causes -----------------------------------------------------------------------------
@@ -470,10 +415,7 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
     with style():
         figure = canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2))
-        grid = figure.subplots(-(-len(panels) // 2), columns, squeeze=False)
-        for axes in grid.flat[len(panels) :]:
-            axes.set_axis_off()
-        for axes, name in zip(grid.flat, panels, strict=False):
+        for axes, name in zip(grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
                 _curve_panel(axes, diagnosis, effect)
                 continue

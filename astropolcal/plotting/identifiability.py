@@ -15,6 +15,7 @@ from astropolcal.plotting._style import (
     BLACK,
     BLUE,
     GREY,
+    MINUS,
     ORANGE,
     SIGMA,
     VERMILION,
@@ -147,11 +148,10 @@ def _open_rows(finding):
     null = np.asarray(finding.null_vectors).reshape(-1, finding.n_free)
     words = [direction["words"] for direction in finding.directions]
     leads = [text.split(" ", 1)[0] for text in words]
-    if len(words) == len(null) and set(leads) <= set(finding.names):
-        at = [finding.names.index(lead) for lead in leads]
-        null = np.linalg.solve(null[:, at], null) if len(null) else null
-    else:
+    if len(words) != len(null) or not set(leads) <= set(finding.names):
         words = [""] * len(null)
+    elif words:
+        null = np.linalg.solve(null[:, [finding.names.index(lead) for lead in leads]], null)
     return [
         _Row(f"open {i + 1}", vector / np.linalg.norm(vector), text)
         for i, (vector, text) in enumerate(zip(null, words, strict=True))
@@ -193,17 +193,16 @@ def _weak_words(names, units, vector, sigma):
     parts = []
     for stem, places in element_places(names).items():
         part = vector[places]
-        share = np.linalg.norm(part)
-        if share > _WORTH_A_WORD:
-            unit = _step_unit(units[places[0]])
-            typical = sigma * (part[0] if len(part) == 1 else share / np.sqrt(len(part)))
-            over = f" (rms of {len(part)} wavelengths)" if len(part) > 1 else ""
-            size = f"{typical:+.2g}" if len(part) == 1 else f"{typical:.2g}"
-            parts.append((share, f"{stem} by {size} {unit}{over}"))
-    parts.sort(reverse=True)
-    named = [text for _, text in parts[:_MOST_NAMES]]
-    more = f" and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
-    return f"1{SIGMA} changes {', '.join(named)}{more}"
+        size = np.linalg.norm(part)
+        if size > _WORTH_A_WORD:
+            unit, typical = _step_unit(units[places[0]]), sigma * size / np.sqrt(len(part))
+            words = f"{stem} by {sigma * part[0]:+.2g} {unit}"
+            if len(part) > 1:
+                words = f"{stem} by {typical:.2g} {unit} (rms of {len(part)} wavelengths)"
+            parts.append((size, words))
+    named = [text for _, text in sorted(parts, reverse=True)]
+    more = f" and {len(named) - _MOST_NAMES} more" if len(named) > _MOST_NAMES else ""
+    return f"1{SIGMA} changes {', '.join(named[:_MOST_NAMES])}{more}"
 
 
 def _step_unit(unit):
@@ -217,10 +216,11 @@ def _step_unit(unit):
 
 def _draw_values(axes, finding, known, n_weak):
     values, rank = np.asarray(finding.singular_values), finding.rank
-    index = np.arange(1, len(values) + 1)
-    n_open = len(values) - rank
+    index, n_open = np.arange(1, len(values) + 1), len(values) - rank
     largest = values.max(initial=0.0) or 1.0
-    threshold = _threshold(values, rank, largest)
+    # the limit of the rank, between the values that it parts
+    between = (values[rank] if n_open else 0.0, values[rank - 1] if rank else largest)
+    threshold = float(np.clip(_OPEN_BELOW * largest, *between)) or 1e-12
     # singular values and errors go together where the data count as independent
     known = known if known is not None and _are_inverse(values[:rank], known[2]) else None
     is_weak = _is_weak(values[:rank], known, n_weak)
@@ -238,15 +238,13 @@ def _draw_values(axes, finding, known, n_weak):
         at_edge = {"color": VERMILION, "label": label, "clip_on": False, "zorder": 3}
         axes.plot(index[rank:], np.full(n_open, low), "v", **at_edge)
         axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
-    open_words = f"{n_open} open" if n_open else "none open"
-    axes.set_title(f"(a) {rank} of {finding.n_free} combinations determined, {open_words}")
-    axes.set(
-        xlabel="direction, the best determined first",
-        ylabel="singular value\n(data per deg, µm or %)",
+    axes.set_title(
+        f"(a) {rank} of {finding.n_free} combinations determined, {n_open or 'none'} open"
     )
-    axes.set_xlim(0, len(values) + 1)
+    axes.set_xlabel("direction, the best determined first")
+    axes.set_ylabel("singular value\n(data per deg, µm or %)")
+    axes.set(xlim=(0, len(values) + 1), ylim=(low, largest * 3))
     axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_ylim(low, largest * 3)
     axes.legend(loc="center left" if n_open else "lower left")
     if known is not None and len(known[2]):
         _add_error_axis(axes, known[2].min() * largest, threshold if n_open else low)
@@ -271,13 +269,6 @@ def _is_weak(values, known, count):
         # with priors or bounds the errors may have directions of their own
         marked[nearest] |= abs(np.log(values[nearest] / expected)) < _SAME
     return marked
-
-
-def _threshold(values, rank, largest):
-    """Return the limit of the rank, between the values that it parts."""
-    low = values[rank] if rank < len(values) else 0.0
-    high = values[rank - 1] if rank else largest
-    return float(np.clip(_OPEN_BELOW * largest, low, high)) or 1e-12
 
 
 def _add_error_axis(axes, noise, lowest):
@@ -309,20 +300,24 @@ def _draw_loadings(figure, axes, finding, rows):
     image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.grid(False)
     labels = [f"{n} ({len(at)})" if len(at) > 1 else n for n, at in places.items()]
-    axes.set_xticks(
-        range(len(labels)), labels, rotation=30, ha="right", rotation_mode="anchor", fontsize=9.5
-    )
+    look = {"rotation": 30, "ha": "right", "rotation_mode": "anchor", "fontsize": 9.5}
+    axes.set_xticks(range(len(labels)), labels, **look)
     axes.set_yticks(range(len(rows)), [row.name for row in rows])
     axes.tick_params(length=0)
+    signs = ["+" if len(at) == 1 else "-" for at in places.values()]
     for i, j in zip(*np.nonzero(np.abs(table) > _WRITTEN), strict=True):
-        single = len(list(places.values())[j]) == 1
-        text = f"{table[i, j]:+.2f}" if single else f"{table[i, j]:.2f}"
-        color = "white" if abs(table[i, j]) > _PALE else "black"
-        axes.text(j, i, text.replace("-", "\N{MINUS SIGN}"), color=color, ha="center", va="center")
+        _write(axes, j, i, table[i, j], signs[j])
     n_open = sum(row.name.startswith("open") for row in rows)
     if 0 < n_open < len(rows):
         axes.axhline(n_open - 0.5, color=BLACK, linewidth=1)
     figure.colorbar(image, ax=axes, pad=0.01, label="|loading|")
+
+
+def _write(axes, x, y, value, sign="-"):
+    """Write a number into its cell, in white on dark ground."""
+    color = "white" if abs(value) > _PALE else "black"
+    text = f"{value:{sign}.2f}".replace("-", MINUS)
+    axes.text(x, y, text, color=color, ha="center", va="center")
 
 
 def _loading(part):
@@ -331,11 +326,8 @@ def _loading(part):
 
 
 def _wrapped(rows):
-    lines = []
-    for row in (r for r in rows if r.words):
-        text = f"{row.name}: {row.words}"
-        lines += textwrap.wrap(text, _COLUMNS, subsequent_indent="     ")
-    return lines
+    texts = [f"{row.name}: {row.words}" for row in rows if row.words]
+    return [x for t in texts for x in textwrap.wrap(t, _COLUMNS, subsequent_indent=" " * 5)]
 
 
 # ---- (c) half-wave-plate angles ---------------------------------------------------------------
@@ -343,12 +335,13 @@ def _wrapped(rows):
 
 def _angles(calibration, hwp):
     """Return the different half-wave-plate angles in radian, or None where not known."""
-    if hwp is not None:
-        return np.unique(np.round(np.atleast_1d(angle_to_rad(hwp, "hwp")), 6))
     measurement = getattr(calibration, "measurement", None)
-    if measurement is None:
+    if hwp is not None:
+        angles = [np.atleast_1d(angle_to_rad(hwp, "hwp"))]
+    elif measurement is None:
         return None
-    angles = [dataset.observations.position("hwp") for dataset in measurement.datasets]
+    else:
+        angles = [dataset.observations.position("hwp") for dataset in measurement.datasets]
     return np.unique(np.round(np.concatenate(angles), 6))
 
 
@@ -362,16 +355,16 @@ def _draw_conditions(axes, finding, angles):
     values = np.array([found[harmonics] for harmonics, _ in SETS])
     top = 10 * max(values[np.isfinite(values)].max(initial=_POOR), _POOR)
     for i, value in enumerate(values):
-        poor = not value <= _POOR
-        look = {"color": VERMILION, "hatch": "//"} if poor else {"color": BLUE}
+        look = {"color": BLUE} if value <= _POOR else {"color": VERMILION, "hatch": "//"}
         length = min(value, top)
         axes.barh(i, length - _LEFT, left=_LEFT, edgecolor="white", height=0.55, **look)
-        text = f" {value:.2g}" if np.isfinite(value) else f" {_INFINITE}: too few angles"
-        inside = not np.isfinite(value)
-        paper = {"facecolor": "white", "edgecolor": "none", "pad": 1} if inside else None
-        axes.text(1.1 if inside else length, i, text, va="center", ha="left", bbox=paper)
+        if np.isfinite(value):
+            axes.text(length, i, f" {value:.2g}", va="center")
+        else:
+            paper = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+            axes.text(1.1, i, f" {_INFINITE}: too few angles", va="center", bbox=paper)
     axes.axvline(_POOR, color=BLACK, linestyle="--", linewidth=1)
-    axes.text(_POOR, -0.62, " poor beyond", ha="left", va="center", fontsize=9.5, color=GREY)
+    axes.text(_POOR, -0.62, " poor beyond", va="center", fontsize=9.5, color=GREY)
     axes.set(xscale="log", xlim=(_LEFT, top * 8), ylim=(len(values) - 0.5, -0.9))
     names = ["harmonics " + ", ".join(map(str, harmonics)) for harmonics, _ in SETS]
     axes.set_yticks(range(len(SETS)), names)
@@ -390,6 +383,7 @@ def _say(axes, text):
 # a parameter common to all wavelengths is drawn this much wider than one of a wavelength
 _WIDE = 4.0
 _SIZE, _MARGIN = 8.5, 2.6
+_HATCHED = {"facecolor": "0.88", "edgecolor": "0.62", "hatch": "////"}
 # numbers are written into the cells of a matrix that is not larger than this
 _FEW = 12
 
@@ -444,8 +438,10 @@ def plot_correlations(calibration, *, figure=None):
         edges = _edges(groups)
         image = _draw_matrix(axes, edges, matrix)
         _name_groups(axes, edges, groups)
-        if len(matrix) <= _FEW:
-            _write_numbers(axes, edges, matrix)
+        middles = (edges[1:] + edges[:-1]) / 2
+        for i, j in zip(*np.nonzero(np.isfinite(matrix)), strict=True):
+            if len(matrix) <= _FEW:
+                _write(axes, middles[j], middles[i], matrix[i, j])
         figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02, label="correlation")
         _explain_hatching(figure, matrix)
         heading(figure, calibration, "Correlations of the parameters")
@@ -461,11 +457,10 @@ def _edges(groups):
 
 def _draw_matrix(axes, edges, matrix):
     # what is not drawn lets the hatched background through
-    axes.patch.set(facecolor="0.88", edgecolor="0.62", hatch="////")
+    axes.patch.set(**_HATCHED)
     axes.grid(False)
-    image = axes.pcolormesh(
-        edges, edges, np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1, rasterized=True
-    )
+    look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
+    image = axes.pcolormesh(edges, edges, np.ma.masked_invalid(matrix), **look)
     axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
     return image
 
@@ -483,16 +478,6 @@ def _name_groups(axes, edges, groups):
         axes.axvline(border, color="0.25", linewidth=0.6)
 
 
-def _write_numbers(axes, edges, matrix):
-    middles = (edges[1:] + edges[:-1]) / 2
-    for i, row in enumerate(matrix):
-        for j, value in enumerate(row):
-            if np.isfinite(value):
-                color = "white" if abs(value) > _PALE else "black"
-                text = f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
-                axes.text(middles[j], middles[i], text, color=color, ha="center", va="center")
-
-
 def _explain_hatching(figure, matrix):
     """Say in a legend what the hatched rows are."""
     from matplotlib.patches import Patch
@@ -500,5 +485,4 @@ def _explain_hatching(figure, matrix):
     without = int((~np.isfinite(np.diag(matrix))).sum())
     if without:
         label = f"{without} of {len(matrix)} parameters: left open by the data, or at a bound"
-        hatched = Patch(facecolor="0.88", edgecolor="0.62", hatch="////", label=label)
-        legend_outside(figure, [hatched])
+        legend_outside(figure, [Patch(**_HATCHED, label=label)])

@@ -24,6 +24,9 @@ from astropolcal.plotting._style import (
     SKY,
     canvas,
     draw_band,
+    draw_line,
+    draw_points,
+    grid,
     heading,
     legend_entries,
     legend_outside,
@@ -32,7 +35,7 @@ from astropolcal.plotting._style import (
     style,
     wavelength_label,
 )
-from astropolcal.words import did_you_mean
+from astropolcal.words import counted, did_you_mean
 
 __all__ = ["plot_efficiency", "plot_history", "plot_mirrors", "plot_retardances"]
 
@@ -54,42 +57,24 @@ _TITLE_WIDTH = 58
 
 def _draw_entry(axes, calibration, entry, look):
     """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
+    lam, (color, marker) = nanometres(calibration.wavelength), look
     if not entry["value"].ndim:
-        _draw_constant(axes, nanometres(calibration.wavelength), entry, look[0])
-        return
-    lam = nanometres(calibration.wavelength)
-    color, marker = look
-    order = np.argsort(lam)
-    if entry["fixed"] or entry["tied"]:
+        _draw_constant(axes, lam, entry, color)
+    elif entry["fixed"] or entry["tied"]:
         label = f"follows {entry['tied']}" if entry["tied"] else _FIXED
-        axes.plot(lam[order], entry["value"][order], color=color, linestyle=":", label=label)
-        return
-    # the thin line only leads the eye through points of different kind
-    axes.plot(lam[order], entry["value"][order], color=color, linewidth=0.6, alpha=0.6)
-    _draw_points(axes, lam, entry, color, marker)
-
-
-def _draw_points(axes, lam, entry, color, marker):
-    value, std, bound = entry["value"], entry["std"], entry["at_bound"]
-    known = np.isfinite(std) & ~bound
-    look = {"color": color, "marker": marker, "linestyle": "none"}
-    if known.any():
-        axes.errorbar(lam[known], value[known], yerr=std[known], label=_DETERMINED, **look)
-    if (~known).any():
+        draw_line(axes, lam, entry["value"], color=color, linestyle=":", label=label)
+    else:
+        # the thin line only leads the eye through points of different kind
+        draw_line(axes, lam, entry["value"], color=color, linewidth=0.6, alpha=0.6)
+        value, std, bound = entry["value"], entry["std"], entry["at_bound"]
+        known = np.isfinite(std) & ~bound
         label = _ALONE if (~known & ~bound).any() else None
-        axes.plot(lam[~known], value[~known], markerfacecolor="white", label=label, **look)
-    if bound.any():
-        axes.plot(
-            lam[bound],
-            value[bound],
-            marker="s",
-            markersize=12,
-            linestyle="none",
-            markerfacecolor="none",
-            color=BLACK,
-            label=_BOUND,
-            clip_on=False,
-        )
+        labels, points = (_DETERMINED, label), {"color": color, "marker": marker}
+        draw_points(axes, lam, value, np.where(known, std, np.nan), labels, **points)
+        if bound.any():
+            box = {"marker": "s", "markersize": 12, "markerfacecolor": "none", "color": BLACK}
+            box |= {"linestyle": "none", "clip_on": False, "label": _BOUND}
+            axes.plot(lam[bound], value[bound], **box)
 
 
 def _draw_constant(axes, lam, entry, color):
@@ -110,21 +95,21 @@ def _draw_constant(axes, lam, entry, color):
 
 def _draw_law(axes, calibration, leaf, known, look):
     """Draw a retardance that follows a law, its band, and the stages' points."""
-    lam = nanometres(calibration.wavelength)
+    lam = np.sort(nanometres(calibration.wavelength))
     # a law is smooth between the wavelengths unless its parameters are given at these
     if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
-        lam = np.linspace(lam.min(), lam.max(), _FINE)
-    lam = np.sort(lam)
+        lam = np.linspace(lam[0], lam[-1], _FINE)
     value, std = _retardance(leaf, lam), _law_std(calibration, leaf, lam)
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
-    free = any(not entry["fixed"] for entry in own.values())
+    free = {key: entry for key, entry in own.items() if not entry["fixed"]}
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
     axes.plot(lam, value, color=look[0], label=label)
     if std is not None:
         draw_band(axes, lam, value, std, look[0], 0.3)
     _draw_stage(axes, calibration, leaf)
-    shown = {key: entry for key, entry in own.items() if not entry["fixed"]} or own
-    words = [", ".join(row) for row in _in_rows(_words(shown))]
+    # lines break between the values alone
+    words = ", ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in _words(free or own))
+    words = textwrap.wrap(words, _TITLE_WIDTH)
     axes.set_title("\n".join([f"{leaf.name}: law", *words]))
 
 
@@ -134,19 +119,13 @@ def _retardance(leaf, lam):
 
 def _law_std(calibration, leaf, lam):
     """Return the 1 sigma error of the law, or None where a parameter has none."""
-    covariance = calibration.covariance
-    rows = [
-        (key, covariance.names.index(f"{leaf.name}.{key}"))
-        for key in leaf.own_names
-        if f"{leaf.name}.{key}" in covariance.names
-    ]
-    if not rows:
+    names = calibration.covariance.names
+    keys = [key for key in leaf.own_names if f"{leaf.name}.{key}" in names]
+    index = [names.index(f"{leaf.name}.{key}") for key in keys]
+    matrix = calibration.covariance.matrix[np.ix_(index, index)]
+    if not keys or not np.isfinite(matrix).all():
         return None
-    index = [i for _, i in rows]
-    matrix = covariance.matrix[np.ix_(index, index)]
-    if not np.isfinite(matrix).all():
-        return None
-    slopes = np.stack([_slope(leaf, key, lam) for key, _ in rows])
+    slopes = np.stack([_slope(leaf, key, lam) for key in keys])
     # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
     return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
 
@@ -185,17 +164,6 @@ def _words(own):
             yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
 
 
-def _in_rows(words):
-    """Yield lists of words that are not too long for a title."""
-    row = []
-    for word in words:
-        if row and len(", ".join([*row, word])) > _TITLE_WIDTH:
-            yield row
-            row = []
-        row.append(word)
-    yield row
-
-
 def _mark_half_wave(axes):
     """Draw the line of a perfect half-wave plate where the data come near to it."""
     # the limits of the data, not of the axes, which a line would widen
@@ -211,16 +179,14 @@ def _mark_half_wave(axes):
 def _legend(figure, axes, calibration):
     """Put one legend for all panels below them: each label once, in neutral colours."""
     entries = legend_entries(axes)
-    labels = [label for label in _ORDER if label in entries]
-    labels += [label for label in entries if label not in labels]
-    handles = [_neutral(entries[label], label) for label in labels]
+    # the kinds of points and lines come first
+    labels = sorted(entries, key=lambda label: _ORDER.index(label) if label in _ORDER else 9)
+    handles = {label: _neutral(entries[label], label) for label in labels}
     free = len(calibration.identifiability.directions)
-    if _ALONE in labels and free:
-        parameters = "combination of parameters" if free == 1 else "combinations of parameters"
-        handles[labels.index(_ALONE)].set_label(
-            f"{_ALONE} (the data leave {free} {parameters} open)"
-        )
-    return legend_outside(figure, handles)
+    if _ALONE in handles and free:
+        words = f"{_ALONE} (the data leave {counted(free, 'combination')} of parameters open)"
+        handles[_ALONE].set_label(words)
+    return legend_outside(figure, list(handles.values()))
 
 
 def _neutral(handle, label):
@@ -228,20 +194,14 @@ def _neutral(handle, label):
     from matplotlib.lines import Line2D
 
     line = handle[0] if isinstance(handle, tuple) else handle
-    hollow = line.get_markerfacecolor() in ("white", "none")
-    boxed = label == _BOUND
-    points = line.get_linestyle() == "None"
-    return Line2D(
-        [],
-        [],
-        color=GREY if label == _STAGE else BLACK,
-        linestyle=line.get_linestyle(),
-        linewidth=line.get_linewidth(),
-        marker=("s" if boxed else "o") if points else "",
-        markersize=11 if boxed else line.get_markersize(),
-        markerfacecolor=("none" if boxed else "white") if hollow else None,
-        label=label,
-    )
+    look = {"linestyle": line.get_linestyle(), "linewidth": line.get_linewidth(), "label": label}
+    look |= {"color": GREY if label == _STAGE else BLACK}
+    if label == _BOUND:
+        look |= {"marker": "s", "markersize": 11, "markerfacecolor": "none"}
+    elif line.get_linestyle() == "None":
+        hollow = "white" if line.get_markerfacecolor() == "white" else None
+        look |= {"marker": "o", "markersize": line.get_markersize(), "markerfacecolor": hollow}
+    return Line2D([], [], **look)
 
 
 # ---- figures of parameters -------------------------------------------------------------------
@@ -310,20 +270,18 @@ def plot_retardances(calibration, *, figure=None):
     ]
     if not panels:
         raise ChainError("the chain has no retarder, so it has no retardances to draw")
-    with style():
-        figure, axes = _grid(figure, len(panels))
-        for one, (leaf, key), look in zip(axes, panels, looks(len(panels)), strict=True):
-            if key in leaf.param_names:
-                entry = known[f"{leaf.name}.{key}"]
-                _draw_entry(one, calibration, entry, look)
-                one.set_title(f"{leaf.name}: {key}")
-            else:
-                _draw_law(one, calibration, leaf, known, look)
-            _mark_half_wave(one)
-            one.set_ylabel(f"{_RETARDANCES[key]} (°)")
-        heading(figure, calibration, "Retardances")
-        _legend(figure, axes, calibration)
-    return figure
+
+    def draw(axes, panel, look):
+        leaf, key = panel
+        if key in leaf.param_names:
+            _draw_entry(axes, calibration, known[f"{leaf.name}.{key}"], look)
+            axes.set_title(f"{leaf.name}: {key}")
+        else:
+            _draw_law(axes, calibration, leaf, known, look)
+        _mark_half_wave(axes)
+        axes.set_ylabel(f"{_RETARDANCES[key]} (°)")
+
+    return _draw_all(figure, calibration, "Retardances", panels, draw)
 
 
 def _has_retardance(leaf, key, known):
@@ -379,17 +337,14 @@ def plot_efficiency(calibration, *, figure=None):
     names = [name for name in known if name.endswith(".efficiency")]
     if not names:
         raise ChainError("no optic of the chain has an efficiency to draw")
-    with style():
-        figure, axes = _grid(figure, len(names))
-        for one, name, look in zip(axes, names, looks(len(names)), strict=True):
-            _draw_entry(one, calibration, known[name], look)
-            # above 1 there is no physical efficiency
-            one.axhline(1, color="black", linestyle="--", linewidth=1, label="perfect: 1")
-            one.set_title(name)
-            one.set_ylabel(r"modulation efficiency $|\eta|$")
-        heading(figure, calibration, "Modulation efficiency")
-        _legend(figure, axes, calibration)
-    return figure
+
+    def draw(axes, name, look):
+        _draw_entry(axes, calibration, known[name], look)
+        # above 1 there is no physical efficiency
+        axes.axhline(1, color="black", linestyle="--", linewidth=1, label="perfect: 1")
+        axes.set(title=name, ylabel=r"modulation efficiency $|\eta|$")
+
+    return _draw_all(figure, calibration, "Modulation efficiency", names, draw)
 
 
 def plot_parameters(calibration, names=None, *, figure=None):
@@ -407,16 +362,13 @@ def plot_parameters(calibration, names=None, *, figure=None):
     if not names:
         raise ChainError("no free parameter has one value a wavelength: nothing to draw")
     optics = _optics(calibration)
-    with style():
-        figure, axes = _grid(figure, len(names))
-        for one, name, look in zip(axes, names, looks(len(names)), strict=True):
-            _draw_entry(one, calibration, known[name], look)
-            optic, _, key = name.rpartition(".")
-            one.set_title(name)
-            one.set_ylabel(_describe(getattr(optics[optic], key)))
-        heading(figure, calibration, "Parameters for each wavelength")
-        _legend(figure, axes, calibration)
-    return figure
+
+    def draw(axes, name, look):
+        _draw_entry(axes, calibration, known[name], look)
+        optic, _, key = name.rpartition(".")
+        axes.set(title=name, ylabel=_describe(getattr(optics[optic], key)))
+
+    return _draw_all(figure, calibration, "Parameters for each wavelength", names, draw)
 
 
 def _describe(parameter):
@@ -450,22 +402,20 @@ def _optics(calibration):
     return {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
 
 
-def _grid(figure, count):
-    """Return a figure and its ``count`` panels, two a row where there are more than two."""
-    columns = 2 if count > 2 else 1
-    rows = -(-count // columns)
-    figure = canvas(figure, 1.5 + 5.2 * columns if columns == 2 else 8.5, 2.0 + 3.1 * rows)
-    spec = figure.add_gridspec(rows, columns)
-    first, axes = None, []
-    for i in range(count):
-        # all on one wavelength axis, labelled at the lowest panels alone
-        axes.append(figure.add_subplot(spec[divmod(i, columns)], sharex=first))
-        first = axes[0]
-        if i + columns >= count:
-            wavelength_label(axes[-1])
-        else:
-            axes[-1].tick_params(labelbottom=False)
-    return figure, axes
+def _draw_all(figure, calibration, title, panels, draw):
+    """Draw panels, two a row where there are more than two, with one legend for all."""
+    columns = 2 if len(panels) > 2 else 1
+    height = 2.0 + 3.1 * -(-len(panels) // columns)
+    with style():
+        figure = canvas(figure, 11.9 if columns == 2 else 8.5, height)
+        axes, lowest = grid(figure, len(panels), columns, sharex=True)
+        for one, panel, look in zip(axes, panels, looks(len(panels)), strict=True):
+            draw(one, panel, look)
+        for one in lowest:
+            wavelength_label(one)
+        heading(figure, calibration, title)
+        _legend(figure, axes, calibration)
+    return figure
 
 
 # ---- mirrors --------------------------------------------------------------------------------
@@ -529,28 +479,25 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     tables = [mirror_values(calibration, name) for name in names]
     # an empty dict is a wish to see none
     reference = _published(calibration) if reference is None else reference
-    rows = ["diattenuation"]
-    if any("retardance" in table.colnames for table in tables):
-        rows.append("retardance")
+    retards = any("retardance" in table.colnames for table in tables)
+    rows = ["diattenuation", "retardance"][: 1 + retards]
     with style():
         figure = canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows))
         # mirrors side by side on one scale
         panels = figure.subplots(len(rows), len(names), sharex=True, sharey="row", squeeze=False)
         for column, table in zip(panels.T, tables, strict=True):
             column[0].set_title(table.meta["name"])
-            shown = [
-                (axes, key) for axes, key in zip(column, rows, strict=True) if key in table.keys()
-            ]
-            for axes, key in shown:
+            for axes, key in zip(column, rows, strict=True):
+                # a mirror that only attenuates has no lower panel
+                if key not in table.colnames:
+                    axes.remove()
+                    continue
                 _draw_mirror(axes, calibration, table, key, reference.get(table.meta["name"], {}))
                 axes.set_ylabel(_MIRROR_LABELS[key])
                 axes.tick_params(labelleft=True)
-            # a mirror that only attenuates has no lower panel
-            for axes in column[len(shown) :]:
-                axes.remove()
-            last = column[len(shown) - 1]
-            last.tick_params(labelbottom=True)
-            wavelength_label(last)
+                lowest = axes
+            lowest.tick_params(labelbottom=True)
+            wavelength_label(lowest)
         heading(figure, calibration, "Mirrors")
         _mirror_legend(figure, panels)
     return figure
@@ -564,50 +511,35 @@ def _published(calibration):
 
 
 def _draw_mirror(axes, calibration, table, key, reference):
-    lam = nanometres(table["wavelength"])
-    order = np.argsort(lam)
+    table = table[np.argsort(table["wavelength"])]
+    lam, name = nanometres(table["wavelength"]), table.meta["name"]
     for metal, (color, line) in _METAL_LOOKS.items():
-        bare = table[f"{key}_{metal}"][order].value
-        axes.plot(lam[order], bare, color=color, linestyle=line, label=metal)
+        axes.plot(lam, table[f"{key}_{metal}"].value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):
-        value = getattr(mirror, key)(table["wavelength"][order])
+        value = getattr(mirror, key)(table["wavelength"])
         value = value.to_value(u.deg) if key == "retardance" else 100 * value
-        axes.plot(lam[order], value, color=BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
-    # with a law in wavelength the diattenuation is computed and no parameter
-    law = f"{table.meta['name']}.diattenuation" not in calibration.parameter_values()
-    _draw_mirror_values(axes, lam[order], table[order], key, law)
-
-
-def _draw_mirror_values(axes, lam, table, key, law):
+        axes.plot(lam, value, color=BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
     value, std = table[key].value, table[f"{key}_err"].value
-    known, look = np.isfinite(std), {"color": BLUE}
-    if law:
-        label = f"fitted law, with 1{SIGMA} band" if known.all() else _MIRROR_LAW_ALONE
-        line = "-" if known.all() else (0, (5, 1))
-        axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, **look)
-        draw_band(axes, lam, value, std, BLUE, 0.3)
-        return
-    points = look | {"marker": "o", "linestyle": "none"}
-    if known.any():
-        label = f"fitted, with 1{SIGMA} error"
-        axes.errorbar(lam[known], value[known], yerr=std[known], label=label, **points)
-    if not known.all():
+    # with a law in wavelength the diattenuation is computed and no parameter
+    if f"{name}.diattenuation" in calibration.parameter_values():
         held = key == "retardance" and table.meta["held"]
-        label = "held, not fitted" if held else "no error: not determined alone, or at a bound"
-        axes.plot(lam[~known], value[~known], markerfacecolor="white", label=label, **points)
+        hollow = "held, not fitted" if held else "no error: not determined alone, or at a bound"
+        draw_points(axes, lam, value, std, (_DETERMINED, hollow), color=BLUE, marker="o")
+        return
+    known = np.isfinite(std).all()
+    label = f"fitted law, with 1{SIGMA} band" if known else _MIRROR_LAW_ALONE
+    line = "-" if known else (0, (5, 1))
+    axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=BLUE)
+    draw_band(axes, lam, value, std, BLUE, 0.3)
 
 
 def _mirror_legend(figure, panels):
-    entries = {
-        f"{label} (bare, 45°)" if label in METALS else label: handle
-        for label, handle in legend_entries(panels.ravel()).items()
-    }
+    entries = legend_entries(panels.ravel())
     # sorting is stable: what was calibrated stays in its order, the metals come last
-    ordered = sorted(entries, key=lambda label: "bare" in label)
-    handles = [entries[label] for label in ordered]
-    for handle, label in zip(handles, ordered, strict=True):
-        handle.set_label(label)
-    legend_outside(figure, handles, columns=2)
+    for label in sorted(entries, key=lambda label: label in METALS):
+        handle = entries[label] = entries.pop(label)
+        handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
+    legend_outside(figure, list(entries.values()), columns=2)
 
 
 # ---- history --------------------------------------------------------------------------------
@@ -665,43 +597,34 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
     if np.any(table["date"].mask):
         without = table["calibration"][table["date"].mask][0]
         raise ParameterError(f"{without}: no date; state one with with_validity(valid_from=)")
-    names = [n for n in dict.fromkeys(table["parameter"]) if not np.all(_of(table, n)["fixed"])]
-    if not 1 <= len(names) <= _MOST_PANELS:
+    own = {name: table[table["parameter"] == name] for name in dict.fromkeys(table["parameter"])}
+    own = {name: rows for name, rows in own.items() if not np.all(rows["fixed"])}
+    if not 1 <= len(own) <= _MOST_PANELS:
         raise ParameterError(
-            f"{len(names)} parameters to draw; allowed are 1 to {_MOST_PANELS}, choose with "
+            f"{len(own)} parameters to draw; allowed are 1 to {_MOST_PANELS}, choose with "
             "parameters="
         )
     with style():
-        columns = min(len(names), 2)
-        rows = -(-len(names) // columns)
-        fig = canvas(figure, 7.2 * columns, 3.6 * rows + 0.6)
-        axes = np.atleast_1d(fig.subplots(rows, columns, sharex=True)).ravel()
-        for ax, name in zip(axes, names, strict=False):
-            own = _of(table, name)
-            _draw_history(ax, own, name, _MOST_LINES if shown is None else shown)
-            _mark_changes(ax, calibrations, own, name)
+        columns = min(len(own), 2)
+        fig = canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6)
+        axes, lowest = grid(fig, len(own), columns, sharex=True)
+        for ax, (name, rows) in zip(axes, own.items(), strict=True):
+            _draw_history(ax, rows, name, _MOST_LINES if shown is None else shown)
+            _mark_changes(ax, calibrations, rows, name)
         per_wavelength = np.isfinite(table["wavelength"].value).any()
         aside = "; wavelengths of one date side by side" if per_wavelength else ""
-        for ax in axes[len(names) :]:
-            ax.remove()
-        for ax in axes[: len(names)][-columns:]:
-            ax.tick_params(axis="x", labelbottom=True, labelrotation=25)
+        for ax in lowest:
+            ax.tick_params(axis="x", labelrotation=25)
             ax.set_xlabel(f"valid from (UTC{aside})")
         note = f"{SIGMA}: by how much neighbours differ, over all wavelengths"
         fig.suptitle(f"{title or 'Calibrated parameters over time'}\n{note}")
     return fig
 
 
-def _of(table, name):
-    return table[table["parameter"] == name]
-
-
 def _draw_history(ax, own, name, most):
     """Draw one parameter; of several wavelengths the differences to the mean."""
     lam = np.unique(own["wavelength"].value)
     several = np.isfinite(lam).all()
-    unit = own["unit"][0]
-    suffix = f" ({unit})" if unit else ""
     if several:
         lam = lam[np.unique(np.linspace(0, lam.size - 1, min(most, lam.size)).astype(int))]
     # a single date has no range to take a share of: one day
@@ -709,19 +632,15 @@ def _draw_history(ax, own, name, most):
     offsets = np.linspace(-width, width, lam.size) if lam.size > 1 else [0.0]
     for wavelength, shift, (color, marker) in zip(lam, offsets, looks(lam.size), strict=True):
         here = own[own["wavelength"].value == wavelength] if several else own
-        days, value, std = here["date"].mjd + shift, here["value"], here["std"]
         # retardances of the wavelengths differ by tens of degrees, their changes by tenths
-        value = value - np.mean(value) if several else value
+        value = here["value"] - np.mean(here["value"]) if several else here["value"]
         label = f"{wavelength:.0f} nm" if several else None
-        dates = Time(days, format="mjd").datetime
-        known = np.isfinite(std)
+        dates = Time(here["date"].mjd + shift, format="mjd").datetime
         ax.plot(dates, value, color=color, lw=0.8, alpha=0.6, zorder=1)
-        ax.errorbar(
-            dates[known], value[known], std[known], fmt=marker, color=color, label=label, zorder=3
-        )
-        ax.plot(dates[~known], value[~known], marker, color=color, mfc="white", ls="", zorder=3)
-    ax.set_title(name)
-    ax.set_ylabel(f"difference to the mean{suffix}" if several else f"value{suffix}")
+        points = {"color": color, "marker": marker, "zorder": 3}
+        draw_points(ax, dates, value, here["std"], (label, None), **points)
+    unit = f" ({own['unit'][0]})" if own["unit"][0] else ""
+    ax.set(title=name, ylabel=f"{'difference to the mean' if several else 'value'}{unit}")
     ax.margins(y=0.18)
     # "+9e1" in a corner is easily missed
     ax.ticklabel_format(axis="y", useOffset=False)
@@ -731,9 +650,8 @@ def _draw_history(ax, own, name, most):
 
 def _mark_changes(ax, calibrations, own, name):
     """Write between neighbours how many sigma they differ by."""
-    named = _named(calibrations)
     held = {row["calibration"]: row["date"].mjd for row in own}
-    for first, second in pairwise(named):
+    for first, second in pairwise(_named(calibrations)):
         try:
             found = significance([_Named(*first), _Named(*second)], [name])
         except (ParameterError, FitError):
@@ -741,16 +659,8 @@ def _mark_changes(ax, calibrations, own, name):
         if not found.dof or not {first[0], second[0]} <= set(held):
             continue
         middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
+        look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        look |= {"xytext": (0, -4), "ha": "center", "va": "top", "color": GREY}
         # one tail of a normal law beyond three sigma
-        certain = found.p_value < 0.00135
-        ax.annotate(
-            f"{found.sigma:.1f} {SIGMA}",
-            (middle, 1),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, -4),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            color="black" if certain else GREY,
-            fontweight="bold" if certain else "normal",
-        )
+        look |= {"color": "black", "fontweight": "bold"} if found.p_value < 0.00135 else {}
+        ax.annotate(f"{found.sigma:.1f} {SIGMA}", (middle, 1), **look)

@@ -110,13 +110,11 @@ def _corner_canvas(figure, size):
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
+    # corner sets margins of its own, which a layout engine would undo
+    if isinstance(figure, Figure):
+        figure.set_layout_engine(None)
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        if figure is None:
-            return Figure(figsize=(size, size))
-        # corner sets margins of its own, which a layout engine would undo
-        if isinstance(figure, Figure):
-            figure.set_layout_engine(None)
-    return figure
+        return Figure(figsize=(size, size)) if figure is None else figure
 
 
 def _columns(posterior, parameters, most):
@@ -158,14 +156,16 @@ def _label(posterior, column, taken=""):
 def _finish_corner(figure, posterior, columns, samples, marks):
     n = len(columns)
     panels = np.array(figure.axes).reshape(n, n)
-    times = posterior.autocorrelation_times[columns]
-    for i, axes in enumerate(panels.diagonal()):
-        axes.set_title(f"τ = {times[i]:.0f} steps", fontsize=10)
+    for axes, time in zip(panels.diagonal(), posterior.autocorrelation_times[columns], strict=True):
+        axes.set_title(f"τ = {time:.0f} steps", fontsize=10)
     for axes in figure.axes:
         axes.grid(False)
         axes.tick_params(labelsize=8.5)
-    if n > 1:
-        _write_correlations(panels, samples)
+    correlations = np.corrcoef(samples.T) if n > 1 else None
+    for row, column in zip(*np.tril_indices(n, -1), strict=True):
+        text = f"r = {correlations[row, column]:.4f}"
+        look = {"xycoords": "axes fraction", "va": "top", "bbox": _PAPER, "fontsize": 8.5}
+        panels[row, column].annotate(text, (0.04, 0.96), **look)
     if marks is not None:
         _mark(panels, marks, np.ptp(samples, axis=0))
     width, height = figure.get_size_inches()
@@ -173,31 +173,15 @@ def _finish_corner(figure, posterior, columns, samples, marks):
     figure.suptitle(_heading(posterior, marks is not None), x=0.98, ha="right", va="top", y=0.98)
 
 
-def _write_correlations(panels, samples):
-    for row, values in enumerate(np.corrcoef(samples.T)):
-        for column in range(row):
-            panels[row, column].annotate(
-                f"r = {values[column]:.4f}",
-                (0.04, 0.96),
-                xycoords="axes fraction",
-                va="top",
-                bbox=_PAPER,
-                fontsize=8.5,
-            )
-
-
 def _mark(panels, marks, widths):
     """Draw the fitted values where that does not change the range by much."""
-    for row in range(len(marks)):
-        for column in range(row + 1):
-            axes = panels[row, column]
-            lines = [(axes.axvline, axes.get_xlim, column)]
-            if row != column:
-                lines.append((axes.axhline, axes.get_ylim, row))
-            for draw, limits, k in lines:
-                low, high = limits()
-                if low - _NEAR * widths[k] < marks[k] < high + _NEAR * widths[k]:
-                    draw(marks[k], color=VERMILION, linewidth=1.2)
+    for row, column in zip(*np.tril_indices(len(marks)), strict=True):
+        axes = panels[row, column]
+        lines = [(axes.axvline, axes.get_xlim(), column)]
+        lines += [(axes.axhline, axes.get_ylim(), row)] if row != column else []
+        for draw, (low, high), k in lines:
+            if low - _NEAR * widths[k] < marks[k] < high + _NEAR * widths[k]:
+                draw(marks[k], color=VERMILION, linewidth=1.2)
 
 
 def _heading(posterior, marked):
@@ -252,29 +236,26 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     'hwp\ntheta (deg)'
     """
     columns = _columns(posterior, parameters, MAX_TRACES)
-    beside = _histogram if posterior.is_thinned else _correlation
+    thinned = posterior.is_thinned
+    beside = _histogram if thinned else _correlation
     with style():
         figure = canvas(figure, 10, 1.6 + 1.7 * len(columns))
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
             _trace(trace, posterior, column)
             beside(right, posterior, column)
-        _name_columns(panels, posterior)
+        burn_in = "burn-in left out" if thinned else "grey: burn-in, left out"
+        _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
+        if thinned:
+            panels[0, 1].set_title("samples and their quantiles")
+        else:
+            _join(panels[:, 1], "autocorrelation", "lag (steps)")
         figure.suptitle(_heading(posterior, marked=False))
     return figure
 
 
-def _name_columns(panels, posterior):
-    """Name both columns, and give the panels of each one scale where they have one."""
-    burn_in = "burn-in left out" if posterior.is_thinned else "grey: burn-in, left out"
-    _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
-    if posterior.is_thinned:
-        panels[0, 1].set_title("samples and their quantiles")
-    else:
-        _join(panels[:, 1], "autocorrelation", "lag (steps)")
-
-
 def _join(panels, title, label):
+    """Name a column and give its panels one scale."""
     panels[0].set_title(title)
     panels[-1].set_xlabel(label)
     for axes in panels[:-1]:
@@ -312,14 +293,8 @@ def _histogram(axes, posterior, column):
 def _write_time(axes, posterior, column):
     time = posterior.autocorrelation_times[column]
     if np.isfinite(time):
-        axes.annotate(
-            f"τ = {time:.0f}",
-            (0.97, 0.9),
-            xycoords="axes fraction",
-            ha="right",
-            va="top",
-            bbox=_PAPER,
-        )
+        look = {"xycoords": "axes fraction", "ha": "right", "va": "top", "bbox": _PAPER}
+        axes.annotate(f"τ = {time:.0f}", (0.97, 0.9), **look)
 
 
 def _correlation(axes, posterior, column):

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Quick look at a reduced run: apertures over images, and the run over time."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from astropolcal.plotting._style import (
     MINUS,
     VERMILION,
     canvas,
+    grid,
     legend_outside,
     save,
     style,
@@ -70,21 +70,15 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
     rows = -(-len(chosen) // columns)
     with style():
         figure = canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2)
-        axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
-        panels = zip(axes, chosen, strict=False)
-        gaps = any([_draw_frame(panel, reduction, index, k) for panel, index in panels])
-        for panel in axes[len(chosen) :]:
-            panel.set_visible(False)
-        for panel in axes[max(len(chosen) - columns, 0) : len(chosen)]:
+        axes, lowest = grid(figure, len(chosen), columns, sharex=True, sharey=True)
+        gaps = [_draw_frame(*panel, reduction, k) for panel in zip(axes, chosen, strict=True)]
+        for panel in lowest:
             panel.set_xlabel("x (pixel)")
-            panel.tick_params(labelbottom=True)
         for panel in axes[::columns]:
             panel.set_ylabel("y (pixel)")
-        figure.suptitle(
-            f"Apertures at {at} "
-            f"({len(chosen)} of {len(reduction.frames)} frames; square-root scale)"
-        )
-        legend_outside(figure, _handles(reduction.source, gaps), columns=4)
+        count = f"{len(chosen)} of {len(reduction.frames)} frames"
+        figure.suptitle(f"Apertures at {at} ({count}; square-root scale)")
+        legend_outside(figure, _handles(reduction.source, any(gaps)), columns=4)
     return figure
 
 
@@ -123,7 +117,7 @@ def _handles(source, gaps):
     return handles
 
 
-def _draw_frame(panel, reduction, index, k):
+def _draw_frame(panel, index, reduction, k):
     """Draw one panel; return whether pixels lack a value."""
     frame = reduction.frames[index]
     layout = reduction.instrument.files
@@ -156,21 +150,18 @@ def _draw_image(panel, image):
     norm = PowerNorm(0.5, vmin=low, vmax=max(high, low + 1e-12), clip=True)
     drawn = panel.imshow(image, origin="lower", cmap="gray_r", norm=norm, interpolation="nearest")
     drawn.set_cmap(drawn.cmap.with_extremes(bad=_GAP))
-    panel.set_xlim(-0.5, image.shape[1] - 0.5)
-    panel.set_ylim(-0.5, image.shape[0] - 0.5)
 
 
 def _draw_circles(panel, photometry, k, annulus):
     from matplotlib.patches import Circle
 
     for beam, name in enumerate(BEAMS):
-        r = photometry.radius[beam, k]
-        place = (photometry.x[beam, k], photometry.y[beam, k])
+        r, x, y = (getattr(photometry, key)[beam, k] for key in ("radius", "x", "y"))
         # a spot that was not found has neither centre nor radius
-        if r > 0 and place != (0.0, 0.0):
+        if r > 0 and (x, y) != (0.0, 0.0):
             look = {"fill": False, "ec": _COLORS[name]}
-            panel.add_patch(Circle(place, r, ls=_LINES[name], lw=1.6, **look))
-            panel.add_patch(Circle(place, r + annulus, ls=":", lw=1.2, **look))
+            panel.add_patch(Circle((x, y), r, ls=_LINES[name], lw=1.6, **look))
+            panel.add_patch(Circle((x, y), r + annulus, ls=":", lw=1.2, **look))
 
 
 def _draw_rectangles(panel, layout):
@@ -178,20 +169,10 @@ def _draw_rectangles(panel, layout):
 
     left, right, width, height, angle = layout.internal_apertures
     for name, (x, y) in (("right", right), ("left", left)):
-        panel.add_patch(
-            Rectangle(
-                # matplotlib counts from a corner, the layout from the centre
-                (x - width / 2, y - height / 2),
-                width,
-                height,
-                angle=np.rad2deg(angle),
-                rotation_point="center",
-                fill=False,
-                ec=_COLORS[name],
-                ls=_LINES[name],
-                lw=1.6,
-            )
-        )
+        look = {"fill": False, "ec": _COLORS[name], "ls": _LINES[name], "lw": 1.6}
+        look |= {"angle": np.rad2deg(angle), "rotation_point": "center"}
+        # matplotlib counts from a corner, the layout from the centre
+        panel.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, **look))
 
 
 def plot_run(reduction, *, wavelength=None, figure=None):
@@ -239,20 +220,17 @@ def _draw_fluxes(top, below, reduction, clock, k):
         top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **_look(name))
     top.set_ylabel(f"flux ({reduction.frames[0].unit})")
     total = flux.sum(axis=0)
-    single = (flux[0] - flux[1]) / total
     # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2
     scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
+    single = (flux[0] - flux[1]) / total
     below.errorbar(clock, single, scatter, fmt="D", color=GREEN, ms=5, lw=0, elinewidth=1.2)
     below.axhline(0.0, color="0.6", lw=0.8)
     below.set_ylabel(f"(right {MINUS} left) /\n(right + left)")
-    failed = np.isnan(flux[0])
-    if failed.any():
-        for axes in (top, below):
-            # at the foot of the panel, whatever the fluxes are
-            height = axes.get_xaxis_transform()
-            axes.plot(
-                clock[failed], np.full(failed.sum(), 0.05), "x", color=BLACK, transform=height
-            )
+    failed = clock[np.isnan(flux[0])]
+    for axes in (top, below) if failed.size else ():
+        # at the foot of the panel, whatever the fluxes are
+        look = {"color": BLACK, "transform": axes.get_xaxis_transform()}
+        axes.plot(failed, np.full(failed.size, 0.05), "x", **look)
 
 
 def _look(name):
@@ -262,16 +240,14 @@ def _look(name):
 
 
 def _draw_places(panels, reduction, clock, k):
-    for panel, key in zip(panels, ("x", "y", "fwhm"), strict=True):
+    labels = (f"x {MINUS} median\n(pixel)", f"y {MINUS} median\n(pixel)", "FWHM (pixel)")
+    for panel, key, label in zip(panels, ("x", "y", "fwhm"), labels, strict=True):
+        panel.set_ylabel(label)
         for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
-            # centres of both beams are hundreds of pixels apart; their motion is what is looked
-            # for
+            # centres of both beams are far apart; their motion is what is looked for
             if key != "fwhm" and np.isfinite(values).any():
                 values = values - np.nanmedian(values)
             panel.plot(clock, values, **_look(name))
-    for panel, axis in zip(panels, "xy", strict=False):
-        panel.set_ylabel(f"{axis} {MINUS} median\n(pixel)")
-    panels[2].set_ylabel("FWHM (pixel)")
 
 
 def _run_handles(reduction, k):
@@ -287,13 +263,12 @@ def _run_handles(reduction, k):
 def save_quicklook(reduction, folder):
     """Write ``apertures.png`` and ``run.png`` of a run to a folder; return their paths."""
     folder = Path(folder)
-    if not os.path.isdir(folder.parent):
-        raise ObservationError(f"{folder}: there is no folder {folder.parent}")
     try:
         folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise ObservationError(f"{folder}: cannot be made: {error.strerror}") from None
-    written = []
-    for name, plot in (("apertures.png", plot_apertures), ("run.png", plot_run)):
-        written.append(save(plot(reduction), folder / name, ObservationError))
-    return written
+    except FileNotFoundError:
+        raise ObservationError(f"{folder}: there is no folder {folder.parent}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ObservationError(f"{folder}: cannot be made: {reason}") from None
+    plots = {"apertures.png": plot_apertures, "run.png": plot_run}
+    return [save(plot(reduction), folder / n, ObservationError) for n, plot in plots.items()]

@@ -17,12 +17,15 @@ from astropolcal.plotting._style import (
     MINUS,
     SIGMA,
     canvas,
-    cell_edges,
     clusters,
+    color_bar,
+    color_limit,
     degrees,
+    draw_map,
     heading,
     legend_outside,
     looks,
+    name_groups,
     nanometres,
     rms,
     style,
@@ -102,8 +105,11 @@ class DataGrid:
 
     def series(self):
         """Return the data by setting of the half-wave plate, ordered by its angle."""
+        observations, frames = self.part.observations, self.part.frames
+        # as commanded where it follows the sky
+        plate = observations.position("hwp")[frames.T] if self.is_star else self.position("hwp")
         # half a turn does not matter; a value just below it belongs to zero
-        angle = np.mod(np.rad2deg(self._plate()) + SAME_ANGLE, 180) - SAME_ANGLE
+        angle = np.mod(np.rad2deg(plate) + SAME_ANGLE, 180) - SAME_ANGLE
         number, state = clusters(angle[0], SAME_ANGLE), self._state()
         settings = sorted(set(zip(number, state, strict=True)))
         return [self._one_series(angle, (number == n) & (state == now), now) for n, now in settings]
@@ -113,28 +119,20 @@ class DataGrid:
         if "flc_state" not in stages(self.chain):
             return np.full(self.part.frames.shape[0], "")
         state = self.part.observations.position("flc_state")[self.part.frames] > 0.5
-        names = [["AB"[one] for one in states] for states in state.astype(int)]
-        return np.array([one[0] if len(set(one)) == 1 else f" {MINUS} ".join(one) for one in names])
-
-    def _plate(self):
-        """Return the angle of the plate: as commanded where it follows the sky."""
-        if self.is_star:
-            return self.part.observations.position("hwp")[self.part.frames.T]
-        return self.position("hwp")
+        names = np.where(state, "B", "A")
+        return np.array([f" {MINUS} ".join(one if len(set(one)) > 1 else one[:1]) for one in names])
 
     def _one_series(self, angle, member, state):
         angles = [degrees(value) for value in np.median(angle[:, member], axis=1)]
         # where the states of a modulator make the difference the plate stands still
-        one = state and len(set(angles)) == 1
-        plate = angles[0] if one else f" {MINUS} ".join(angles)
+        still = state and len(set(angles)) == 1
+        plate = angles[0] if still else f" {MINUS} ".join(angles)
         label = f"{plate}, {state}" if state else plate
-        return Series(label, np.flatnonzero(member), self._steady(member))
-
-    def _steady(self, member):
         others = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
+        positions = {stage: angle.mean(axis=1) for stage, angle in others.items()}
         if any(np.ptp(angle, axis=1).max() > np.deg2rad(SAME_ANGLE) for angle in others.values()):
-            return None
-        return {stage: angle.mean(axis=1) for stage, angle in others.items()}
+            positions = None
+        return Series(label, np.flatnonzero(member), positions)
 
     # ---- the model ---------------------------------------------------------------
 
@@ -247,9 +245,9 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     >>> len(plot_double_differences(cal, [1330, 1575] * u.nm).axes)
     4
     """
-    grid = DataGrid(calibration, dataset)
-    bins = grid.spread_bins(_PANELS) if wavelengths is None else grid.nearest_bins(wavelengths)
-    series = grid.series()
+    drawn = DataGrid(calibration, dataset)
+    bins = drawn.spread_bins(_PANELS) if wavelengths is None else drawn.nearest_bins(wavelengths)
+    series = drawn.series()
     with style():
         columns = min(2, len(bins))
         rows = -(-len(bins) // columns)
@@ -257,18 +255,18 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
         figure = canvas(figure, 3.0 + 4.4 * columns, height)
         pairs = _panels(figure, len(bins), rows, columns)
-        fine = _fine(grid.abscissa[0])
-        curves = [None if one.positions is None else grid.curve(one, bins, fine) for one in series]
+        fine = _fine(drawn.abscissa[0])
+        curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
-            _draw_heading(pair, grid.wavelength[row], spread[row])
+            _draw_heading(pair, drawn.wavelength[row], spread[row])
             for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
-                _draw_series(pair, grid, row, one, look)
+                _draw_series(pair, drawn, row, one, look)
                 if curve is not None:
                     pair[0].plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
-        _label(pairs, grid, columns)
-        heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
-        _legend(figure, grid, series, bins, spread[bins])
+        _label(pairs, drawn, columns)
+        heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
+        _legend(figure, drawn, series, bins, spread[bins])
     return figure
 
 
@@ -288,18 +286,12 @@ def _panels(figure, count, rows, columns):
 
 def _looks(count):
     """Return the looks of the series: where colours recur, lines are dashed and markers open."""
-    found = []
-    for i, (color, marker) in enumerate(looks(count)):
-        again = i // len(COLORS) % 2 == 1
-        found.append(
-            {
-                "color": color,
-                "marker": marker,
-                "markerfacecolor": "white" if again else color,
-                "linestyle": "--" if again else "-",
-            }
-        )
-    return found
+    pairs = zip(looks(count), np.arange(count) // len(COLORS) % 2, strict=True)
+    return [
+        {"color": color, "marker": marker}
+        | {"markerfacecolor": "white" if again else color, "linestyle": "--" if again else "-"}
+        for (color, marker), again in pairs
+    ]
 
 
 def _draw_heading(pair, wavelength, s_res):
@@ -313,21 +305,15 @@ def _draw_heading(pair, wavelength, s_res):
 
 def _draw_series(pair, grid, row, one, look):
     """Draw the data of one setting of the half-wave plate, and their residuals."""
-    angle = grid.abscissa[0][one.data]
-    value, residual, sigma = (
-        array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
-    )
-    points = look | {"linestyle": "none", "label": one.label}
-    pair[0].errorbar(angle, value, yerr=_bars(sigma), **points)
-    pair[1].errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **points)
+    angle, points = grid.abscissa[0][one.data], look | {"linestyle": "none", "label": one.label}
+    value, residual, sigma = (a[row, one.data] for a in (grid.observed, grid.residual, grid.sigma))
+    # bars of length zero would look like errors that are very small
+    bars = np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
+    pair[0].errorbar(angle, value, yerr=bars, **points)
+    pair[1].errorbar(angle, 100 * residual, yerr=bars if bars is None else 100 * bars, **points)
     # where a stage moves from datum to datum there is no model between the data
     if one.positions is None:
         pair[0].plot(angle, value - residual, "x", color=look["color"], markersize=8)
-
-
-def _bars(sigma):
-    # bars of length zero would look like errors that are very small
-    return np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
 
 
 def _fine(angle):
@@ -339,25 +325,25 @@ def _fine(angle):
 
 
 def _label(pairs, grid, columns):
-    for i, (top, bottom) in enumerate(pairs):
-        top.tick_params(labelbottom=False)
-        last = i + columns >= len(pairs)
-        bottom.tick_params(labelbottom=last)
-        if last:
-            bottom.set_xlabel(grid.abscissa[1])
-        if i % columns == 0:
-            top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
-            bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
-        else:
-            top.tick_params(labelleft=False)
-            bottom.tick_params(labelleft=False)
     fine = _fine(grid.abscissa[0])
     pairs[0][0].set_xlim(fine[0], fine[-1])
+    for i, (top, bottom) in enumerate(pairs):
+        last, first = i + columns >= len(pairs), i % columns == 0
+        top.tick_params(labelbottom=False, labelleft=first)
+        bottom.tick_params(labelbottom=last, labelleft=first)
+        if last:
+            bottom.set_xlabel(grid.abscissa[1])
+        if first:
+            top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
+            bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
 
 
 def _legend(figure, grid, series, bins, s_res):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+
+    def entry(label, marker="", line=""):
+        return Line2D([], [], color=GREY, marker=marker, linestyle=line, label=label)
 
     # what is not drawn has no entry in the legend
     curves = any(one.positions is not None for one in series)
@@ -367,28 +353,22 @@ def _legend(figure, grid, series, bins, s_res):
     ]
     bars = np.isfinite(grid.sigma[bins]).any()
     seen = f"observed, with 1{SIGMA} errors" if bars else "observed (no errors given)"
-    handles.append(Line2D([], [], color=GREY, marker="o", linestyle="", label=seen))
-    if curves:
-        handles.append(Line2D([], [], color=GREY, label="model"))
+    handles.append(entry(seen, "o"))
+    handles += [entry("model", line="-")] if curves else []
     if any(one.positions is None for one in series):
-        handles.append(Line2D([], [], color=GREY, marker="x", linestyle="", label="model at data"))
+        handles.append(entry("model at data", "x"))
     if np.isfinite(s_res).any():
         handles.append(Patch(color="0.92", label="± s_res"))
     frames = f"plus {MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
     plate = "half-wave plate\nas commanded" if grid.is_star else "half-wave plate"
-    legend_outside(
-        figure,
-        handles,
-        # at the top a long title would run into it
-        place="outside right center",
-        title=f"{plate},\n{frames}",
-    )
+    # at the top a long title would run into it
+    place = "outside right center"
+    legend_outside(figure, handles, place=place, title=f"{plate},\n{frames}")
 
 
 # ---- maps of the residuals -------------------------------------------------------------------
 # share of the residuals that the colour scale covers, so that one outlier does not blank the map
 _COVERED = 99
-_MAX_TICKS = 12
 # maps have one scale unless those of their own differ by more than this factor
 _ONE_SCALE = 3
 # room above the tallest bar
@@ -404,11 +384,9 @@ def plot_residuals(calibration, *, figure=None):
     Datasets of one wavelength each are bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
+    draw = _draw_bars if all(grid.wavelength.size == 1 for grid in grids) else _draw_maps
     with style():
-        if all(grid.wavelength.size == 1 for grid in grids):
-            figure = _draw_bars(figure, grids)
-        else:
-            figure = _draw_maps(figure, grids)
+        figure = draw(figure, grids)
         names = [grid.part.observations.name for grid in grids]
         heading(figure, calibration, f"Residuals of the {grids[0].quantity}", names)
     return figure
@@ -416,38 +394,31 @@ def plot_residuals(calibration, *, figure=None):
 
 def _draw_maps(figure, grids):
     scales, shared = _scales(grids)
-    figure = canvas(figure, 10.5, 0.8 + 5.4 * len(grids))
-    spec = figure.add_gridspec(
-        2 * len(grids), 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * len(grids)
-    )
+    n = len(grids)
+    figure = canvas(figure, 10.5, 0.8 + 5.4 * n)
+    spec = figure.add_gridspec(2 * n, 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * n)
     for i, (grid, (limit, clipped)) in enumerate(zip(grids, scales, strict=True)):
         main = figure.add_subplot(spec[2 * i + 1, 0])
         above = figure.add_subplot(spec[2 * i, 0], sharex=main)
         right = figure.add_subplot(spec[2 * i + 1, 1], sharey=main)
         drawn = _draw_dataset(main, above, right, grid, limit)
-        if len(grids) > 1:
+        if n > 1:
             above.set_title(grid.part.observations.name, loc="left")
         if not shared:
-            bar = _add_bar(figure, drawn, [main, above, right], clipped)
-            bar.set_label(f"observed {MINUS} model (%), own scale\ngrey: masked")
+            color_bar(figure, drawn, [main, above, right], clipped, ", own scale\n")
     if shared:
-        bar = _add_bar(figure, drawn, figure.axes, clipped)
-        bar.set_label(f"observed {MINUS} model (%); grey: masked")
+        color_bar(figure, drawn, figure.axes, clipped)
     return figure
 
 
-def _add_bar(figure, drawn, panels, clipped):
-    extend = "both" if clipped else "neither"
-    return figure.colorbar(drawn, ax=panels, extend=extend, shrink=0.8, aspect=35)
-
-
 def _scales(grids):
-    """Return the colour scale of each map, and whether it is that of all."""
-    own = [_limit([grid]) for grid in grids]
+    """Return colour scale of each map, whether data lie beyond it, and if it is that of all."""
+    residuals = [100 * grid.residual.ravel() for grid in grids]
+    own = [color_limit(one, _COVERED) for one in residuals]
     ends = [limit for limit, _ in own]
     if max(ends) > _ONE_SCALE * min(ends):
         return own, False
-    return [_limit(grids)] * len(grids), True
+    return [color_limit(np.concatenate(residuals), _COVERED)] * len(grids), True
 
 
 def _draw_bars(figure, grids):
@@ -456,7 +427,7 @@ def _draw_bars(figure, grids):
     panels = figure.subplots(len(grids), 1, sharey=True, squeeze=False)[:, 0]
     below = None
     for axes, grid in list(zip(panels, grids, strict=True))[::-1]:
-        order, group, ends = _layout(grid)
+        order, _, ends = _layout(grid)
         percent = 100 * grid.residual[0, order]
         axes.bar(np.arange(len(order)) + 0.5, percent, width=0.9, color=BLUE)
         for masked in np.flatnonzero(~np.isfinite(percent)):
@@ -467,7 +438,7 @@ def _draw_bars(figure, grids):
         axes.set_xlim(0, len(order))
         size = f"{grid.wavelength[0]:.1f} nm, rms {rms(percent):.2g} %"
         axes.set_title(f"{grid.part.observations.name}: {size}", loc="left", fontsize=10)
-        _name_groups(axes, grid, order, group, ends)
+        _name_axis(axes, grid)
         # what stands below the next panel need not be said twice
         words = axes.get_xlabel(), [text.get_text() for text in axes.get_xticklabels()]
         if words == below:
@@ -475,38 +446,22 @@ def _draw_bars(figure, grids):
             axes.tick_params(labelbottom=False)
         below = words
     figure.supylabel(f"observed {MINUS} model (%); grey: masked", fontsize=11)
-    size = max(np.nanmax(np.abs(grid.residual)) for grid in grids) * 100
-    panels[0].set_ylim(-_HEADROOM * max(size, 1e-12), _HEADROOM * max(size, 1e-12))
+    size = max(100 * _HEADROOM * max(np.nanmax(np.abs(grid.residual)) for grid in grids), 1e-12)
+    panels[0].set_ylim(-size, size)
     return figure
 
 
-def _limit(grids):
-    """Return the end of the colour scale in percent, and whether data lie beyond it."""
-    size = np.concatenate([np.abs(g.residual[np.isfinite(g.residual)]) for g in grids]) * 100
-    # exact data would leave a scale of no width
-    limit = max(np.percentile(size, _COVERED), 1e-12)
-    return limit, bool(size.max() > limit)
-
-
 def _draw_dataset(main, above, right, grid, limit):
-    order, group, ends = _layout(grid)
-    lam = np.argsort(grid.wavelength)
-    edges = cell_edges(grid.wavelength[lam])
-    percent = 100 * grid.residual[np.ix_(lam, order)]
-    columns = np.arange(len(order) + 1)
-    main.grid(False)
-    main.set_facecolor("0.75")
-    drawn = main.pcolormesh(
-        columns, edges, np.ma.masked_invalid(percent), cmap="RdBu_r", vmin=-limit, vmax=limit
-    )
-    main.vlines(ends[:-1], edges[0], edges[-1], color="black", linewidth=0.8)
-    main.set_ylabel("wavelength (nm)")
-    _name_groups(main, grid, order, group, ends)
-    above.stairs(rms(percent, axis=0), columns, color=BLUE, fill=True)
+    order, _, ends = _layout(grid)
+    percent = 100 * grid.residual[:, order]
+    drawn = draw_map(main, percent, grid.wavelength, limit)
+    main.vlines(ends[:-1], *main.get_ylim(), color="black", linewidth=0.8)
+    _name_axis(main, grid)
+    above.stairs(rms(percent, axis=0), np.arange(len(order) + 1), color=BLUE, fill=True)
     above.tick_params(labelbottom=False)
     above.set_ylabel("rms (%)")
-    each = rms(percent, axis=1)
-    right.plot(each, grid.wavelength[lam], "o-", color=BLUE)
+    lam, each = np.argsort(grid.wavelength), rms(percent, axis=1)
+    right.plot(each[lam], grid.wavelength[lam], "o-", color=BLUE)
     right.set_xlabel("rms (%)")
     right.tick_params(labelleft=False)
     for axes in (above, right):
@@ -531,14 +486,10 @@ def _layout(grid):
     return order, group, ends
 
 
-def _name_groups(main, grid, order, group, ends):
-    starts = np.concatenate([[0], ends[:-1]])
-    angles = [np.median(grid.derotator[order][group == g]) for g in range(len(ends))]
-    step = -(-len(ends) // _MAX_TICKS)
-    main.set_xticks(
-        ((starts + ends) / 2)[::step], labels=[degrees(angle) for angle in angles[::step]]
-    )
-    main.tick_params(axis="x", length=0)
+def _name_axis(axes, grid):
+    order, group, ends = _layout(grid)
+    angles = [degrees(np.median(grid.derotator[order][group == g])) for g in range(len(ends))]
     labels = [series.label for series in grid.series()]
     within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
-    main.set_xlabel(f"derotator angle; at each, left to right, half-wave plate at\n{within}")
+    words = f"derotator angle; at each, left to right, half-wave plate at\n{within}"
+    name_groups(axes, ends, angles, words)

@@ -2,6 +2,8 @@
 """All figures of a calibration as files."""
 
 import warnings
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -94,12 +96,9 @@ def save_all(calibration, folder):
         raise AstropolcalError(f"{folder}: cannot be created: {reason}") from error
     paths = []
     for name, draw in _figures(calibration):
-        try:
-            figure = draw()
         # no such optic, no data in a file, or no datum left: the figure has nothing to show
-        except (ChainError, CalibrationFileError, ObservationError):
-            continue
-        paths.append(save(figure, folder / f"{name}.png"))
+        with suppress(ChainError, CalibrationFileError, ObservationError):
+            paths.append(save(draw(), folder / f"{name}.png"))
     if calibration.posterior is not None:
         paths += _save_posterior(calibration.posterior, folder)
     return paths
@@ -141,16 +140,13 @@ def _figures(calibration):
     """Yield the name of each figure and what draws it."""
     for i in range(len(calibration.datasets)):
         name = "double_differences" + (f"_{i + 1}" if i else "")
-        yield name, lambda i=i: plot_double_differences(calibration, dataset=i)
-    yield "residuals", lambda: plot_residuals(calibration)
-    yield "identifiability", lambda: plot_identifiability(calibration)
-    yield "accuracy", lambda: plot_accuracy(calibration)
-    yield "retardances", lambda: plot_retardances(calibration)
-    yield "targets", lambda: plot_target_accuracy(calibration)
-    yield "mirrors", lambda: plot_mirrors(calibration)
+        yield name, partial(plot_double_differences, calibration, dataset=i)
+    plots = {"residuals": plot_residuals, "identifiability": plot_identifiability}
+    plots |= {"accuracy": plot_accuracy, "retardances": plot_retardances}
+    plots |= {"targets": plot_target_accuracy, "mirrors": plot_mirrors}
     for i, entry in enumerate(calibration.fit.get("stars", [])):
-        name = "star" + (f"_{i + 1}" if i else "")
-        yield name, lambda entry=entry: plot_star_check(calibration, entry)
-    yield "efficiency", lambda: plot_efficiency(calibration)
-    yield "correlations", lambda: plot_correlations(calibration)
+        plots["star" + (f"_{i + 1}" if i else "")] = partial(plot_star_check, entry=entry)
+    plots |= {"efficiency": plot_efficiency, "correlations": plot_correlations}
+    for name, plot in plots.items():
+        yield name, partial(plot, calibration)
     yield "other_parameters", lambda: plot_parameters(calibration, other_parameters(calibration))

@@ -38,13 +38,13 @@ def find_pair(image, good, offset, *, fwhm=4.0, significance=6.0, tolerance=4.0,
     A second pair brighter than the fraction ``companion`` is another star.
     """
     smooth, level, noise = _smoothed(image, good, fwhm)
-    if not noise > 0:
-        return Pair(np.zeros((2, 2)), 0.0, "no star")
     peaks, heights = _peaks(smooth, level + significance * noise, fwhm)
-    heights = heights - level
-    if not len(peaks):
+    if not (noise > 0 and len(peaks)):
         return Pair(np.zeros((2, 2)), 0.0, "no star")
-    right, left = _matches(peaks, offset, tolerance)
+    heights = heights - level
+    # of all right and left images at the offset from each other; (right, left, xy)
+    deviation = peaks[:, None, :] - peaks[None, :, :] - np.asarray(offset, dtype=float)
+    right, left = np.nonzero(np.hypot(deviation[..., 0], deviation[..., 1]) <= tolerance)
     if not len(right):
         return Pair(np.zeros((2, 2)), 0.0, "one beam missing")
     # the fainter image of a pair decides: a ghost beside a star makes a poor pair
@@ -92,22 +92,14 @@ def _peaks(smooth, threshold, fwhm):
 
     # odd, about a full width: one peak a star
     size = 2 * int(np.ceil(fwhm / 2)) + 1
-    if not (smooth > threshold).any():
-        return np.empty((0, 2), dtype=int), np.empty(0)
-    table = find_peaks(smooth, threshold, box_size=size)
+    # without a pixel above the threshold it would warn
+    table = find_peaks(smooth, threshold, box_size=size) if (smooth > threshold).any() else None
     if table is None:
         return np.empty((0, 2), dtype=int), np.empty(0)
-    xy = np.stack([np.asarray(table["x_peak"]), np.asarray(table["y_peak"])], axis=1)
+    table.sort("peak_value", reverse=True)
+    table = table[:_MAX_PEAKS]
     heights = np.asarray(table["peak_value"], dtype=float)
-    order = np.argsort(heights)[::-1][:_MAX_PEAKS]
-    return xy[order], heights[order]
-
-
-def _matches(peaks, offset, tolerance):
-    """Return the indices of all right and left images at the offset from each other."""
-    # (right, left, xy)
-    deviation = peaks[:, None, :] - peaks[None, :, :] - np.asarray(offset, dtype=float)
-    return np.nonzero(np.hypot(deviation[..., 0], deviation[..., 1]) <= tolerance)
+    return np.stack([np.asarray(table["x_peak"]), np.asarray(table["y_peak"])], axis=1), heights
 
 
 def _width(light, positions):
@@ -185,14 +177,12 @@ def fit_gaussians(images, good=None, *, x, y, fwhm, max_iterations=40, tolerance
 def _start(data, weight, x, y, fwhm):
     """Return amplitude, x, y, xx, xy, yy, background to start from."""
     known = np.where(weight > 0, data, np.nan)
-    empty = ~(weight > 0).any(axis=1)
-    known[empty] = 0.0
+    known[~(weight > 0).any(axis=1)] = 0.0
     background = np.nanmedian(known, axis=1)
     amplitude = np.nanmax(known, axis=1) - background
     # 1 / sigma^2, the same along both axes
     curvature = (gaussian_sigma_to_fwhm / fwhm) ** 2
-    zero = np.zeros_like(background)
-    return np.stack([amplitude, x, y, curvature, zero, curvature, background], axis=1)
+    return np.stack([amplitude, x, y, curvature, 0 * x, curvature, background], axis=1)
 
 
 def _minimize(p, data, weight, grid, max_iterations, tolerance):
@@ -267,18 +257,10 @@ def _sane(p):
 
 def _result(p, noise, done):
     amplitude, x, y, xx, xy, yy, background = p.T
-    determinant = xx * yy - xy**2
+    # sqrt(sigma_1 sigma_2) = det^(-1/4)
+    fwhm = gaussian_sigma_to_fwhm * (xx * yy - xy**2) ** -0.25
     # eigenvalues of the inverse covariance are mean +- half
     mean, half = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    return GaussianFits(
-        amplitude=amplitude,
-        x=x,
-        y=y,
-        background=background,
-        # sqrt(sigma_1 sigma_2) = det^(-1/4)
-        fwhm=gaussian_sigma_to_fwhm * determinant**-0.25,
-        elongation=np.sqrt((mean + half) / np.maximum(mean - half, 1e-300)),
-        noise=noise,
-        converged=done,
-        shape=np.stack([xx, xy, yy], axis=1),
-    )
+    elongation = np.sqrt((mean + half) / np.maximum(mean - half, 1e-300))
+    shape = np.stack([xx, xy, yy], axis=1)
+    return GaussianFits(amplitude, x, y, background, fwhm, elongation, noise, done, shape)

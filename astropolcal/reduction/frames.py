@@ -3,7 +3,7 @@
 
 import hashlib
 import warnings
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +30,6 @@ _ARRAYS = (
     *("flux", "variance", "covariance", "scale", "scale_err"),
     *("x", "y", "fwhm", "radius", "background"),
 )
-_NEEDED = {"internal": ("hwp", "derotator"), "star": ("hwp", "derotator")}
 
 
 @dataclass
@@ -139,33 +138,23 @@ def _read(path, hdus, layout):
     primary, header, cube, good = _read_beams(path, hdus, layout)
     left = layout.left_file(path)
     if left is None:
-        return primary, header, cube, good
+        return primary, header, cube, None if good.all() else good
     if not left.is_file():
         raise ObservationError(f"{path}: no file {left.name} of the left beam beside it")
     # what is joined is in memory, so that this file need not stay open
-    with (
-        readable_fits(left),
-        open_fits(left) as stream,
-        fits.open(stream, memmap=False) as others,
-    ):
+    with readable_fits(left), open_fits(left) as stream, fits.open(stream, memmap=False) as others:
         _, _, other, known = _read_beams(left, others, layout)
-    joined = np.concatenate([other, cube], axis=-1)
-    if good is not None or known is not None:
-        parts = [
-            np.ones(c.shape, bool) if g is None else g for c, g in ((other, known), (cube, good))
-        ]
-        good = np.concatenate(parts, axis=-1)
-    return primary, header, joined, good
+    joined, good = (np.concatenate(pair, axis=-1) for pair in ((other, cube), (known, good)))
+    return primary, header, joined, None if good.all() else good
 
 
 def _read_beams(path, hdus, layout):
-    number = layout.cube_extension
+    number, wanted = layout.cube_extension, layout.file_shape
     if len(hdus) <= number:
         raise ObservationError(
             f"{path}: no extension {number}, where the cube should be; it has {len(hdus)} HDUs"
         )
     data = hdus[number].data
-    wanted = layout.file_shape
     if data is not None and data.ndim == 2 and wanted[0] == 1:
         data = data[None]
     if data is None or data.shape != wanted:
@@ -174,48 +163,39 @@ def _read_beams(path, hdus, layout):
     if data.dtype.kind not in "fiu":
         raise ObservationError(f"{path}: pixels of type {data.dtype}, numbers are needed")
     # FITS is big-endian, which slows down all that follows
-    native = data.dtype.newbyteorder("=") if data.dtype.kind == "f" else float
-    cube = np.asarray(data, dtype=native)
+    cube = np.asarray(data, dtype=data.dtype.newbyteorder("=") if data.dtype.kind == "f" else float)
     # NaN marks what extraction could not reach
     good = np.isfinite(cube)
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
     if weight is not None and weight.size == cube.size:
-        weight = weight.reshape(cube.shape)
-        good &= np.asarray(weight) > 0
+        good &= np.asarray(weight.reshape(cube.shape)) > 0
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
-    return hdus[0].header, hdus[number].header, cube, None if good.all() else good
+    return hdus[0].header, hdus[number].header, cube, good
 
 
 def _check_header(frame, layout, source):
     """Add what is missing or contradictory to the errors of a frame."""
-    values = frame.values
+    values, keywords = frame.values, layout.keywords
     foreign = not_of_instrument(values, layout)
     frame.errors += [foreign] if foreign else []
     frame.errors += [
-        f"no keyword {layout.keywords[column]} in its header"
-        for column in _NEEDED[source]
+        f"no keyword {keywords[column]} in its header"
+        for column in ("hwp", "derotator")
         if column not in values
-        and not any(error.startswith(layout.keywords[column]) for error in frame.errors)
+        and not any(error.startswith(keywords[column]) for error in frame.errors)
     ]
-    _add_time(values)
+    with suppress(ObservationError):
+        time = observation_time(values)
+        values.setdefault("mjd", float(time.mjd))
+        values.setdefault("date", time.isot[:10])
     # of stars `check_stars` looks
     on_plate = tracking_error(values, layout, on_sky=False) if source != "star" else None
     if abs(on_plate or 0.0) > layout.tracking_tolerance:
         frame.doubts.append(
-            f"{layout.keywords['hwp_true']} and {layout.keywords['hwp']} differ by more than "
+            f"{keywords['hwp_true']} and {keywords['hwp']} differ by more than "
             f"{layout.tracking_tolerance:g} deg, though the plate does not follow the sky"
         )
-
-
-def _add_time(values):
-    if "mjd" not in values:
-        try:
-            values["mjd"] = float(observation_time(values).mjd)
-        except ObservationError:
-            return
-    if "date" not in values:
-        values["date"] = observation_time(values).isot[:10]
 
 
 def check_stars(frames, layout):
@@ -227,25 +207,19 @@ def check_stars(frames, layout):
     # what could not be opened says nothing
     frames = [frame for frame in frames if frame.values]
     add_pointing(frames, layout)
+    name, most = layout.keywords.get("hwp_true", "hwp_true"), layout.tracking_tolerance
     for frame in frames:
-        if {"parallactic", "altitude"} <= frame.values.keys():
-            _check_tracking(frame, layout)
-
-
-def _check_tracking(frame, layout):
-    values = frame.values
-    # a plate that did not follow the sky spoils a frame without any other sign
-    off = tracking_error(values, layout)
-    if off is None:
-        frame.doubts.append(
-            f"no keyword {layout.keywords.get('hwp_true', 'hwp_true')}: "
-            "the tracking of the half-wave plate was not checked"
-        )
-    elif abs(off) > layout.tracking_tolerance:
-        frame.errors.append(
-            f"{layout.keywords['hwp_true']} = {values['hwp_true']:g} deg is {off:+.2f} deg off the "
-            f"tracking law; up to {layout.tracking_tolerance:g} deg is allowed"
-        )
+        if not {"parallactic", "altitude"} <= frame.values.keys():
+            continue
+        # a plate that did not follow the sky spoils a frame without any other sign
+        off = tracking_error(frame.values, layout)
+        if off is None:
+            words = "the tracking of the half-wave plate was not checked"
+            frame.doubts.append(f"no keyword {name}: {words}")
+        elif abs(off) > most:
+            stated = f"{name} = {frame.values['hwp_true']:g} deg"
+            law = f"{off:+.2f} deg off the tracking law; up to {most:g} deg is allowed"
+            frame.errors.append(f"{stated} is {law}")
 
 
 # ---- beams on two cameras, each with a file of its own -------------------------------------------
@@ -267,15 +241,14 @@ def match_beams(frame, layout, cube, detector):
     # what the plate did while the cameras were exposed must be one thing
     frame.errors += _contradictions(frame.values, other.values, path.name)
     frame.errors += _wrong_cameras(frame, other, layout)
-    unit = detector.unit.to_string()
     # each camera is read out in its own way
-    left = detector_of(layout, unit, other.values.get("exposure_time"), other.values)
+    unit, exposure = detector.unit.to_string(), other.values.get("exposure_time")
+    left = detector_of(layout, unit, exposure, other.values)
     # to the electrons of the right one: single differences compare both beams
     if left.gain != detector.gain:
-        width = cube.shape[-1] // 2
         # the left image is the first half of the columns
-        factor = np.where(np.arange(cube.shape[-1]) < width, left.gain / detector.gain, 1.0)
-        cube = cube * factor
+        first = np.arange(cube.shape[-1]) < cube.shape[-1] // 2
+        cube = cube * np.where(first, left.gain / detector.gain, 1.0)
     return replace(detector, left=left.in_units_of(detector)), cube
 
 

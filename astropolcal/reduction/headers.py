@@ -8,7 +8,9 @@ What is missing, impossible or contradictory is reported for each file.
 
 import os
 import re
+import warnings
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,13 +61,10 @@ def frame_number(name, layout, header=None):
 
     The header knows the name that a file had before it was renamed.
     """
-    candidates = [Path(name).name]
-    if header is not None:
-        candidates.append(str(header.get(layout.original_name, "")))
-    for text in candidates:
+    other = "" if header is None else str(header.get(layout.original_name, ""))
+    for text in (Path(name).name, other):
         # the last one: a date may stand before it
-        found = re.findall(layout.frame_pattern, text)
-        if found:
+        if found := re.findall(layout.frame_pattern, text):
             return int(found[-1])
     return None
 
@@ -85,6 +84,16 @@ def raw_frames(folder, layout):
     if not found:
         raise ObservationError(f"{folder}: no FITS file with a frame number in its name")
     return found
+
+
+def configured(instrument, files):
+    """Return the instrument as the first header that can be read says; as it is without one."""
+    for path in files:
+        with suppress(ObservationError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # wavelengths and shape of the cubes may depend on it
+            return instrument.configured(primary_header(path))
+    return instrument
 
 
 def read_header(path, layout, *, header=None, raw=None):
@@ -157,19 +166,21 @@ def _convert(frame, column, keyword, value, layout):
     """Store a value in the unit of its column, or say why it cannot be right."""
     if column == "flc_state":
         _add_state(frame, keyword, value, layout)
-        return
-    if column == "date":
+    elif column == "date":
         try:
             frame.values[column] = iso_date(value, keyword)
         except ParameterError as error:
             # the time may stand in another keyword
             frame.doubts.append(f"{error}; it was left out")
-        return
-    if column in TEXTS:
+    elif column in TEXTS:
         frame.values[column] = " ".join(str(value).split())
-        return
-    unit = unit_of(column, layout)
-    target = u.deg if column in ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
+    else:
+        _add_number(frame, column, keyword, value, layout)
+
+
+def _add_number(frame, column, keyword, value, layout):
+    unit = {"exposure_time": "s"}.get(column, unit_of(column, layout))
+    target = u.deg if column in ANGLES else u.Unit(unit)
     try:
         number = convert(column, value, layout, target)
     except (TypeError, ValueError):
@@ -179,10 +190,12 @@ def _convert(frame, column, keyword, value, layout):
     if column == "exposure_time":
         # an exposure of zero seconds has no rate
         low = np.nextafter(0, 1)
-    if not (np.isfinite(number) and low <= number <= high):
-        frame.errors.append(f"{keyword} = {value}, allowed are {_allowed(low, high, target)}")
+    if np.isfinite(number) and low <= number <= high:
+        frame.values[column] = number
         return
-    frame.values[column] = number
+    allowed = "finite numbers" if np.isinf(low) else "numbers above zero"
+    allowed = f"{low:g} to {high:g} {target}".strip() if np.isfinite(high) else allowed
+    frame.errors.append(f"{keyword} = {value}, allowed are {allowed}")
 
 
 def _add_state(frame, keyword, value, layout):
@@ -194,12 +207,6 @@ def _add_state(frame, keyword, value, layout):
         frame.errors.append(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
     elif known[word]:
         frame.values["flc_state"] = known[word]
-
-
-def _allowed(low, high, unit):
-    if np.isfinite(high):
-        return f"{low:g} to {high:g} {unit}".strip()
-    return "finite numbers" if np.isinf(low) else "numbers above zero"
 
 
 def pointing(values, site):
@@ -244,8 +251,9 @@ def _target(values, site):
         raise ObservationError("no site of the telescope to compute the pointing from")
     time = observation_time(values)
     try:
-        ra, dec = values["right_ascension"], values["declination"]
-        unit = u.deg if _is_number(ra) else u.hourangle
+        ra, dec, unit = values["right_ascension"], values["declination"], u.hourangle
+        with suppress(ValueError):
+            ra, unit = plain_number(ra), u.deg
         coordinate = SkyCoord(ra, dec, unit=(unit, u.deg), frame=FK5(equinox="J2000"))
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
@@ -263,14 +271,6 @@ def _pointings(targets, site):
     coordinate = SkyCoord(ra, dec, unit=u.deg, frame=FK5(equinox="J2000"))
     angles = sky_pointing(coordinate, Time(mjd, format="mjd", scale="utc"), location_of(site))
     return list(zip(*(angle.to_value(u.deg).tolist() for angle in angles), strict=True))
-
-
-def _is_number(text):
-    try:
-        plain_number(text)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def observation_time(values):
@@ -322,13 +322,12 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     blocks = np.split(np.arange(len(hwp)), np.flatnonzero(np.abs(np.diff(derotator)) > 1.0) + 1)
     sequence = _sequence([tuple(steps[block]) for block in blocks])
     found = {}
-    for block in blocks:
-        for i, expected in _misfits(block, steps, sequence, uneven):
-            words = f"half-wave plate at {hwp[i]:g} deg"
-            words += f", no multiple of {layout.hwp_step:g} deg" if uneven[i] else " once too often"
-            if expected is not None and expected < 1e6:
-                words += f"; the sequence has {expected * layout.hwp_step:g} deg"
-            found[int(i)] = words
+    for i, expected in (one for b in blocks for one in _misfits(b, steps, sequence, uneven)):
+        found[int(i)] = f"half-wave plate at {hwp[i]:g} deg"
+        multiple = f", no multiple of {layout.hwp_step:g} deg"
+        found[int(i)] += multiple if uneven[i] else " once too often"
+        if expected is not None and expected < 1e6:
+            found[int(i)] += f"; the sequence has {expected * layout.hwp_step:g} deg"
     return found
 
 

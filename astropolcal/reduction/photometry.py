@@ -127,13 +127,11 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
     counts = 1 * own * (exposure_time * u.s if rate else 1)
     how = layout.read_out(values or {})
     if counts.unit.is_equivalent(u.adu):
-        electrons = float(how.gain * counts.to_value(u.adu))
-    else:
-        electrons = float(counts.to_value(u.electron))
-    # both in electrons, which no unit of the file changes
-    full = how.saturation * how.gain
-    noise = how.read_noise / electrons
-    return Detector(own, electrons, noise, full / electrons, how.excess_noise)
+        counts = counts * how.gain * u.electron / u.adu
+    electrons = float(counts.to_value(u.electron))
+    # saturation and noise in electrons, which no unit of the file changes
+    full, noise = how.saturation * how.gain / electrons, how.read_noise / electrons
+    return Detector(own, electrons, noise, full, how.excess_noise)
 
 
 def _unit(text):
@@ -213,12 +211,9 @@ def rectangles(apertures, shape):
         # exact: weights are the parts of pixels inside, and their sum is the area
         mask = RectangularAperture((x, y), width, height, theta=angle).to_mask(method="exact")
         box = mask.bbox
-        inside = box.iymin >= 0 and box.ixmin >= 0 and box.iymax <= shape[0]
-        if not (inside and box.ixmax <= shape[1]):
-            raise InstrumentError(
-                f"the rectangle at ({x:g}, {y:g}) leaves the image of {shape[1]} x {shape[0]} "
-                "pixels"
-            )
+        if min(box.iymin, box.ixmin) < 0 or box.iymax > shape[0] or box.ixmax > shape[1]:
+            size = f"{shape[1]} x {shape[0]} pixels"
+            raise InstrumentError(f"the rectangle at ({x:g}, {y:g}) leaves the image of {size}")
         found.append((slice(box.iymin, box.iymax), slice(box.ixmin, box.ixmax), mask.data))
     return tuple(found)
 
@@ -257,18 +252,16 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         level, spread, number = _level(cube, good, detector, layout)
         result.background[:] = level
     areas = []
-    for beam, (rows, columns, weights) in enumerate(
-        rectangles(layout.internal_apertures, cube.shape[1:])
-    ):
-        cut = cube[:, rows, columns]
+    inside = rectangles(layout.internal_apertures, cube.shape[1:])
+    for beam, (rows, columns, weights) in enumerate(inside):
+        own, cut = detector.of(beam), cube[:, rows, columns]
         known = None if good is None else good[:, rows, columns]
-        single = _outliers(cut, known, weights, detector.of(beam))
+        single = _outliers(cut, known, weights, own)
         result.outliers += int(single.sum())
         used = known if not single.any() else ~single if known is None else known & ~single
         total, area, kept = _weighted(cut, used, weights)
         scale = area / np.where(kept > 0, kept, 1.0)
         result.flux[beam] = total * scale - level * area
-        own = detector.of(beam)
         photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
         pixel = np.maximum(spread, own.read_noise**2)
         result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
@@ -292,15 +285,12 @@ def evenly_lit(cube, good, layout):
     beams = []
     for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
         inside = (slice(None), rows, columns)
-        values, whole = cube[inside], weights >= 1.0
-        if good is not None:
-            known = good[inside]
-            values = np.where(known, values, 0.0)
-            whole = whole & known.any(axis=0)
-            pixels = values.sum(axis=0, dtype=float)[whole] / known.sum(axis=0)[whole]
-        else:
-            # in the precision of the cube a damaged pixel would overflow
-            pixels = values.mean(axis=0, dtype=float)[whole]
+        known = np.ones((1, 1, 1), bool) if good is None else good[inside]
+        # in the precision of the cube a damaged pixel would overflow
+        total = np.sum(cube[inside], axis=0, dtype=float, where=known)
+        number = np.broadcast_to(known, cube[inside].shape).sum(axis=0)
+        whole = (weights >= 1.0) & (number > 0)
+        pixels = total[whole] / number[whole]
         beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
     # the brighter one: of light that is all in one polarization the other is dark
     mean, median = max(beams)

@@ -5,12 +5,12 @@ import hashlib
 import json
 import os
 import re
-import warnings
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import cycle
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 
@@ -18,12 +18,11 @@ import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.files import append_line, understood
-from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations
 from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
-from astropolcal.reduction.headers import check_sequence, raw_frames
+from astropolcal.reduction.headers import check_sequence, configured, raw_frames
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -286,47 +285,35 @@ def _instrument(instrument, files=()):
 
     instrument = instruments.get(instrument) if isinstance(instrument, str) else instrument
     # one run, one mode: what differs is left out later
-    header = _first_header(files)
-    if header is not None:
-        instrument = instrument.configured(header)
-    if instrument.files is None:
+    instrument = configured(instrument, files)
+    name, layout = instrument.name, instrument.files
+    if layout is None:
         known = [name for name in instruments.names() if instruments.get(name).files is not None]
         raise InstrumentError(
-            f"{instrument.name}: it is not known how its files look; they can be read of "
-            f"{', '.join(known)}"
+            f"{name}: it is not known how its files look; they can be read of {', '.join(known)}"
         )
-    if len(instrument.wavelength) != instrument.files.shape[0]:
+    if len(instrument.wavelength) != layout.shape[0]:
         raise InstrumentError(
-            f"{instrument.name}: {len(instrument.wavelength)} wavelengths, but cubes of "
-            f"{instrument.files.shape[0]} slices"
+            f"{name}: {len(instrument.wavelength)} wavelengths, but cubes of {layout.shape[0]} "
+            "slices"
         )
     return instrument
 
 
-def _first_header(files):
-    """Return the primary header of the first file that has one, None without."""
-    for path in files:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                return primary_header(path)
-        except Exception:  # damaged files raise errors of every kind, and are reported later
-            continue
-    return None
-
-
 def _with_state(frames, reduction):
     """Leave out frames without the state of a modulator that others have."""
-    states = [frame.values.get("flc_state") for frame in frames]
-    if not any(states):
+    if not any(frame.values.get("flc_state") for frame in frames):
         return frames
     keyword = reduction.instrument.files.keywords.get("flc_state", "flc_state")
-    for frame, state in zip(frames, states, strict=True):
-        if state is None:
-            reduction.problems[frame.path] = [
-                f"no state of the modulator, A or B, in its header ({keyword}), which others have"
-            ]
-    return [frame for frame, state in zip(frames, states, strict=True) if state is not None]
+    why = f"no state of the modulator, A or B, in its header ({keyword}), which others have"
+    return _kept(frames, reduction, lambda f: [] if "flc_state" in f.values else [why])
+
+
+def _kept(frames, reduction, why):
+    """Return the frames of which ``why`` knows no reasons to leave them out; note the others."""
+    found = [(frame, why(frame)) for frame in frames]
+    reduction.problems |= {frame.path: reasons for frame, reasons in found if reasons}
+    return [frame for frame, reasons in found if not reasons]
 
 
 def _photometry(source, instrument):
@@ -430,9 +417,8 @@ def _meta(frames, instrument, source, given):
     for key, column in (("mode", "filter"), ("object", "object"), ("date", "date")):
         texts = [v[column] for v in values if v.get(column)]
         if texts and (key != "object" or "star" in source):
-            meta[key] = Counter(texts).most_common(1)[0][0]
-    if "date" in meta:
-        meta["date"] = meta["date"][:10]
+            usual = Counter(texts).most_common(1)[0][0]
+            meta[key] = usual[:10] if key == "date" else usual
     meta |= _optics(values, instrument.files)
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
@@ -440,19 +426,17 @@ def _meta(frames, instrument, source, given):
     if source != "internal":
         meta["source"] = source
     elif "source" not in given and (seen := _seen_source(frames)):
-        meta["source"] = seen
-        meta["source_from"] = "the modulation of the fluxes"
+        meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
 
 def _optics(values, layout):
-    """Return what the headers say of optics in the beam."""
+    """Return what the headers say of optics in the beam, by the first pattern that is found."""
     found = {}
     for key, (column, words) in layout.optics.items():
-        stated = next((v[column] for v in values if v.get(column)), "")
-        for pattern, word in words.items():
-            if re.search(pattern, stated):
-                found.setdefault(key, word)
+        said = next((v[column] for v in values if v.get(column)), "")
+        hits = [word for pattern, word in words.items() if re.search(pattern, said)]
+        found |= {key: hits[0]} if hits else {}
     return found
 
 
@@ -480,80 +464,68 @@ _KINDS = {"internal": ("filter", "pickoff", "light"), "star": ("filter", "pickof
 
 def set_aside(frames, reduction):
     """Leave out what cannot be used, copies, and frames of another kind than most."""
-    kept = []
     seen = {}
-    for frame in frames:
+
+    def why(frame):
         if not frame.usable:
-            reduction.problems[frame.path] = frame.errors
-            continue
+            return frame.errors
         # a copy under another name has the same fluxes to the last bit
         keys = [f"data {frame.digest}"]
         keys += [f"number {frame.number}"] if frame.number is not None else []
         first = next((seen[key] for key in keys if key in seen), None)
-        if first is not None:
-            same = "the same data as" if f"data {frame.digest}" in seen else "the same frame as"
-            name = first.path if first.name == frame.name else first.name
-            reduction.problems[frame.path] = [f"{same} {name}"]
-            continue
-        seen.update(dict.fromkeys(keys, frame))
-        kept.append(frame)
+        if first is None:
+            seen.update(dict.fromkeys(keys, frame))
+            return []
+        same = "the same data as" if keys[0] in seen else "the same frame as"
+        return [f"{same} {first.path if first.name == frame.name else first.name}"]
+
+    kept = _kept(frames, reduction, why)
     # before the rest: fluxes in other units cannot be compared at all
     kept = _of_one_kind(kept, "unit", lambda frame: frame.unit, reduction)
     for name in _KINDS[reduction.source]:
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
-    return sorted(kept, key=_order)
+    # what has no number comes last, by time
+    time = {frame.path: frame.values.get("mjd", np.inf) for frame in kept}
+    return sorted(
+        kept,
+        key=lambda f: (f.number is None, time[f.path] if f.number is None else f.number, f.name),
+    )
 
 
 def _of_one_kind(frames, what, value, reduction):
     """Leave out frames that differ from most in what a run has in common."""
     # case, blanks and signs are written now so, now so; but BD+12 and BD-12 are two stars
-    kinds = [
-        None if value(frame) is None else re.sub(r"[^\w+-]|_", "", value(frame)).casefold()
-        for frame in frames
-    ]
-    counts = Counter(kind for kind in kinds if kind is not None)
-    if len(counts) < 2:
-        return frames
+    kinds = {f.path: value(f) and re.sub(r"[^\w+-]|_", "", value(f)).casefold() for f in frames}
     # whose frames are fewer is the intruder, even if it came first
-    usual = counts.most_common(1)[0][0]
-    words = value(frames[kinds.index(usual)])
-    kept = []
-    for frame, kind in zip(frames, kinds, strict=True):
-        # a header that says nothing contradicts nothing
-        if kind in (usual, None):
-            kept.append(frame)
-            continue
-        reduction.problems[frame.path] = [
-            f"{what} {value(frame)!r}, the others of the run have {words!r}"
-        ]
-    return kept
+    usual = Counter(kind for kind in kinds.values() if kind is not None).most_common()
+    if len(usual) < 2:
+        return frames
+    # a header that says nothing contradicts nothing
+    good = (usual[0][0], None)
+    words = value(next(frame for frame in frames if kinds[frame.path] == good[0]))
 
+    def why(f):
+        said = f"{what} {value(f)!r}, the others of the run have {words!r}"
+        return [] if kinds[f.path] in good else [said]
 
-def _order(frame):
-    """Order by frame number; what has none comes last, by time and name."""
-    if frame.number is not None:
-        return (0, frame.number, frame.name)
-    return (1, frame.values.get("mjd", np.inf), frame.name)
+    return _kept(frames, reduction, why)
 
 
 def replace_angles(frames, sequence):
     """Give the frames the angles of a sequence that repeats, in place."""
     if sequence is None:
         return
-    sequence = [float(angle) for angle in sequence]
-    if not sequence or len(frames) % len(sequence):
+    if not len(sequence) or len(frames) % len(sequence):
         raise ObservationError(
             f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
             "frames are missing, and it is unclear which"
         )
-    for i, frame in enumerate(frames):
-        stated, frame.values["hwp"] = frame.values["hwp"], sequence[i % len(sequence)]
+    for frame, angle in zip(frames, cycle(map(float, sequence)), strict=False):
+        stated, frame.values["hwp"] = frame.values["hwp"], angle
         # degree; what a header rounds
-        if abs(stated - frame.values["hwp"]) > 1e-3:
-            frame.doubts.append(
-                f"half-wave plate at {stated:g} deg in the header, replaced by "
-                f"{frame.values['hwp']:g} deg"
-            )
+        if abs(stated - angle) > 1e-3:
+            words = f"half-wave plate at {stated:g} deg in the header, replaced by {angle:g} deg"
+            frame.doubts.append(words)
 
 
 def consistent(frames, reduction, layout, check):
@@ -561,24 +533,22 @@ def consistent(frames, reduction, layout, check):
     if not check or not frames:
         return frames
     angles = ([frame.values[name] for frame in frames] for name in ("hwp", "derotator"))
-    wrong = check_sequence(*angles, layout)
-    for i, why in wrong.items():
-        reduction.problems[frames[i].path] = [why]
-    return [frame for i, frame in enumerate(frames) if i not in wrong]
+    wrong = {frames[i].path: [why] for i, why in check_sequence(*angles, layout).items()}
+    return _kept(frames, reduction, lambda frame: wrong.get(frame.path))
 
 
 def without_repeats(frames, reduction):
     """Leave out frames at 90 deg from another one, which measure the same again."""
-    kept = []
-    for frame in frames:
-        twin = next((other for other in kept if _repeats(frame, other)), None)
+    seen = []
+
+    def why(frame):
+        twin = next((other for other in seen if _repeats(frame, other)), None)
         if twin is None:
-            kept.append(frame)
-        else:
-            reduction.problems[frame.path] = [
-                f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
-            ]
-    return kept
+            seen.append(frame)
+            return []
+        return [f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"]
+
+    return _kept(frames, reduction, why)
 
 
 def _repeats(frame, other):

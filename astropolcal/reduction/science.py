@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What headers and images tell of science frames, before their light is measured."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -13,6 +14,7 @@ from astropolcal.pipeline.headers import told_beam
 from astropolcal.reduction.frames import beam_scale, check_stars, reduce_frame
 from astropolcal.reduction.headers import (
     add_pointing,
+    configured,
     not_of_instrument,
     observation_time,
     raw_frames,
@@ -47,32 +49,21 @@ def read_night(files, instrument):
         raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
     # which keywords there are may depend on the mode
     layout = configured(instrument, files).files
-    moments, modes, headers = {}, {}, []
+    moments, modes = {}, {}
     for file in files:
-        frame = read_header(file, layout)
-        if frame.values.get("filter"):
+        values = read_header(file, layout).values
+        if values.get("filter"):
             # the first file of each mode, to be named
-            modes.setdefault(frame.values["filter"], file)
-        try:
-            moments[str(file)] = observation_time(frame.values).isot
-        except ObservationError:
-            # whether it is needed depends on the calibration
-            moments[str(file)] = None
-        headers.append(primary_header(file))
+            modes.setdefault(values["filter"], file)
+        moments[str(file)] = None
+        # whether it is needed depends on the calibration
+        with suppress(ObservationError):
+            moments[str(file)] = observation_time(values).isot
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
-    return Night(moments, next(iter(modes), None), told_beam(headers, instrument, files))
-
-
-def configured(instrument, files):
-    """Return the instrument as the first file's header says; as it is if that cannot be read."""
-    try:
-        header = primary_header(files[0])
-    except (ObservationError, IndexError):
-        return instrument
-    # wavelengths and shape of the cubes may depend on it
-    return instrument.configured(header)
+    beam = told_beam([primary_header(file) for file in files], instrument, files)
+    return Night(moments, next(iter(modes), None), beam)
 
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):

@@ -15,8 +15,8 @@ from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
-from astropolcal.files import atomic_path, check_new
 from astropolcal.observations.reading import read_ecsv
+from astropolcal.reduction.tables import write_table
 
 __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
 
@@ -73,23 +73,19 @@ def spectra_from_table(table):
             "spectra of a target need the package specutils (2.0 or later): pip install specutils"
         ) from error
     table, mask = _checked(table)
-    axis = table["wavelength"]
     spectra = {}
-    for key in (key for key, name in _NAMES.items() if name in table.colnames):
+    for key, name in _NAMES.items():
+        if name not in table.colnames:
+            continue
         # each spectrum its own: a user may change one
         meta = dict(table.meta)
         if key in ("q", "u") and _COVARIANCE in table.colnames:
-            meta[_COVARIANCE] = u.Quantity(table[_COVARIANCE]).to_value(u.one)
-        name = _NAMES[key]
+            meta[_COVARIANCE] = table[_COVARIANCE].to_value(u.one)
         if f"{name}_{_SYSTEMATIC}" in table.colnames:
-            meta[_SYSTEMATIC] = np.asarray(u.Quantity(table[f"{name}_{_SYSTEMATIC}"]).value)
-        spectra[key] = Spectrum(
-            flux=u.Quantity(table[name]),
-            spectral_axis=axis,
-            uncertainty=StdDevUncertainty(u.Quantity(table[f"{name}_err"])),
-            mask=mask.copy(),
-            meta=meta,
-        )
+            meta[_SYSTEMATIC] = table[f"{name}_{_SYSTEMATIC}"].value
+        settings = {"flux": table[name], "spectral_axis": table["wavelength"], "meta": meta}
+        uncertainty = StdDevUncertainty(table[f"{name}_err"])
+        spectra[key] = Spectrum(**settings, uncertainty=uncertainty, mask=mask.copy())
     return spectra
 
 
@@ -133,16 +129,18 @@ def table_from_spectra(spectra):
             f"{', '.join(unknown) or 'none'}; needed are I, q, u, and v if measured"
         )
     table = QTable({"wavelength": _common_axis(spectra)})
-    mask = np.zeros(len(table), dtype=bool)
+    table["mask"] = np.zeros(len(table), dtype=bool)
     for key in (key for key in _NAMES if key in spectra):
         spectrum, name = spectra[key], _NAMES[key]
-        table[name] = u.Quantity(spectrum.flux)
-        table[f"{name}_err"] = _standard_deviation(key, spectrum)
+        if spectrum.uncertainty is None:
+            raise ObservationError(f"spectrum {key}: has no uncertainty")
+        deviation = spectrum.uncertainty.represent_as(StdDevUncertainty)
+        unit = deviation.unit or spectrum.flux.unit
+        table[name], table[f"{name}_err"] = spectrum.flux, u.Quantity(deviation.array, unit)
         _take(table, f"{name}_{_SYSTEMATIC}", spectrum, key, _SYSTEMATIC, table[name].unit)
         if spectrum.mask is not None:
-            mask |= np.asarray(spectrum.mask, dtype=bool)
+            table["mask"] |= np.asarray(spectrum.mask, dtype=bool)
     _take(table, _COVARIANCE, spectra["q"], "q", _COVARIANCE, u.one)
-    table["mask"] = mask
     own = ("header", _COVARIANCE, _SYSTEMATIC)
     table.meta = {k: v for k, v in spectra["I"].meta.items() if k not in own}
     return _checked(table)[0]
@@ -174,10 +172,7 @@ def write_spectra(spectra, path, *, overwrite=False):
     ...
     astropolcal.exceptions.ObservationError: spectra: missing I, q, u, ...
     """
-    table = table_from_spectra(spectra)
-    path = check_new(path, overwrite, ObservationError)
-    with atomic_path(path, ObservationError) as temporary:
-        table.write(temporary, format="ascii.ecsv", overwrite=True)
+    write_table(table_from_spectra(spectra), path, overwrite)
 
 
 def read_spectra(path):
@@ -217,7 +212,7 @@ def read_spectra(path):
 def _checked(table):
     """Return the table in the order of the wavelengths, and its mask, or refuse it."""
     table = _in_our_names(QTable(table, copy=True))
-    names = [_NAMES[key] for key in (*_REQUIRED, "v") if key in _REQUIRED or "v" in table.colnames]
+    names = [_NAMES[key] for key in _REQUIRED] + ["v"] * ("v" in table.colnames)
     needed = ["wavelength", *names, *(f"{name}_err" for name in names)]
     missing = [name for name in needed if name not in table.colnames]
     if missing:
@@ -233,15 +228,14 @@ def _checked(table):
             mask = np.array(table["mask"], dtype=bool)
         except (TypeError, ValueError):
             raise ObservationError("target: mask must be true or false in each row") from None
+    units = {_COVARIANCE: u.one}
     for name in names:
         unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
-        columns = [name, f"{name}_err", f"{name}_{_SYSTEMATIC}"]
-        for column in (column for column in columns if column in table.colnames):
+        units |= dict.fromkeys([name, f"{name}_err", f"{name}_{_SYSTEMATIC}"], unit)
+    for column, unit in units.items():
+        if column in table.colnames:
             table[column] = _with_unit(table, column, unit)
             _check_values(table, column, mask)
-    if _COVARIANCE in table.colnames:
-        table[_COVARIANCE] = _with_unit(table, _COVARIANCE, u.one)
-        _check_values(table, _COVARIANCE, mask)
     return table, mask
 
 
@@ -322,13 +316,6 @@ def _common_axis(spectra):
         if axis.shape != first.shape or not u.allclose(axis, first, rtol=1e-5):
             raise ObservationError(f"spectrum {key}: is on another spectral axis than I")
     return first
-
-
-def _standard_deviation(key, spectrum):
-    if spectrum.uncertainty is None:
-        raise ObservationError(f"spectrum {key}: has no uncertainty")
-    deviation = spectrum.uncertainty.represent_as(StdDevUncertainty)
-    return u.Quantity(deviation.array, deviation.unit or spectrum.flux.unit)
 
 
 def _take(table, column, spectrum, key, name, unit):

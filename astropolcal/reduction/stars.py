@@ -57,15 +57,10 @@ def measure_stars(
     like polarization. Pixels without a value are filled with the Gaussian and what the pixels
     around them have beyond it. The options are described in `reduce_run`.
     """
-    _check(radius, factor, max_radius, annulus, companion, max_masked)
-    if aperture_correction not in (False, True, "growth"):
-        raise ParameterError(
-            f"aperture_correction = {aperture_correction!r}; allowed are False, True and 'growth'"
-        )
+    _check(radius, factor, max_radius, annulus, companion, max_masked, aperture_correction)
     result = Photometry.empty(len(cube))
     good = np.isfinite(cube) if good is None else good
-    empty = ~good.any(axis=(1, 2))
-    result.flag(empty, "empty slice")
+    result.flag(~good.any(axis=(1, 2)), "empty slice")
     mean, known = _mean(cube, good)
     pair = find_pair(mean, known, layout.star_offset, fwhm=layout.fwhm, companion=companion)
     if pair.reason:
@@ -95,7 +90,7 @@ def measure_stars(
     return result
 
 
-def _check(radius, factor, max_radius, annulus, companion, max_masked):
+def _check(radius, factor, max_radius, annulus, companion, max_masked, correction):
     if isinstance(radius, str):
         if radius not in ("fwhm", "growth"):
             raise ParameterError(f"radius = {radius!r}; allowed are 'fwhm', 'growth' and pixels")
@@ -107,6 +102,10 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
+    if correction not in (False, True, "growth"):
+        raise ParameterError(
+            f"aperture_correction = {correction!r}; allowed are False, True and 'growth'"
+        )
 
 
 def _mean(cube, good):
@@ -122,19 +121,15 @@ def _mean(cube, good):
 
 def _cutouts(cube, good, pair):
     """Return the surroundings of the star in all slices of both beams, and their corners."""
+    size = np.array(cube.shape[:0:-1])
     # room for the wings of the core, not for other stars; odd sizes keep it in the middle
     half = int(np.clip(np.ceil(1.5 * pair.fwhm) + 3, 6, 30))
-    size = np.array(cube.shape[:0:-1])
-    if (size <= 2 * half).any():
-        half = int((size.min() - 1) // 2)
-    images, known, origin = [], [], []
-    for place in pair.positions:
-        corner = np.clip(np.rint(place).astype(int) - half, 0, size - 2 * half - 1)
-        box = (slice(None), *(slice(c, c + 2 * half + 1) for c in corner[::-1]))
-        images.append(cube[box])
-        known.append(good[box])
-        origin.append(corner)
-    return np.concatenate(images), np.concatenate(known), np.array(origin, dtype=float)
+    half = min(half, int((size.min() - 1) // 2))
+    corners = np.rint(pair.positions).astype(int) - half
+    origin = np.clip(corners, 0, size - 2 * half - 1)
+    boxes = [(slice(None), *(slice(c, c + 2 * half + 1) for c in xy[::-1])) for xy in origin]
+    images, known = (np.concatenate([array[box] for box in boxes]) for array in (cube, good))
+    return images, known, origin.astype(float)
 
 
 def _check_light(result, images, there, starts, fwhm, detector):
@@ -184,10 +179,8 @@ def _track(values, usable):
     """Return what the neighbours of each slice have: a running median over the usable ones."""
     if not usable.any():
         return values
-    bins = np.arange(len(values))
-    kept = values[usable]
-    smooth = ndimage.median_filter(kept, size=min(7, len(kept)), mode="nearest")
-    return np.interp(bins, bins[usable], smooth)
+    smooth = ndimage.median_filter(values[usable], size=min(7, usable.sum()), mode="nearest")
+    return np.interp(np.arange(len(values)), np.flatnonzero(usable), smooth)
 
 
 def _radii(fwhm, radius, factor, max_radius, mean, known, pair):
@@ -195,12 +188,12 @@ def _radii(fwhm, radius, factor, max_radius, mean, known, pair):
     if radius == "fwhm":
         typical = _track(fwhm.mean(axis=0), (fwhm > 0).all(axis=0))
         return np.minimum(factor * typical, max_radius)
-    if radius == "growth":
-        image = np.where(known, mean, np.median(mean[known]))
-        radii = np.arange(1.0, max_radius + 0.5)
-        curves = [curve_of_growth(image, place, radii) for place in pair.positions]
-        return choose_radius(radii, np.mean(curves, axis=0))
-    return float(radius)
+    if radius != "growth":
+        return float(radius)
+    image = np.where(known, mean, np.median(mean[known]))
+    radii = np.arange(1.0, max_radius + 0.5)
+    curves = [curve_of_growth(image, place, radii) for place in pair.positions]
+    return choose_radius(radii, np.mean(curves, axis=0))
 
 
 @dataclass(frozen=True)
@@ -224,22 +217,18 @@ def _measure(result, cube):
         found = _both(result, cube, k, result.radius[0, k])
         if isinstance(found, str):
             result.flag(np.arange(len(result.reasons)) == k, found)
-            continue
-        result.flux[:, k], result.variance[:, k], result.background[:, k] = found[:3]
-        level_variance[:, k] = found[3]
+        else:
+            result.flux[:, k], result.variance[:, k], result.background[:, k] = found[:3]
+            level_variance[:, k] = found[3]
     return level_variance
 
 
 def _both(result, cube, k, radius):
     """Return flux, variance, background and its share in the variance, or why there are none."""
     places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
-    found = []
-    for beam in range(2):
-        values = _aperture(cube, k, beam, places, radius)
-        if isinstance(values, str):
-            return values
-        found.append(values)
-    return np.transpose(found)
+    found = [_aperture(cube, k, beam, places, radius) for beam in range(2)]
+    wrong = [one for one in found if isinstance(one, str)]
+    return wrong[0] if wrong else np.transpose(found)
 
 
 def _aperture(cube, k, beam, places, radius):
@@ -381,8 +370,5 @@ def choose_radius(radii, curve, fraction=0.99):
         raise ParameterError(f"fraction = {fraction:g}; allowed is between 0 and 1")
     curve = np.maximum.accumulate(curve / curve[-1])
     first = int(np.argmax(curve >= fraction))
-    if first == 0:
-        return float(radii[0])
-    below, above = curve[first - 1 : first + 1]
-    step = (fraction - below) / (above - below)
-    return float(radii[first - 1] + step * (radii[first] - radii[first - 1]))
+    around = slice(max(first - 1, 0), first + 1)
+    return float(np.interp(fraction, curve[around], radii[around]))

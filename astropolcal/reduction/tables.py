@@ -32,11 +32,10 @@ def reduced_table(frames, instrument, meta):
     if not frames:
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
-    unit = u.Unit(frames[0].unit)
-    flux = _stack(frames, "flux")
-    variance = _stack(frames, "variance")
-    covariance = np.concatenate([frame.photometry.covariance for frame in frames])
-    columns = {f"flux_{beam}": values for beam, values in zip(BEAMS, flux, strict=True)}
+    flux, variance, covariance = (
+        _stack(frames, name) for name in ("flux", "variance", "covariance")
+    )
+    columns = dict(zip([f"flux_{beam}" for beam in BEAMS], flux, strict=True))
     # errors of the beams alone cannot say what they share
     if (covariance[~failed] != 0).any():
         # var(R -+ L) = var(R) + var(L) -+ 2 cov
@@ -46,7 +45,7 @@ def reduced_table(frames, instrument, meta):
     else:
         columns |= {f"flux_{b}_err": np.sqrt(v) for b, v in zip(BEAMS, variance, strict=True)}
     for name, values in columns.items():
-        table[name] = _column(np.where(failed, 0.0, values), failed, unit)
+        table[name] = _column(np.where(failed, 0.0, values), failed, u.Unit(frames[0].unit))
     reasons = [reason for frame in frames for reason in frame.photometry.reasons]
     if any(reasons):
         table["mask_reason"] = reasons
@@ -55,14 +54,13 @@ def reduced_table(frames, instrument, meta):
 
 
 def _column(values, failed, unit):
-    if failed.any():
-        return MaskedColumn(values, mask=failed, unit=unit)
-    return MaskedColumn(values, unit=unit).filled()
+    column = MaskedColumn(values, mask=failed, unit=unit)
+    return column if failed.any() else column.filled()
 
 
 def _stack(frames, name):
-    """Return an array of the photometry, (2, rows)."""
-    return np.concatenate([getattr(frame.photometry, name) for frame in frames], axis=1)
+    """Return an array of the photometry, (2, rows) or (rows,)."""
+    return np.concatenate([getattr(frame.photometry, name) for frame in frames], axis=-1)
 
 
 def _frame_columns(frames, instrument):
@@ -100,13 +98,11 @@ def photometry_table(frames, instrument):
     if not frames:
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
-    units = {name: u.Unit(unit) for name, unit in _GEOMETRY.items()}
-    for name, unit in (units | {"background": u.Unit(frames[0].unit)}).items():
+    for name, unit in (_GEOMETRY | {"background": frames[0].unit}).items():
         for beam, values in zip(BEAMS, _stack(frames, name), strict=True):
-            table[f"{name}_{beam}"] = _column(values, failed, unit)
+            table[f"{name}_{beam}"] = _column(values, failed, u.Unit(unit))
     for name in ("scale", "scale_err"):
-        values = np.concatenate([getattr(frame.photometry, name) for frame in frames])
-        table[name] = _column(values, failed, u.one)
+        table[name] = _column(_stack(frames, name), failed, u.one)
     return table
 
 
@@ -200,10 +196,9 @@ def _paths(files):
         files = sorted(folder.glob("*.csv")) if os.path.isdir(folder) else [folder]
         if not files:
             raise ObservationError(f"{folder}: no CSV file in this folder")
-    paths = [Path(path) for path in files]
-    if not paths:
+    if not len(files):
         raise ObservationError("no files to read")
-    return paths
+    return [Path(path) for path in files]
 
 
 def _rows(path):
@@ -234,14 +229,12 @@ def _numbers(rows, column):
 
 def _frame_numbers(rows, bins):
     """Number the cubes in the order in which the first file lists them."""
-    numbers = {}
-    seen = {}
-    for (path, i, row), b in zip(rows, bins.tolist(), strict=True):
-        cube = row["filepath"].strip()
-        numbers.setdefault(cube, len(numbers))
+    cubes, seen = [row["filepath"].strip() for _, _, row in rows], {}
+    for (path, i, _), cube, b in zip(rows, cubes, bins.tolist(), strict=True):
         if (cube, b) in seen:
             raise ObservationError(
                 f"{path}, line {i}: {one_line(cube, 80)} is given already in {seen[cube, b]}"
             )
         seen[cube, b] = f"{path}, line {i}"
-    return np.array([numbers[row["filepath"].strip()] for _, _, row in rows])
+    numbers = {cube: number for number, cube in enumerate(dict.fromkeys(cubes))}
+    return np.array([numbers[cube] for cube in cubes])

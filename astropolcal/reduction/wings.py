@@ -49,8 +49,6 @@ class Shares:
     # measured flux of both beams over all of the light, (K,), and covariance, (K, K)
     values: np.ndarray
     covariance: np.ndarray
-    # of the profile, over its degrees of freedom
-    chi_square: float
 
 
 def wing_shares(cube, good, photometry, level_variance, detector, layout, *, reach=45.0):
@@ -184,7 +182,7 @@ def _fit(star, rings, detector, halo_radius):
     freedom = max(weights.size - len(star.x) - len(c) - len(p), 1)
     found = (p, c, background)
     covariance = _covariance(profile, weights, found) * max(1.0, cost / freedom)
-    return _shares(profile, found, covariance, cost / freedom)
+    return _shares(profile, found, covariance)
 
 
 def _least_squares(profile, weights, start):
@@ -218,15 +216,14 @@ def _without_mean(values, weights):
 
 def _covariance(profile, weights, found):
     """Return the covariance of p, c and the backgrounds."""
-    _, _, background = found
     slopes = _slopes(profile.in_rings, found)
-    own = np.zeros((len(background), *weights.shape))
-    own[np.arange(len(background)), np.arange(len(background))] = 1.0
+    own = np.eye(len(found[2]))[:, :, None] * np.ones(weights.shape)
     jacobian = (np.concatenate([slopes, own]) * weights).reshape(len(slopes) + len(own), -1)
     normal = jacobian @ jacobian.T
     normal[2, 2] += _SEEING_SPREAD**-2
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    scale = np.outer(scale, scale)
+    return np.linalg.pinv(normal / scale, hermitian=True) / scale
 
 
 def _slopes(columns, found):
@@ -239,18 +236,16 @@ def _slopes(columns, found):
     return np.concatenate([moved, columns(p)])
 
 
-def _shares(profile, found, covariance, chi_square):
-    star = profile.star
-    p, c, background = found
+def _shares(profile, found, covariance):
+    star, (_, c, background) = profile.star, found
     measured = star.flux.sum(axis=0)
     known = profile.sums() - profile.background_in_apertures(background)
-    total = known + np.tensordot(c, profile.lacking(p), 1)
+    total = known + np.tensordot(c, profile.lacking(found[0]), 1)
     aperture = np.diag(-profile.background_in_apertures(np.ones(len(background))))
     slopes = np.concatenate([_slopes(profile.lacking, found), aperture])
     noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
-    share = measured / total
-    relative = share / total
-    return Shares(share, noise * np.outer(relative, relative), chi_square)
+    relative = measured / total**2
+    return Shares(measured / total, noise * np.outer(relative, relative))
 
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
@@ -349,11 +344,12 @@ def _unlit(star):
 
     for beam, lit in enumerate(star.lit):
         for k, (place, radius) in enumerate(zip(star.places[beam].T, star.radius, strict=True)):
+            aperture = CircularAperture(place, radius)
             # quick look first: few apertures reach out of the field
-            mask = CircularAperture(place, radius).to_mask(method="center")
+            mask = aperture.to_mask(method="center")
             if lit[mask.get_overlap_slices(lit.shape)[0]].all():
                 continue
-            mask = CircularAperture(place, radius).to_mask(method="exact")
+            mask = aperture.to_mask(method="exact")
             inside, part = mask.get_overlap_slices(lit.shape)
             dark = ~lit[inside] & (mask.data[part] > 0)
             if not dark.any():
@@ -361,9 +357,7 @@ def _unlit(star):
             rows, columns = np.nonzero(dark)
             r = np.hypot(columns + inside[1].start - place[0], rows + inside[0].start - place[1])
             # (pixels in the dark part,) of the slice
-            values, known = (
-                array[star.usable[k]][inside][dark] for array in (star.cube, star.good)
-            )
+            values, known = (a[star.usable[k]][inside][dark] for a in (star.cube, star.good))
             weights = mask.data[part][dark]
             yield beam, k, r, weights, float(weights @ np.where(known, values, 0.0))
 
@@ -405,18 +399,15 @@ def _means(star, beam, edges):
     found = []
     rows, columns = np.nonzero(star.lit[beam])
     for k, slice_ in enumerate(star.usable):
-        x, y = star.places[beam, :, k]
-        own = np.hypot(columns - x, rows - y)
+        beams = (beam,) if star.stopped else (beam, 1 - beam)
+        distances = [np.hypot(columns - x, rows - y) for x, y in star.places[beams, :, k]]
+        own = distances[0]
         used = (own >= edges[0]) & (own < edges[-1]) & star.good[slice_][rows, columns]
-        own, y_used, x_used = own[used], rows[used], columns[used]
-        moments = [star.cube[slice_][y_used, x_used], own, own**2]
-        if not star.stopped:
-            x, y = star.places[1 - beam, :, k]
-            other = np.hypot(x_used - x, y_used - y)
-            # mean and mean square, for the two points that stand for a ring
-            moments += [other, other**2]
+        # mean and mean square, for the two points that stand for a ring
+        moments = [d[used] ** power for d in distances for power in (1, 2)]
+        moments.insert(0, star.cube[slice_][rows[used], columns[used]])
         # rings are a pixel wide
-        ring = (own - edges[0]).astype(int)
+        ring = (own[used] - edges[0]).astype(int)
         number = np.bincount(ring, minlength=len(edges) - 1)
         sums = [np.bincount(ring, m, len(edges) - 1) for m in moments]
         found.append([number, *(total / np.maximum(number, 1) for total in sums)])

@@ -10,12 +10,6 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    MODEL,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -29,7 +23,11 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EXAMPLES = """\
+HELP = "fit an instrument's chain of optics to observation tables"
+DESCRIPTION = """\
+Fit an instrument's chain of optics to observation tables. Without files,
+the packaged example is calibrated."""
+EXAMPLES = """\
 examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
@@ -41,119 +39,41 @@ examples:
 """
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "calibrate",
-        run,
-        "fit an instrument's chain of optics to observation tables",
-        "Fit an instrument's chain of optics to observation tables. Without files,\n"
-        "the packaged example is calibrated.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("files FILE", "observation tables (ECSV)", nargs="*", type=Input)
-    add(
-        "-o --output CAL.asdf",
-        "write the calibration here; overwritten if it exists",
-        type=Output,
-    )
-    add("--instrument NAME", "default: as the tables say")
-    _add_model_options(parser, add)
-    _add_fit_options(add)
-    add_shared(parser, "fix", "free")
-    add(
-        "--start OLD.asdf",
-        "start from this calibration, hold it, and refit only what --free names",
-        type=Input,
-    )
-    add_shared(parser, "prior")
-    add(
-        "--gauge",
-        "where the data leave a choice: the least misalignments (default), or where the fit ends",
-        choices=("minimal", "none"),
-        default="minimal",
-    )
-    add_shared(parser, "without")
-    _add_accuracy_options(add)
-    add_shared(parser, "plots", "full", "json", "online", "quiet")
-
-
-def _add_model_options(parser, add):
-    """Add what says how the model is made."""
-    add_shared(parser, *MODEL)
-    add(
-        "--exact",
-        "take the polarization of standard stars and the orientation of fixed optics as "
-        "exact, as published calibrations do; by default they have the errors of the catalogue "
-        "and of the mounting",
-    )
-    add(
-        "--nuisance KIND[:DATASET] ...",
-        "add what differs from dataset to dataset, with a prior: background, beam_gain, or "
-        "lamp (q and u of an unpolarized internal source); for all datasets or for one",
-    )
-
-
-def _add_fit_options(add):
-    """Add what says how the model is fitted."""
-    add(
-        "--observable NAME",
-        "what is fitted (default: normalized_double_difference; single differences of tables "
-        "without half-wave plate, and the intensity of single beams)",
-    )
-    add(
-        "--strategy HOW",
-        "joint (default), two-step (the paper's fit of a polarized source), or sequential: "
-        "polarized source, unpolarized source, stars, each step holding what came before",
-        default="joint",
-    )
-    add(
-        "--loss NAME",
-        "linear (default: least squares), huber, cauchy or bisquare: data far off count less",
-        default="linear",
-    )
-    add(
-        "--keep-all",
-        "mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
-        "incomplete half-wave-plate cycles",
-    )
-    add(
-        "--weights",
-        "equal weights (default), one over the residuals' scatter at each wavelength, or one "
-        "over the tables' errors",
-        choices=("none", "wavelength", "errors"),
-        default="none",
-    )
-    add(
-        "--errors",
-        "errors from how the residuals scatter and hang together (default), or those of "
-        "independent data with the noise of --weights",
-        choices=("scatter", "white"),
-        default="scatter",
-    )
-
-
-def _add_accuracy_options(add):
-    """Add what says how the accuracy is judged."""
-    add(
-        "--standard FILE ...",
-        "table that is predicted, not fitted; its errors are s_standard. A standard star is "
-        "compared with the catalogue, too",
-        type=Input,
-    )
-    add(
-        "--groups",
-        "what cross-validation leaves out: derotator angles (default, where there are "
-        "three), cycles of the half-wave plate, or whole datasets",
-        choices=("derotator", "cycle", "dataset"),
-    )
-    add(
-        "--target DOLP[,AOLP] ...",
-        "target whose accuracy is given, in percent and degree (default: 30, 1 and 0.1, at "
-        "any angle)",
-    )
+OPTIONS = """
+files FILE * Input  observation tables (ECSV)
+-o --output CAL.asdf Output  write the calibration here; overwritten if it exists
+--instrument NAME  default: as the tables say
+@ derotator bounds m3 plate
+--exact  take the polarization of standard stars and the orientation of fixed optics as exact, as
+    published calibrations do; by default they have the errors of the catalogue and of the mounting
+--nuisance KIND[:DATASET] ...  add what differs from dataset to dataset, with a prior: background,
+    beam_gain, or lamp (q and u of an unpolarized internal source); for all datasets or for one
+--observable NAME  what is fitted (default: normalized_double_difference; single differences of
+    tables without half-wave plate, and the intensity of single beams)
+--strategy HOW =joint  joint (default), two-step (the paper's fit of a polarized source), or
+    sequential: polarized source, unpolarized source, stars, each step holding what came before
+--loss NAME =linear  linear (default: least squares), huber, cauchy or bisquare: data far off count
+    less
+--keep-all  mask nothing by itself: neither an unstable lamp, nor saturated frames, nor incomplete
+    half-wave-plate cycles
+--weights {none,wavelength,errors} =none  equal weights (default), one over the residuals' scatter
+    at each wavelength, or one over the tables' errors
+--errors {scatter,white} =scatter  errors from how the residuals scatter and hang together
+    (default), or those of independent data with the noise of --weights
+@ fix free
+--start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
+@ prior
+--gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
+    or where the fit ends
+@ without
+--standard FILE Input ...  table that is predicted, not fitted; its errors are s_standard. A
+    standard star is compared with the catalogue, too
+--groups {derotator,cycle,dataset}  what cross-validation leaves out: derotator angles (default,
+    where there are three), cycles of the half-wave plate, or whole datasets
+--target DOLP[,AOLP] ...  target whose accuracy is given, in percent and degree (default: 30, 1 and
+    0.1, at any angle)
+@ plots full json online quiet
+"""
 
 
 def run(arguments):
@@ -164,7 +84,6 @@ def run(arguments):
     from astropolcal.calibration.validation.targets import TARGETS
     from astropolcal.observations.observables import get_observable
 
-    say = printer(arguments)
     check_suffix("-o", arguments.output, ".asdf")
     _check_start(arguments)
     # raises before any table is read
@@ -172,28 +91,25 @@ def run(arguments):
         get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
     # so that a first call without any data shows what comes out
-    files = arguments.files or [_example(say)]
+    files = arguments.files or [_example(printer(arguments))]
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)
     _check_standards(arguments.standard, standards, files, datasets)
-    # standards follow them in the lists below, and are not fitted
-    n = len(datasets)
-    instrument = instrument_of(arguments, datasets)
+    instrument, options = instrument_of(arguments, datasets), stated_model(arguments)
+    # standards follow the datasets in the lists, and are not fitted
+    n, tables = len(datasets), [*datasets, *standards]
     # the instrument knows which of its frames cannot be trusted
     if not arguments.keep_all:
-        datasets = [instrument.prepare(table) for table in datasets]
-        standards = [instrument.prepare(table) for table in standards]
-    tables = [*datasets, *standards]
-    options = stated_model(arguments)
+        tables = [instrument.prepare(table) for table in tables]
     exact = {"nuisance": arguments.nuisance, "exact": arguments.exact}
-    chains = instrument.chains_for(datasets, **exact, **options)
+    chains = instrument.chains_for(tables[:n], **exact, **options)
     # each on its own wavelengths
-    chains += [instrument.chains_for([table], **options)[0] for table in standards]
+    chains += [instrument.chains_for([table], **options)[0] for table in tables[n:]]
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     if arguments.start:
         edits["free"] = []
     chains = edit_chains(chains, **edits)
     positions = [instrument.positions(*pair) for pair in zip(tables, chains, strict=True)]
-    calibration = _fitted(arguments, chains[:n], datasets, positions[:n], instrument)
+    calibration = _fitted(arguments, chains[:n], tables[:n], positions[:n], instrument)
     if arguments.groups:
         # the fit leaves cross-validation to this line where groups are named
         calibration.cross_validate(arguments.groups)
@@ -219,11 +135,12 @@ def _tell(arguments, calibration, targets, written):
             words = f"NOT USABLE AS IT IS: {'; '.join(found.reasons)}"
             show(f"astropolcal: warning: {words}", file=sys.stderr)
         return
-    last = _written(arguments, written) + ([] if arguments.full else [HINT])
+    last = _written(arguments, written)
     if arguments.full:
         # its end is what stays on the screen
         lines = [summary(calibration, targets, full=True), "", *found.words]
     else:
+        last.append(HINT)
         before = 0 if arguments.files else 2
         lines = compact_lines(calibration, found, HEIGHT - before - len(last))
     show("\n".join([*lines, *last]))
@@ -257,37 +174,27 @@ def _fitted(arguments, chains, datasets, positions, instrument):
     from astropolcal.calibration import Calibration, calibrate
     from astropolcal.pipeline import restart
 
-    options = {
-        "weights": None if arguments.weights == "none" else arguments.weights,
-        "loss": arguments.loss,
-        "errors": arguments.errors,
-        "positions": positions,
-        "gauge": None if arguments.gauge == "none" else arguments.gauge,
-        "cross_validate": arguments.groups is None,
-    }
+    options = {key: getattr(arguments, key) for key in ("weights", "loss", "errors", "gauge")}
+    options |= {key: None for key in ("weights", "gauge") if options[key] == "none"}
+    options |= {"positions": positions, "cross_validate": arguments.groups is None}
     if arguments.start:
         old = Calibration.read(arguments.start)
         return restart(old, datasets, arguments.free, chain=chains, **options)
-    return calibrate(
-        chains,
-        datasets,
-        strategy=arguments.strategy,
-        observable=arguments.observable,
-        fix=_held(arguments, chains),
-        instrument=instrument.name,
-        **options,
-    )
+    options |= {"strategy": arguments.strategy, "observable": arguments.observable}
+    options |= {"fix": _held(arguments, chains), "instrument": instrument.name}
+    return calibrate(chains, datasets, **options)
 
 
 def _check_start(arguments):
     """Refuse what a calibration to start from settles already."""
+    if not arguments.start:
+        return
     # they would contradict what the old calibration holds
-    others = ("fix", "prior", "without")
-    given = [f"--{key}" for key in others if getattr(arguments, key)]
-    if arguments.start and (given or arguments.strategy != "joint"):
-        shown = given[0] if given else f"--strategy {arguments.strategy}"
-        raise AstropolcalError(f"{shown} cannot be combined with --start; --free can")
-    if arguments.start and not arguments.free:
+    given = [f"--{key}" for key in ("fix", "prior", "without") if getattr(arguments, key)]
+    given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
+    if given:
+        raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")
+    if not arguments.free:
         raise AstropolcalError("--start holds everything: say with --free NAME what may change")
 
 
@@ -307,24 +214,20 @@ def _held(arguments, chains):
     from astropolcal.measurement import parameter_table
 
     # a --prior frees one parameter of an optic that --fix holds
-    names = {text.partition("=")[0] for text in arguments.fix}
-    loose = {text.partition("=")[0] for text in arguments.prior}
-    known = parameter_table(chains)
-    held = [name for name in known if _named(name, names) and not _named(name, loose)]
-    return dict.fromkeys(held) or None
-
-
-def _named(name, names):
-    return name in names or name.partition(".")[0] in names
+    held, loose = (
+        {text.partition("=")[0] for text in texts} for texts in (arguments.fix, arguments.prior)
+    )
+    own = {name: {name, name.partition(".")[0]} for name in parameter_table(chains)}
+    return (
+        dict.fromkeys(n for n, names in own.items() if names & held and not names & loose) or None
+    )
 
 
 def _target(text):
     """Return degree and angle of polarization of DOLP[,AOLP]."""
     dolp, comma, aolp = text.partition(",")
-    return (
-        _quantity(text, dolp, u.percent, 0, 100),
-        _quantity(text, aolp, u.deg, -180, 180) if comma else None,
-    )
+    degree = _quantity(text, dolp, u.percent, 0, 100)
+    return degree, _quantity(text, aolp, u.deg, -180, 180) if comma else None
 
 
 def _quantity(text, part, unit, low, high):

@@ -9,21 +9,15 @@ import time
 from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.scripts._common import (
-    Continued,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    is_quiet,
-    show,
-    wrapped,
-    write_json,
-)
+from astropolcal.scripts._common import is_quiet, show, wrapped, write_json
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EXAMPLES = """\
+HELP = "test the diagnosis, or another tool, on sealed simulated data"
+DESCRIPTION = """\
+Simulate calibrations with random faults, diagnose each without the key,
+and compare the answers with the truth."""
+EXAMPLES = """\
 examples:
   astropolcal challenge -n 20
   astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
@@ -37,56 +31,25 @@ checkpoint.
 _BETWEEN = 10
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "challenge",
-        run,
-        "test the diagnosis, or another tool, on sealed simulated data",
-        "Simulate calibrations with random faults, diagnose each without the key,\n"
-        "and compare the answers with the truth.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add(
-        "action",
-        "run: make, diagnose and score (default); make DIR: write cases to files; "
-        "score DIR OUTPUTS: score the answers of any tool to them",
-        nargs="?",
-        default="run",
-        choices=("run", "make", "score"),
-    )
-    add("folders FOLDER", "of the cases, and of the answers", nargs="*", default=[])
-    add("-n --count N", "how many (default: %(default)s)", dest="n", type=int, default=20)
-    add("--seed S", "default: %(default)s", type=int, default=0)
-    add(
-        "--snr LOW:HIGH",
-        "signal-to-noise ratio of each fault (default: 12:120)",
-        type=_range,
-        default=(12.0, 120.0),
-    )
-    add(
-        "--kinds KIND,KIND,...",
-        "none, cell, listed, pair, detector, frame, mechanism, absorbed (default: all)",
-        type=lambda text: text.split(","),
-    )
-    add("--instrument NAME", "default: %(default)s", default="charis")
-    add("--wavelengths N", "default: 8", type=int, default=8)
-    add("--derotator-angles N", "default: 8", type=int, default=8)
-    add(
-        "--checkpoint FILE",
-        "append each outcome of a run to this file, and go on from it",
-        type=Continued,
-    )
-    add("--workers N", "processes; default: 1", type=int, default=1)
-    add("--figure FILE", "draw the rates (PNG, PDF or SVG)", type=Output)
-    add(
-        "--reliability FILE",
-        "draw how many causes are right against their probability (PNG, PDF or SVG)",
-        type=Output,
-    )
-    add_shared(parser, "json", "quiet")
+OPTIONS = """
+action {run,make,score} ? =run  run: make, diagnose and score (default); make DIR: write cases to
+    files; score DIR OUTPUTS: score the answers of any tool to them
+folders FOLDER *  of the cases, and of the answers
+-n --count N int =20  how many (default: %(default)s)
+--seed S int =0  default: %(default)s
+--snr LOW:HIGH range =12:120  signal-to-noise ratio of each fault (default: 12:120)
+--kinds KIND,KIND,... kinds  none, cell, listed, pair, detector, frame, mechanism, absorbed
+    (default: all)
+--instrument NAME =charis  default: %(default)s
+--wavelengths N int =8  default: 8
+--derotator-angles N int =8  default: 8
+--checkpoint FILE Continued  append each outcome of a run to this file, and go on from it
+--workers N int =1  processes; default: 1
+--figure FILE Output  draw the rates (PNG, PDF or SVG)
+--reliability FILE Output  draw how many causes are right against their probability (PNG, PDF or
+    SVG)
+@ json quiet
+"""
 
 
 def _range(text):
@@ -96,6 +59,9 @@ def _range(text):
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form LOW:HIGH") from None
     return low, high
+
+
+TYPES = {"range": _range, "kinds": lambda text: text.split(",")}
 
 
 def run(arguments):
@@ -142,7 +108,7 @@ def _options(arguments):
     from astropolcal.gap.challenge import KINDS, Setup
 
     return {
-        "n": arguments.n,
+        "n": arguments.count,
         "seed": arguments.seed,
         "snr": arguments.snr,
         "kinds": arguments.kinds or tuple(KINDS),

@@ -217,45 +217,63 @@ def _are_same(path, other):
 # ---- options --------------------------------------------------------------------------------
 
 
-def add_command(commands, name, run, meaning, description, examples=None, **defaults):
-    """Add a subcommand to what ``add_subparsers`` returned; return its parser."""
+def add_command(commands, name, module):
+    """Add the subcommand whose texts, ``OPTIONS`` and ``run`` a module has; return its parser."""
+    examples = getattr(module, "EXAMPLES", None)
     # texts with examples are shown as they are written
     form = argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter
-    texts = {"help": meaning, "description": description, "epilog": examples}
-    parser = commands.add_parser(name, formatter_class=form, **texts)
-    parser.set_defaults(run=run, **defaults)
+    texts = {"help": module.HELP, "description": module.DESCRIPTION, "epilog": examples}
+    parser = place = commands.add_parser(name, formatter_class=form, **texts)
+    parser.set_defaults(run=module.run, **getattr(module, "DEFAULTS", {}))
+    for entry in entries(module.OPTIONS):
+        if entry.startswith("["):
+            place = parser.add_argument_group(entry.strip("[]"))
+            continue
+        flags, settings = option(entry, getattr(module, "TYPES", {}))
+        place.add_argument(*flags, **settings)
     return parser
 
 
-def adder(parser):
+def entries(text):
+    """Yield the entries of a text of options; ``@ json quiet`` stands for options of `_SHARED`."""
+    # further lines of an entry are indented
+    for entry in re.split(r"\n(?! )", text.strip()):
+        if entry.startswith("@"):
+            yield from (_SHARED[name] for name in entry[1:].split())
+        else:
+            yield entry
+
+
+def option(entry, types):
     """
-    Return what adds an argument to a parser or a group.
+    Return the names and the settings of ``add_argument`` that an entry describes.
 
-    It takes names and value as the help shows them, such as ``"-o --output FILE"`` or ``"files
-    FILE"``, with ``...`` after them for an option that may be repeated; what it means; and settings
-    of ``add_argument``. An option that takes no value is a switch.
+    Before two spaces stand names and value as the help shows them, such as ``-o --output FILE`` or
+    ``--kind {a,b}``; the name of a type; ``=DEFAULT``; ``required``; ``?``, ``*`` or ``+`` as in
+    ``nargs``; ``...`` if it may be repeated. After them stands what it means. An option that takes
+    no value is a switch.
     """
-
-    def add(form, meaning, **settings):
-        words = form.split()
-        if words[-1] == "...":
-            words.pop()
-            settings |= {"action": "append", "default": []}
-        flags = [word for word in words if word.startswith("-")] or words[:1]
-        if words != flags:
-            settings["metavar"] = words[-1]
-        elif flags[0].startswith("-") and not {"choices", "action"} & set(settings):
-            settings["action"] = "store_true"
-        parser.add_argument(*flags, help=meaning, **settings)
-
-    return add
-
-
-def add_shared(parser, *names):
-    """Add options that several commands have."""
-    for name in names:
-        form, meaning, *kind = _SHARED[name]
-        adder(parser)(form, meaning, **({"type": kind[0]} if kind else {}))
+    form, _, meaning = entry.partition("  ")
+    flags, settings, known = [], {"help": " ".join(meaning.split())}, _TYPES | types
+    for word in form.split():
+        if word.startswith("-") or not flags:
+            flags.append(word)
+        elif word.startswith("{"):
+            settings["choices"] = word[1:-1].split(",")
+        elif word.startswith("="):
+            settings["default"] = settings.get("type", str)(word[1:])
+        elif word == "required":
+            settings["required"] = True
+        elif word in ("?", "*", "+"):
+            settings["nargs"] = word
+        elif word == "...":
+            several = {"action": "append", "default": []}
+            settings |= {"action": "extend"} if "nargs" in settings else several
+        else:
+            settings |= {"type": known[word]} if word in known else {"metavar": word}
+    if flags[0].startswith("-") and len(settings) == 1:
+        settings["action"] = "store_true"
+    return flags, settings
 
 
 #: Options of an instrument's chains; only what was typed, as not every instrument knows all.
@@ -268,46 +286,26 @@ def stated_model(arguments):
     return {key: value for key, value in stated.items() if value is not None}
 
 
-_SHARED = {
-    "derotator": (
-        "--derotator MODEL",
-        "elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
-    ),
-    "bounds": ("--bounds KIND", "physical (default), or those of the paper"),
-    "m3": (
-        "--m3 MODEL",
-        "tertiary mirror of stars: free (default, a diattenuation per wavelength), "
-        "'power law' (the paper's permittivity) or metal (silver with a film)",
-    ),
-    "plate": (
-        "--plate MODEL",
-        "half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
-        "law for all bands)",
-    ),
-    "full": (
-        "--full",
-        "print everything; by default what fits a terminal of 80 columns and 24 lines",
-    ),
-    "json": ("--json FILE", "write a summary for machines (- for stdout)", Output),
-    # obeyed by astropolcal.scripts.main
-    "online": (
-        "--online",
-        "fetch new tables of the Earth's rotation; by default the network is not used",
-    ),
-    "quiet": ("-q --quiet", "print nothing but warnings and errors"),
-    "plots": ("--plots DIR", "save the figures in this folder", Folder),
-    # those that edit the model, for edit_chains
-    "fix": (
-        "--fix NAME[=VALUE] ...",
-        "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg",
-    ),
-    "free": ("--free NAME ...", "free a parameter, such as wollaston.theta"),
-    "prior": (
-        "--prior NAME=MEAN+-STD ...",
-        "normal prior on a parameter, such as hwp.theta=0+-0.1deg",
-    ),
-    "without": ("--without OPTIC ...", "take an optic out of the model"),
-}
+#: Options that several commands have, by name; ``online`` is obeyed by `astropolcal.scripts.main`.
+_SHARED = """
+--derotator MODEL  elliptical (default) or linear retarder, or kmirror: three silver mirrors with
+    films
+--bounds KIND  physical (default), or those of the paper
+--m3 MODEL  tertiary mirror of stars: free (default, a diattenuation per wavelength), 'power law'
+    (the paper's permittivity) or metal (silver with a film)
+--plate MODEL  half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one
+    law for all bands)
+--full  print everything; by default what fits a terminal of 80 columns and 24 lines
+--json FILE Output  write a summary for machines (- for stdout)
+--online  fetch new tables of the Earth's rotation; by default the network is not used
+-q --quiet  print nothing but warnings and errors
+--plots DIR Folder  save the figures in this folder
+--fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
+--free NAME ...  free a parameter, such as wollaston.theta
+--prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
+--without OPTIC ...  take an optic out of the model
+"""
+_SHARED = {re.search(r"--(\w+)", entry)[1]: entry for entry in entries(_SHARED)}
 
 
 def angles(text):
@@ -331,6 +329,10 @@ def number_or(*words):
             raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}") from None
 
     return convert
+
+
+_TYPES = {"float": float, "int": int, "angles": angles}
+_TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Folder)}
 
 
 # ---- outputs --------------------------------------------------------------------------------
@@ -391,6 +393,13 @@ def write_json(content, path):
         return
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def give(arguments, lines, content):
+    """Write what machines want, and print lines, as asked for."""
+    if arguments.json:
+        write_json(content, arguments.json)
+    printer(arguments)("\n".join(lines))
 
 
 def write_calibration(calibration, arguments, content):

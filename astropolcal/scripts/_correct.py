@@ -15,12 +15,6 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    Frames,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
     check_suffix,
     cube_files,
     is_quiet,
@@ -32,7 +26,11 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EXAMPLES = """\
+HELP = "correct science cubes with a calibration and write Stokes parameters"
+DESCRIPTION = """\
+Solve for the Stokes parameters of the light that entered the telescope, by
+least squares over all frames, and write them with their errors."""
+EXAMPLES = """\
 examples:
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
@@ -40,6 +38,49 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
+OPTIONS = """
+cubes CUBES + Frames  cubes, or folders of them (*.fits)
+--calibration LIB_OR_FILE Input required  a calibration file, or a folder of them, from which the
+    one that holds for the frames is taken
+-o --output OUT.fits Output required  the product; overwritten if it exists
+--mode {stokes,ip} =stokes  stokes (default): invert the Mueller matrices; ip: instrumental
+    polarization only
+--observable {intensity,single,double}  what is fitted: the beams, or their single or double
+    differences and sums (default: what the calibration fitted)
+--components {IQU,IQUV} =IQU  default: IQU, V is zero
+--weights {equal,variance} =equal  of the fluxes: equal (default), or one over their variances
+--brightness {exposure,measured} =measured  relative brightness of the frames: by the light in the
+    images (default), or by their exposure times alone
+--max-condition X float =30  condition number from which on Stokes parameters count as poorly
+    determined and are left out (default: 30)
+--instrument NAME  default: that of the calibration
+--raw DIR Frames  folder of raw frames, for keywords that the cubes lack
+--optics-in NAME,NAME,... names  all optional optics that were in the beam ('' for none), where
+    headers do not tell and the calibration has several sets of them
+--filter MODE  mode of the instrument, as the calibration calls it; default: what headers say
+--any-date  take the calibration even if it does not hold for the date of the frames
+--max-age YEARS float  time between the data of the calibration and the frames from which on there
+    is a warning (default: that of the instrument, mostly 1)
+--interpolate  interpolate parameters that are known at the calibrated wavelengths only
+--centre X,Y point  place of the star in the left beam, 0-based; by default it is found
+--size PIXELS int =51  width of the images of the product (default: 51)
+--rotation {none,fixed,pupil} =none  how the field turned: not known, images stay as they are
+    (default); the +y axis at a fixed position angle; at a fixed angle from the zenith
+--camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
+    zenith (default: 0)
+--mirrored  east is to the right of north
+--open-directions SIGMA sigma =infinite  systematic errors along what the calibration leaves open:
+    infinite (default), ignore, or the standard deviation of the angle that each is named after, in
+    degrees
+--samples N int =0  systematic errors from N samples of the calibration (default: linearized)
+--seed N int  of the random numbers of --samples
+--spectrum OUT.ecsv Output  table of the star in an aperture
+--radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
+--plot FILE Output  figure of the result
+--workers N int  threads of dask
+--cluster ADDRESS  scheduler of dask.distributed
+@ json online quiet
+"""
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -61,160 +102,19 @@ _WAYS = {
 }
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "correct",
-        run,
-        "correct science cubes with a calibration and write Stokes parameters",
-        "Solve for the Stokes parameters of the light that entered the telescope, by\n"
-        "least squares over all frames, and write them with their errors.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("cubes CUBES", "cubes, or folders of them (*.fits)", nargs="+", type=Frames)
-    add(
-        "--calibration LIB_OR_FILE",
-        "a calibration file, or a folder of them, from which the one that holds for the "
-        "frames is taken",
-        type=Input,
-        required=True,
-    )
-    add(
-        "-o --output OUT.fits",
-        "the product; overwritten if it exists",
-        type=Output,
-        required=True,
-    )
-    _add_solution(add)
-    _add_instrument(add)
-    _add_images(add)
-    _add_errors(add)
-    add("--spectrum OUT.ecsv", "table of the star in an aperture", type=Output)
-    add(
-        "--radius PIXELS",
-        "of the aperture (default: 10, or half of a smaller --size)",
-        type=float,
-    )
-    add("--plot FILE", "figure of the result", type=Output)
-    add("--workers N", "threads of dask", type=int)
-    add("--cluster ADDRESS", "scheduler of dask.distributed")
-    add_shared(parser, "json", "online", "quiet")
-
-
-def _add_solution(add):
-    """Add what says what is solved for, and from what."""
-    add(
-        "--mode",
-        "stokes (default): invert the Mueller matrices; ip: instrumental polarization only",
-        choices=("stokes", "ip"),
-        default="stokes",
-    )
-    add(
-        "--observable",
-        "what is fitted: the beams, or their single or double differences and sums "
-        "(default: what the calibration fitted)",
-        choices=("intensity", "single", "double"),
-    )
-    add("--components", "default: IQU, V is zero", choices=("IQU", "IQUV"), default="IQU")
-    add(
-        "--weights",
-        "of the fluxes: equal (default), or one over their variances",
-        choices=("equal", "variance"),
-        default="equal",
-    )
-    add(
-        "--brightness",
-        "relative brightness of the frames: by the light in the images (default), or by "
-        "their exposure times alone",
-        choices=("exposure", "measured"),
-        default="measured",
-    )
-    add(
-        "--max-condition X",
-        "condition number from which on Stokes parameters count as poorly determined "
-        "and are left out (default: 30)",
-        type=float,
-        default=30.0,
-    )
-
-
-def _add_errors(add):
-    """Add what says how the calibration's errors are propagated."""
-    add(
-        "--open-directions SIGMA",
-        "systematic errors along what the calibration leaves open: infinite (default), "
-        "ignore, or the standard deviation of the angle that each is named after, in degrees",
-        type=number_or("infinite", "ignore"),
-        default="infinite",
-    )
-    add(
-        "--samples N",
-        "systematic errors from N samples of the calibration (default: linearized)",
-        type=int,
-        default=0,
-    )
-    add("--seed N", "of the random numbers of --samples", type=int)
-
-
-def _add_instrument(add):
-    add("--instrument NAME", "default: that of the calibration")
-    add("--raw DIR", "folder of raw frames, for keywords that the cubes lack", type=Frames)
-    add(
-        "--optics-in NAME,NAME,...",
-        "all optional optics that were in the beam ('' for none), where headers do not tell "
-        "and the calibration has several sets of them",
-        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
-    )
-    add(
-        "--filter MODE",
-        "mode of the instrument, as the calibration calls it; default: what headers say",
-    )
-    add(
-        "--any-date",
-        "take the calibration even if it does not hold for the date of the frames",
-    )
-    add(
-        "--max-age YEARS",
-        "time between the data of the calibration and the frames from which on there is a "
-        "warning (default: that of the instrument, mostly 1)",
-        type=float,
-    )
-    add(
-        "--interpolate",
-        "interpolate parameters that are known at the calibrated wavelengths only",
-    )
-
-
-def _add_images(add):
-    add(
-        "--centre X,Y",
-        "place of the star in the left beam, 0-based; by default it is found",
-        type=_point,
-    )
-    add("--size PIXELS", "width of the images of the product (default: 51)", type=int, default=51)
-    add(
-        "--rotation",
-        "how the field turned: not known, images stay as they are (default); the +y axis at a "
-        "fixed position angle; at a fixed angle from the zenith",
-        choices=("none", "fixed", "pupil"),
-        default="none",
-    )
-    add(
-        "--camera-angle DEG",
-        "position angle of the +y axis, or with --rotation pupil that from the zenith (default: 0)",
-        type=float,
-    )
-    add("--mirrored", "east is to the right of north")
-
-
 def _point(text):
     try:
         x, y = (plain_number(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
     return x, y
+
+
+TYPES = {
+    "names": lambda text: [name.strip() for name in text.split(",") if name.strip()],
+    "point": _point,
+    "sigma": number_or("infinite", "ignore"),
+}
 
 
 def run(arguments):
@@ -326,13 +226,8 @@ def choose_calibration(arguments, files):
         entry = _of_library(path, arguments, night, beam, files)
         calibration, path = entry.calibration, entry.path
     _check_validity(calibration, path, arguments, night)
-    chain = sky_chain(
-        calibration,
-        optics_in=arguments.optics_in,
-        beam=beam,
-        label=str(path),
-        date=night.dates or None,
-    )
+    wanted = {"optics_in": arguments.optics_in, "beam": beam, "date": night.dates or None}
+    chain = sky_chain(calibration, label=str(path), **wanted)
     made = {"calibration": str(path), "calibration_hash": content_hash(calibration)}
     return calibration, chain, made
 
@@ -382,20 +277,18 @@ def _position_angles(table, arguments):
         return None
     # from north through east
     angle = np.full(len(table), arguments.camera_angle or 0.0) * u.deg
-    if arguments.rotation == "pupil":
-        if "parallactic" not in table.colnames:
-            raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
-        angle = angle + table["parallactic"]
-    return angle
+    if arguments.rotation == "fixed":
+        return angle
+    if "parallactic" not in table.colnames:
+        raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
+    return angle + table["parallactic"]
 
 
 def _write_others(result, star, arguments):
     if arguments.spectrum:
-        from astropolcal.files import atomic_path
+        from astropolcal.reduction.tables import write_table
 
-        table = star.table()
-        with atomic_path(arguments.spectrum, ObservationError) as temporary:
-            table.write(temporary, format="ascii.ecsv", overwrite=True)
+        write_table(star.table(), arguments.spectrum, overwrite=True)
     if arguments.plot:
         from astropolcal.plotting._style import save
         from astropolcal.plotting.correction import plot_corrected
@@ -436,23 +329,18 @@ def _report(summary, systematic):
     show(f"Written: {written} ({frames}, mode {summary['mode']})")
     show(f"  calibration: {calibration}")
     if condition.size:
-        show(
-            f"  condition number of the solution for {summary['components']}: "
-            f"{min(condition):.3g} to {max(condition):.3g}"
-        )
+        limits = f"{min(condition):.3g} to {max(condition):.3g}"
+        show(f"  condition number of the solution for {summary['components']}: {limits}")
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
         show(wrapped(line, indent=4))
     aperture = summary["aperture"]
     show(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
     unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
-    for name, unit, error, words, scale in (
-        ("dolp", " %", "s_p", "degree of linear polarization", 100),
-        ("aolp", " deg", "s_chi", "angle of linear polarization", 1),
-    ):
-        values = scale * aperture[name]
-        shown = _middle(values, ".2f" if name == "dolp" else ".1f", unit, name == "aolp")
-        show(f"    {words}: {shown}")
+    for name, unit, error, scale in (("dolp", " %", "s_p", 100), ("aolp", " deg", "s_chi", 1)):
+        words = "degree" if name == "dolp" else "angle"
+        shown = _middle(scale * aperture[name], ".2f" if scale == 100 else ".1f", unit, scale == 1)
+        show(f"    {words} of linear polarization: {shown}")
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
             values = scale * aperture[f"{error}_{kind}"]
             show(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")

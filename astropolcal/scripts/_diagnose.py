@@ -9,11 +9,6 @@ from pathlib import Path
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
     MODEL,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -26,7 +21,11 @@ from astropolcal.scripts._common import (
     write_json,
 )
 
-_EXAMPLES = """\
+HELP = "find what a model lacks to explain the measurements"
+DESCRIPTION = """\
+Find what an instrument's model lacks to explain the measurements: where
+the gap lies, which effect causes it, and how far it shrinks on left-out frames."""
+EXAMPLES = """\
 examples:
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
@@ -50,46 +49,20 @@ _FRAMES = (
 )
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "diagnose",
-        run,
-        "find what a model lacks to explain the measurements",
-        "Find what an instrument's model lacks to explain the measurements: where\n"
-        "the gap lies, which effect causes it, and how far it shrinks on left-out frames.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add(
-        "files FILE",
-        "observation tables (ECSV); before them may stand a calibration (.asdf), whose "
-        "model is then the nominal one",
-        nargs="*",
-        type=Input,
-    )
-    add("--instrument NAME", "default: as the tables say")
-    # not with a calibration, which has a model
-    add_shared(parser, *MODEL, "without", "free", "fix")
-    add(
-        "--effects all|NAME,NAME",
-        "which effects to try (default: all; help lists them)",
-        default="all",
-    )
-    add("--changes", "ask what changed between several runs of the same kind of source")
-    add(
-        "--nested",
-        "choose the causes anew without each group of frames, and predict these: slow, and "
-        "the one measure in which the choice has no part",
-    )
-    add("--report FILE.html", "write a page with tables and figures", type=Output)
-    add(
-        "--save CAL.asdf",
-        "calibrate with the effects that were found, and write the calibration",
-        type=Output,
-    )
-    add_shared(parser, "json", "online", "quiet")
+# the options of a model not with a calibration, which has one
+OPTIONS = """
+files FILE * Input  observation tables (ECSV); before them may stand a calibration (.asdf), whose
+    model is then the nominal one
+--instrument NAME  default: as the tables say
+@ derotator bounds m3 plate without free fix
+--effects all|NAME,NAME =all  which effects to try (default: all; help lists them)
+--changes  ask what changed between several runs of the same kind of source
+--nested  choose the causes anew without each group of frames, and predict these: slow, and the one
+    measure in which the choice has no part
+--report FILE.html Output  write a page with tables and figures
+--save CAL.asdf Output  calibrate with the effects that were found, and write the calibration
+@ json online quiet
+"""
 
 
 def run(arguments):

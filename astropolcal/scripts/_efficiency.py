@@ -7,22 +7,18 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.scripts._common import (
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    is_quiet,
-    say_written,
-    show,
-    write_json,
-)
+from astropolcal.scripts._common import give, printer, say_written
 from astropolcal.units import iso_date, plain_number
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
-_EXAMPLES = """\
+HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
+DESCRIPTION = """\
+Share of the linear polarization that an observation measures, over
+wavelength, derotator angle, altitude and parallactic angle; and the derotator
+offset that loses least of it. Without a calibration the published values are
+taken."""
+EXAMPLES = """\
 examples:
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
@@ -32,71 +28,43 @@ examples:
 """
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "efficiency",
-        run,
-        "polarimetric efficiency over wavelength, derotator angle and pointing",
-        "Share of the linear polarization that an observation measures, over\n"
-        "wavelength, derotator angle, altitude and parallactic angle; and the derotator\n"
-        "offset that loses least of it. Without a calibration the published values are\n"
-        "taken.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("file CAL.asdf", "calibration", nargs="?", type=Input)
-    add("--instrument NAME", "default: that of the file, or charis")
-    # without a default, so that it is known whether the table was asked for
-    add("--altitude DEG", "default: 60", type=float)
-    add("--parallactic DEG", "default: 0", type=float)
-    add(
-        "--derotator DEG",
-        "angles of the table (default: 0 to 90 in steps of 15)",
-        type=float,
-        nargs="+",
-    )
-    add(
-        "--wavelength UM",
-        "wavelengths of the table in micrometre, the nearest calibrated ones",
-        type=float,
-        nargs="+",
-    )
-    add("--target RA,DEC", "for the best derotator offset: position in degree")
-    add("--night START/END", "times in UTC, with --target")
-    add("--law MODE", "what the derotator keeps still, such as field (default: pupil)")
-    add("--date DATE", "of the telescope's mirrors, where that matters")
-    add(
-        "-o --output FILE",
-        "save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
-        type=Output,
-    )
-    add_shared(parser, "json", "online", "quiet")
+# altitude and others have no default, so that it is known whether the table was asked for
+OPTIONS = """
+file CAL.asdf ? Input  calibration
+--instrument NAME  default: that of the file, or charis
+--altitude DEG float  default: 60
+--parallactic DEG float  default: 0
+--derotator DEG + float  angles of the table (default: 0 to 90 in steps of 15)
+--wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
+--target RA,DEC  for the best derotator offset: position in degree
+--night START/END  times in UTC, with --target
+--law MODE  what the derotator keeps still, such as field (default: pupil)
+--date DATE  of the telescope's mirrors, where that matters
+-o --output FILE Output  save the figure (PNG, PDF, SVG); with --target that of the derotator
+    offsets
+@ json online quiet
+"""
 
 
 def run(arguments):
     """Print the table, draw the figure and write what was asked for."""
     asked = (arguments.altitude, arguments.parallactic, arguments.derotator, arguments.wavelength)
+    planned = bool(arguments.target or arguments.night)
     # a target has its own pointing, not that of the table
-    tabulated = not (arguments.target or arguments.night) or any(a is not None for a in asked)
+    tabulated = not planned or any(a is not None for a in asked)
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
     arguments.parallactic = arguments.parallactic or 0.0
     instrument, chain, grid = _chain(arguments)
     content = _table(arguments, instrument, chain, grid)
-    best = None
-    if arguments.target or arguments.night:
-        best, content["best_derotator"] = _best(arguments, instrument, chain, grid)
+    texts, best = [_table_text(content)] if tabulated else [], None
+    if planned:
+        best, found = _best(arguments, instrument, chain, grid)
+        content["best_derotator"] = found
+        texts.append(_best_text(found, instrument.name))
     if arguments.output:
         _draw(arguments, instrument, chain, grid, best)
-    if arguments.json:
-        write_json(content, arguments.json)
-    if not is_quiet(arguments):
-        texts = [_table_text(content)] if tabulated else []
-        if best is not None:
-            texts.append(_best_text(content["best_derotator"], instrument.name))
-        show("\n\n".join(texts))
-        say_written(show, [path for path in (arguments.output, arguments.json) if path])
+    give(arguments, ["\n\n".join(texts)], content)
+    say_written(printer(arguments), [path for path in (arguments.output, arguments.json) if path])
 
 
 def _chain(arguments):
@@ -108,18 +76,15 @@ def _chain(arguments):
         chain, grid = instrument.published(), instrument.wavelength
         return instrument, _on_sky(instrument, chain, grid, arguments), grid
     calibration = Calibration.read(arguments.file)
-    name = arguments.instrument or calibration.instrument
-    if name is None:
+    own, grid = calibration.instrument, calibration.wavelength
+    if not (arguments.instrument or own):
         raise InstrumentError(f"{arguments.file}: names no instrument; give --instrument NAME")
-    instrument = instruments.get(name)
-    if calibration.instrument and not instrument.answers_to(calibration.instrument):
-        raise InstrumentError(
-            f"{arguments.file}: the calibration is of instrument {calibration.instrument!r}, not "
-            f"{instrument.name!r}"
-        )
+    instrument = instruments.get(arguments.instrument or own)
+    if own and not instrument.answers_to(own):
+        words = f"the calibration is of instrument {own!r}, not {instrument.name!r}"
+        raise InstrumentError(f"{arguments.file}: {words}")
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
-    grid = calibration.wavelength
     return instrument, _on_sky(instrument, chains[0], grid, arguments), grid
 
 
@@ -140,23 +105,15 @@ def _table(arguments, instrument, chain, grid):
     if arguments.derotator and not turns:
         raise ParameterError(f"--derotator: {instrument.name} has none in this chain")
     derotator = np.array(arguments.derotator or np.arange(0, 91, 15), dtype=float)
-    rows = _rows(arguments.wavelength, grid)
-    values = polarimetric_efficiency(
-        chain,
-        grid,
-        derotator=derotator * u.deg if turns else None,
-        instrument=instrument,
-        mode=_mode(arguments, instrument),
-        **_pointing(arguments, chain),
-    )
+    rows, pointing = _rows(arguments.wavelength, grid), _pointing(arguments, chain)
+    settings = {"instrument": instrument, "mode": _mode(arguments, instrument)} | pointing
+    settings["derotator"] = derotator * u.deg if turns else None
+    values = np.atleast_2d(polarimetric_efficiency(chain, grid, **settings))[:, rows]
     content = {"instrument": instrument.name}
-    content |= {f"{key}_deg": a.value for key, a in _pointing(arguments, chain).items()}
+    content |= {f"{key}_deg": a.value for key, a in pointing.items()}
     # absent where there is none, not empty
     content |= {"derotator_deg": derotator} if turns else {}
-    return content | {
-        "wavelength_nm": grid.to_value(u.nm)[rows],
-        "efficiency": np.atleast_2d(values)[:, rows],
-    }
+    return content | {"wavelength_nm": grid.to_value(u.nm)[rows], "efficiency": values}
 
 
 def _pointing(arguments, chain):
@@ -267,26 +224,17 @@ def _draw(arguments, instrument, chain, grid, best=None):
     from astropolcal.plotting._style import save
     from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
+    title = f"Polarimetric efficiency of {instrument.name}"
     if best is not None:
-        title = (
-            f"Polarimetric efficiency of {instrument.name}\n"
-            f"target {arguments.target}, {arguments.night}"
-        )
+        title = f"{title}\ntarget {arguments.target}, {arguments.night}"
         save(plot_derotator_offsets(best, title=title), arguments.output)
         return
-    figure = plot_polarimetric_efficiency(
-        chain,
-        grid,
-        altitude=arguments.altitude * u.deg,
-        parallactic=arguments.parallactic * u.deg,
-        # one angle a figure, the last that was asked for
-        derotator=(arguments.derotator or [90.0])[-1] * u.deg,
-        shown=None if arguments.wavelength is None else arguments.wavelength * u.um,
-        instrument=instrument,
-        mode=_mode(arguments, instrument),
-        title=f"Polarimetric efficiency of {instrument.name}",
-    )
-    save(figure, arguments.output)
+    pointing = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
+    shown = None if arguments.wavelength is None else arguments.wavelength * u.um
+    # one angle a figure, the last that was asked for
+    settings = {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
+    settings |= {"instrument": instrument, "mode": _mode(arguments, instrument), "title": title}
+    save(plot_polarimetric_efficiency(chain, grid, **pointing, **settings), arguments.output)
 
 
 def _table_text(content):
@@ -309,13 +257,12 @@ def _table_text(content):
 
 def _best_text(best, instrument):
     (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]
-    lines = [
+    return (
         f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
-        f"{west:z.1f} deg",
-        f"Best derotator offset of {instrument}, {best['law']} still: {best['offset_deg']:zg} deg",
+        f"{west:z.1f} deg\n"
+        f"Best derotator offset of {instrument}, {best['law']} still: {best['offset_deg']:zg} deg\n"
         f"  efficiency over times, wavelengths and angles of polarization: least "
-        f"{best['least']:z.3f},",
+        f"{best['least']:z.3f},\n"
         f"  mean {best['mean']:z.3f}; with the worst offset the least is "
-        f"{best['least_of_any_offset']:z.3f}",
-    ]
-    return "\n".join(lines)
+        f"{best['least_of_any_offset']:z.3f}"
+    )

@@ -6,19 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.scripts._common import (
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    plain,
-    printer,
-    wrapped,
-    write_json,
-)
+from astropolcal.scripts._common import give, plain, printer, wrapped
 from astropolcal.words import counted
 
+HELP = "say what a calibration, a folder of them, a table, cube or product holds"
+DESCRIPTION = (
+    "Say what a calibration file, a folder of calibrations, an observation table, an image cube or "
+    "a corrected product holds; of a calibration also how good it is and for what it is valid. "
+    "Without a file, what this installation knows."
+)
+OPTIONS = """
+file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
+--instruments  list the instruments only
+@ full
+--json FILE Output  write it for machines (- for stdout)
+@ quiet
+"""
 # columns by which a table is known, the more special first
 _TABLES = (
     ({"wavelength", "I", "q", "u", "determined"}, "spectrum of a corrected target"),
@@ -33,50 +36,29 @@ _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "info",
-        run,
-        "say what a calibration, a folder of them, a table, cube or product holds",
-        "Say what a calibration file, a folder of calibrations, an observation "
-        "table, an image cube or a corrected product holds; of a calibration also how good it is "
-        "and for what it is valid. Without a file, what this installation knows.",
-    )
-    add = adder(parser)
-    add(
-        "file FILE|DIR",
-        "ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
-        nargs="?",
-        type=Input,
-    )
-    add("--instruments", "list the instruments only")
-    add_shared(parser, "full")
-    add("--json FILE", "write it for machines (- for stdout)", type=Output)
-    add_shared(parser, "quiet")
-
-
 def run(arguments):
     """Print what the file holds."""
+    path = arguments.file
     if arguments.instruments:
         from astropolcal import instruments
 
         printer(arguments)("\n".join(instruments.names()))
         return
-    if arguments.file is None:
-        text, content = _installation()
-    elif Path(arguments.file).is_dir():
-        text, content = _library(arguments.file)
-    elif Path(arguments.file).suffix.lower() == ".asdf":
-        text, content = _calibration(arguments.file, arguments.full)
-    elif _is_fits(arguments.file):
-        text, content = _lines(*describe_fits(arguments.file))
+    if path is None:
+        lines, content = _installation()
+    elif Path(path).is_dir():
+        lines, content = _library(path)
+    elif Path(path).suffix.lower() == ".asdf":
+        lines, content = _calibration(path, arguments.full)
+    elif _is_fits(path):
+        lines, content = _wrapped(*describe_fits(path))
     else:
-        text, content = _table(arguments.file)
-    if arguments.json:
-        write_json(content, arguments.json)
-    printer(arguments)(text)
+        lines, content = _table(path)
+    give(arguments, lines, content)
+
+
+def _wrapped(lines, content):
+    return [wrapped(line, indent=4) for line in lines], content
 
 
 def _installation():
@@ -94,7 +76,7 @@ def _installation():
     lines = [f"astropolcal {version}"]
     for key in ("instruments", "optics", "observables"):
         lines.append(f"  {key + ':':<13}" + ("\n" + " " * 15).join(content[key]))
-    return "\n".join(lines), content
+    return lines, content
 
 
 def _calibration(path, full):
@@ -113,17 +95,15 @@ def _calibration(path, full):
         f"  valid for {held}",
         f"  sha256 {digest}",
     ]
-    content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
-    if not full:
-        lines = [wrapped(line, indent=4) for line in lines]
-        height = HEIGHT - len("\n".join(lines).split("\n")) - 1
-        told = compact_lines(calibration, calibration.verdict(), height)
-        return "\n".join([*told, *lines, HINT]), content
-    for record in calibration.datasets:
+    for record in calibration.datasets if full else ():
         optics = ", ".join(f"{k}: {v}" for k, v in record.meta.items() if k not in _DULL)
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
-    lines = [wrapped(line, indent=4) for line in lines]
-    return "\n".join([*lines, "", calibration.summary(full=True)]), content
+    content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
+    lines, content = _wrapped(lines, content)
+    if full:
+        return [*lines, "", calibration.summary(full=True)], content
+    height = HEIGHT - len("\n".join(lines).split("\n")) - 1
+    return [*compact_lines(calibration, calibration.verdict(), height), *lines, HINT], content
 
 
 def _library(folder):
@@ -131,10 +111,8 @@ def _library(folder):
     from astropolcal.pipeline.library import Library
 
     library = Library(folder)
-    table = library.table()
-    lines = [f"{folder}: {counted(len(library), 'calibration')}"]
-    files = []
-    for entry, row in zip(library.entries, table, strict=True):
+    lines, files = [f"{folder}: {counted(len(library), 'calibration')}"], []
+    for entry, row in zip(library.entries, library.table(), strict=True):
         good = f"s_res {_percent(row['s_res'])}, s_cv {_percent(row['s_cv'])}"
         # loud: nobody should take it by accident
         state = "" if row["converged"] else ", NOT CONVERGED"
@@ -144,12 +122,10 @@ def _library(folder):
             f"  from {row['datasets']}; {good} (median){state}",
             f"  content sha256 {entry.content_hash[:12]}",
         ]
-        files.append(
-            {key: str(row[key]) for key in ("name", "datasets", "content_hash")}
-            | {"converged": bool(row["converged"])}
-            | {f"{key}_percent": row[key] for key in ("s_res", "s_cv")}
-            | {"validity": entry.validity.to_dict()}
-        )
+        known = {key: str(row[key]) for key in ("name", "datasets", "content_hash")}
+        known |= {f"{key}_percent": row[key] for key in ("s_res", "s_cv")}
+        known |= {"converged": bool(row["converged"]), "validity": entry.validity.to_dict()}
+        files.append(known)
     problems = {path.name: reason for path, reason in library.problems.items()}
     for name, reason in problems.items():
         lines += [name, f"  UNREADABLE: {reason}"]
@@ -158,11 +134,10 @@ def _library(folder):
     others = sum(path.suffix.lower() in (".ecsv", ".fits") for path in Path(folder).iterdir())
     if not (files or problems) and others:
         # they could be told of one by one
-        lines.append(f"  {counted(others, 'table or FITS file', 'tables and FITS files')} in it; "
-                     "astropolcal info FILE tells of one")  # fmt: skip
+        what = counted(others, "table or FITS file", "tables and FITS files")
+        lines.append(f"  {what} in it; astropolcal info FILE tells of one")
     content = {"folder": str(folder), "calibrations": files}
-    text = "\n".join(wrapped(line, indent=4) for line in lines)
-    return text, content | {"unreadable": problems, "overlaps": overlaps}
+    return _wrapped(lines, content | {"unreadable": problems, "overlaps": overlaps})
 
 
 def _percent(value):
@@ -172,44 +147,31 @@ def _percent(value):
 
 def _is_fits(path):
     """Return whether a file is, or by its name claims to be, a FITS file."""
-    if str(path).lower().endswith(_FITS_NAMES):
-        return True
+    return str(path).lower().endswith(_FITS_NAMES) or _begins(path, b"SIMPLE  =")
+
+
+def _begins(path, mark, unknown=False):
+    """Return whether a file begins so; what cannot be opened its reader says."""
     try:
         with open(path, "rb") as stream:
-            return stream.read(9) == b"SIMPLE  ="
+            return stream.read(len(mark)) == mark
     except OSError:
-        # the reader of tables says what is wrong
-        return False
-
-
-def _lines(lines, content):
-    return "\n".join(wrapped(line, indent=4) for line in lines), content
+        return unknown
 
 
 def _table(path):
     """Return what an ECSV table holds: beam fluxes, or something else."""
     from astropolcal.observations.reading import read_ecsv
 
-    _check_ecsv(path)
-    table = read_ecsv(path)
-    if _OBSERVED & set(table.colnames) or {"frame", "flux"} <= set(table.colnames):
-        return _observations(path)
-    return _lines(*_other_table(path, table))
-
-
-def _check_ecsv(path):
-    """Refuse a file that is nothing of ours, and say what is."""
-    try:
-        with open(path, "rb") as stream:
-            known = stream.read(7) == b"# %ECSV"
-    except OSError:
-        # the reader of tables says what is wrong
-        return
-    if not known:
+    if not _begins(path, b"# %ECSV", unknown=True):
         raise ObservationError(
             f"{path}: info takes a calibration (.asdf), a folder of them, an ECSV table, or a FITS "
             "cube or product; this is none of them"
         )
+    table = read_ecsv(path)
+    if _OBSERVED & set(table.colnames) or {"frame", "flux"} <= set(table.colnames):
+        return _observations(path)
+    return _wrapped(*_other_table(path, table))
 
 
 def _observations(path):
@@ -234,8 +196,7 @@ def _observations(path):
         "wavelength_nm": observations.wavelength.to_value(u.nm),
         "content_hash": observations.content_hash,
     }
-    lines = observations.summary().splitlines()
-    return "\n".join(wrapped(line, indent=2) for line in lines), content
+    return [wrapped(line, indent=2) for line in observations.summary().splitlines()], content
 
 
 # ---- tables ---------------------------------------------------------------------------------
@@ -275,11 +236,7 @@ def describe_fits(path):
     from astropolcal.correction.product import PRODUCT
     from astropolcal.fitscheck import open_fits, readable_fits
 
-    with (
-        readable_fits(path),
-        open_fits(path) as stream,
-        fits.open(stream, memmap=True) as hdus,
-    ):
+    with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
         # a product says in its first header what it is
         header = hdus[0].header
         if header.get("CONTENT") != PRODUCT:
@@ -291,45 +248,44 @@ def _describe_product(path, product):
     from astropy import units as u
 
     made, wavelength = product.provenance, product.wavelength.to_value(u.nm)
-    # at a wavelength all components must be
-    n_determined = int(np.sum(product.determined.all(axis=-1)))
-    systematic = "none" if product.systematic is None else product.systematic.method
-    shape = product.stokes.shape
-    size = " x ".join(map(str, shape[2:]))
+    # frames have a key of their own
+    frames = list(made.get("frames", []))
     content = {
         "file": str(path),
         "type": "corrected product",
         "components": product.components,
-        "shape": list(shape),
+        "shape": list(product.stokes.shape),
         "unit": product.unit.to_string(),
         "wavelength_nm": wavelength,
         "mode": product.mode,
         "observable": product.observable,
         "north_up": product.north_up,
-        "n_determined": n_determined,
+        # at a wavelength all components must be
+        "n_determined": int(np.sum(product.determined.all(axis=-1))),
         "statistical": product.covariance is not None,
-        "systematic": systematic,
-        # frames have a key of their own
+        "systematic": "none" if product.systematic is None else product.systematic.method,
         "provenance": _told({key: made[key] for key in made if key != "frames"}),
+        "frames": frames,
     }
-    frames = list(made.get("frames", []))
+    n = counted(len(wavelength), "wavelength")
+    size = " x ".join(map(str, content["shape"][2:]))
     ends = dict.fromkeys((frames[0], frames[-1])) if frames else ()
     lines = [
         f"{path}: corrected product, made {made.get('created', 'at an unknown time')} with "
         f"astropolcal {made.get('astropolcal', '?')}",
-        f"  Stokes parameters {product.components} in {product.unit.to_string() or 'counts'}, "
-        f"{counted(shape[1], 'wavelength')} from {wavelength.min():.6g} to "
-        f"{wavelength.max():.6g} nm" + (f", images of {size} pixels" if size else ""),
+        f"  Stokes parameters {product.components} in {content['unit'] or 'counts'}, {n} from "
+        f"{wavelength.min():.6g} to {wavelength.max():.6g} nm"
+        + (f", images of {size} pixels" if size else ""),
         f"  mode {product.mode}, observable {product.observable}, "
         + ("north is up" if product.north_up else "as the detector sees the field"),
-        f"  determined at {n_determined} of {counted(shape[1], 'wavelength')}",
+        f"  determined at {content['n_determined']} of {n}",
         f"  errors: statistical {'yes' if content['statistical'] else 'no'}, systematic "
-        f"{systematic}",
+        f"{content['systematic']}",
         f"  calibration: {made.get('calibration', 'not known')}, sha256 "
         f"{str(made.get('calibration_hash', 'not known'))[:12]}",
         f"  from {counted(len(frames), 'frame')}" + (f": {' to '.join(ends)}" if frames else ""),
     ]
-    return lines, content | {"frames": frames}
+    return lines, content
 
 
 def _hdu(hdu):

@@ -9,14 +9,6 @@ from pathlib import Path
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    Continued,
-    Folder,
-    Frames,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    angles,
     check_suffix,
     cube_files,
     number_or,
@@ -29,7 +21,11 @@ from astropolcal.words import counted
 # a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
 
-_EXAMPLES = """\
+HELP = "measure both beams in FITS cubes and write an observation table"
+DESCRIPTION = """\
+Measure the fluxes of both beams in extracted cubes. A file that cannot be
+used is left out and listed with the reason."""
+EXAMPLES = """\
 examples:
   astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
   astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
@@ -37,68 +33,25 @@ examples:
 """
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "reduce",
-        run,
-        "measure both beams in FITS cubes and write an observation table",
-        "Measure the fluxes of both beams in extracted cubes. A file that cannot be\n"
-        "used is left out and listed with the reason.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("cubes CUBES", "cubes, or folders of them (*.fits)", nargs="+", type=Frames)
-    add(
-        "-o --output OBS.ecsv",
-        "the table; overwritten if it exists",
-        type=Output,
-        required=True,
-    )
-    _add_meta(add)
-    add(
-        "--background",
-        "internal source: subtract nothing (default) or the level outside the beams",
-        choices=("none", "outside"),
-    )
-    add(
-        "--radius PIXELS",
-        "stars: radius of the aperture; fwhm (default, 3 full widths), growth (99 %% of the "
-        "light) or pixels",
-        type=number_or("fwhm", "growth"),
-    )
-    add(
-        "--aperture-correction",
-        "stars: scale the fluxes to all of the star's light, by a profile of its wings",
-        default=None,
-    )
-    add("--workers N", "number of processes", type=int)
-    add("--resume FILE", "journal of what is done, to go on after a stop", type=Continued)
-    add("--quicklook DIR", "write figures to this folder", type=Folder)
-    add_shared(parser, "json", "online", "quiet")
-
-
-def _add_meta(add):
-    """Add what says what the cubes are of, beside or in the place of their headers."""
-    add("--instrument NAME", "default: charis", default="charis")
-    add("--raw DIR", "folder of raw frames, for keywords that the cubes lack", type=Frames)
-    add(
-        "--source KIND",
-        "internal (default), polarized, unpolarized (internal source with and without its "
-        "polarizer), star, 'unpolarized standard star', 'polarized standard star'",
-        default="internal",
-    )
-    add(
-        "--meta KEY=VALUE ...",
-        "more for the table's meta, such as yjh50_dichroic=in",
-        type=_pair,
-    )
-    add(
-        "--hwp-sequence DEG,DEG,...",
-        "commanded angles that replace wrong ones of the headers, in turn",
-        type=angles,
-    )
+OPTIONS = """
+cubes CUBES + Frames  cubes, or folders of them (*.fits)
+-o --output OBS.ecsv Output required  the table; overwritten if it exists
+--instrument NAME =charis  default: charis
+--raw DIR Frames  folder of raw frames, for keywords that the cubes lack
+--source KIND =internal  internal (default), polarized, unpolarized (internal source with and
+    without its polarizer), star, 'unpolarized standard star', 'polarized standard star'
+--meta KEY=VALUE pair ...  more for the table's meta, such as yjh50_dichroic=in
+--hwp-sequence DEG,DEG,... angles  commanded angles that replace wrong ones of the headers, in turn
+--background {none,outside}  internal source: subtract nothing (default) or the level outside the
+    beams
+--radius PIXELS radius  stars: radius of the aperture; fwhm (default, 3 full widths), growth (99 %%
+    of the light) or pixels
+--aperture-correction  stars: scale the fluxes to all of the star's light, by a profile of its wings
+--workers N int  number of processes
+--resume FILE Continued  journal of what is done, to go on after a stop
+--quicklook DIR Folder  write figures to this folder
+@ json online quiet
+"""
 
 
 def _pair(text):
@@ -106,6 +59,9 @@ def _pair(text):
     if not (equal and key.strip() and value.strip()):
         raise argparse.ArgumentTypeError(f"{text!r} is not KEY=VALUE")
     return key.strip(), value.strip()
+
+
+TYPES = {"pair": _pair, "radius": number_or("fwhm", "growth")}
 
 
 def run(arguments):
@@ -152,7 +108,7 @@ def _options(arguments):
     given = {
         name: value
         for name in ("background", "radius", "aperture_correction")
-        if (value := getattr(arguments, name)) is not None
+        if (value := getattr(arguments, name)) is not None and value is not False
     }
     # options of one photometry do nothing in the other
     wrong = {"background"} & set(given) if star else set(given) - {"background"}

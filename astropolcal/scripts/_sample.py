@@ -8,12 +8,6 @@ from pathlib import Path
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    Continued,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
     check_suffix,
     printer,
     read_datasets,
@@ -25,7 +19,11 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EXAMPLES = """\
+HELP = "sample the posterior of a calibration's parameters"
+DESCRIPTION = """\
+Sample the posterior of a calibration's parameters with an ensemble of
+walkers, and keep the samples with the calibration."""
+EXAMPLES = """\
 examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
@@ -39,45 +37,22 @@ _OPTIONS = {"n_walkers": "--walkers", "n_steps": "--steps", "burn_in": "--burn"}
 _COLUMNS = ("median", "lower", "upper", "fitted")
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "sample",
-        run,
-        "sample the posterior of a calibration's parameters",
-        "Sample the posterior of a calibration's parameters with an ensemble of\n"
-        "walkers, and keep the samples with the calibration.",
-        _EXAMPLES,
-        # the samples come to what the calibration holds, and nothing of it is lost
-        may_replace={"output": "calibration"},
-    )
-    add = adder(parser)
-    add("calibration CAL.asdf", "calibration file", type=Input)
-    add("files FILE", "the tables that it was made from (ECSV)", nargs="+", type=Input)
-    add(
-        "-o --output OUT.asdf",
-        "write the calibration with samples here; overwritten if it exists",
-        type=Output,
-    )
-    add(
-        "--parameters NAME",
-        "what varies, such as hwp.w_sio2; the rest is held at its fitted values (default: "
-        "all free parameters)",
-        nargs="+",
-        action="extend",
-    )
-    add("--walkers N", "default: twice the parameters, at least 24", type=int)
-    add("--steps N", "default: %(default)s", type=int, default=5000)
-    add(
-        "--burn N|auto",
-        "steps to leave out at the start (default: auto, 5 autocorrelation times)",
-        type=_burn_in,
-    )
-    add("--seed N", "makes the run repeatable", type=int)
-    add("--checkpoint FILE.h5", "write the steps here while the run lasts", type=Continued)
-    add("--resume", "go on from the checkpoint, if there is one")
-    add_shared(parser, "plots", "json", "online", "quiet")
+OPTIONS = """
+calibration CAL.asdf Input  calibration file
+files FILE + Input  the tables that it was made from (ECSV)
+-o --output OUT.asdf Output  write the calibration with samples here; overwritten if it exists
+--parameters NAME + ...  what varies, such as hwp.w_sio2; the rest is held at its fitted values
+    (default: all free parameters)
+--walkers N int  default: twice the parameters, at least 24
+--steps N int =5000  default: %(default)s
+--burn N|auto burn_in  steps to leave out at the start (default: auto, 5 autocorrelation times)
+--seed N int  makes the run repeatable
+--checkpoint FILE.h5 Continued  write the steps here while the run lasts
+--resume  go on from the checkpoint, if there is one
+@ plots json online quiet
+"""
+# the samples come to what the calibration holds, and nothing of it is lost
+DEFAULTS = {"may_replace": {"output": "calibration"}}
 
 
 def _burn_in(text):
@@ -88,6 +63,9 @@ def _burn_in(text):
         return plain_number(text, int)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor auto") from None
+
+
+TYPES = {"burn_in": _burn_in}
 
 
 def run(arguments):

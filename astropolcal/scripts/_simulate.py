@@ -4,15 +4,10 @@
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    Folder,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    angles,
     check_suffix,
     edit_chains,
+    entries,
+    option,
     printer,
     write_json,
 )
@@ -24,7 +19,11 @@ EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 # double differences of Q, then of U: the order in which stars are observed
 _STAR_CYCLE = [0, 45, 22.5, 67.5]
 
-_EXAMPLES = """\
+HELP = "simulate an observation table or image cubes, with photon and read noise"
+DESCRIPTION = """\
+Simulate the beam fluxes of an instrument's chain: the published values,
+or those of a calibration file. With --cubes, simulate its image cubes."""
+EXAMPLES = """\
 examples:
   astropolcal simulate -o run.ecsv                      the packaged example
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
@@ -36,108 +35,50 @@ examples:
 # of the light in an image
 _LOOKS = ("source", "psf", "fwhm", "halo", "background")
 _DEROTATOR = [45 + 12.5 * i for i in range(8)]
-_PSF = "moffat"
 
-#: Options of ``--cubes`` that are numbers: default, unit and meaning.
-_IMAGES = {
-    "fwhm": (5.0, "PIX", "full width of a star's core at half maximum"),
-    "halo": (0.0, "SHARE", "share of a star's light in its halo"),
-    "motion": (0.0, "PIX", "standard deviation of a star's place from frame to frame"),
-    "seeing": (0.0, "PART", "relative standard deviation of its width"),
-    "background": (0.0, "ADU", "of each pixel"),
-    "bad_pixels": (0.0, "SHARE", "share of the pixels without a value"),
-    "flat_error": (0.0, "PART", "relative standard deviation of the pixels' response"),
+#: Options of image cubes, which do nothing without ``--cubes``.
+_IMAGES = """
+--psf {moffat,gaussian} =moffat  profile of a star's core (default: %(default)s)
+--fwhm PIX float =5  full width of a star's core at half maximum (default: %(default)g)
+--halo SHARE float =0  share of a star's light in its halo (default: %(default)g)
+--motion PIX float =0  standard deviation of a star's place from frame to frame (default:
+    %(default)g)
+--seeing PART float =0  relative standard deviation of its width (default: %(default)g)
+--background ADU float =0  of each pixel (default: %(default)g)
+--bad-pixels SHARE float =0  share of the pixels without a value (default: %(default)g)
+--flat-error PART float =0  relative standard deviation of the pixels' response (default:
+    %(default)g)
+--saturate  cut pixels off at the instrument's saturation
+"""
+_USUAL = {
+    flags[0].removeprefix("--").replace("-", "_"): settings.get("default", False)
+    for flags, settings in (option(entry, {}) for entry in entries(_IMAGES))
 }
-
-
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "simulate",
-        run,
-        "simulate an observation table or image cubes, with photon and read noise",
-        "Simulate the beam fluxes of an instrument's chain: the published values,\n"
-        "or those of a calibration file. With --cubes, simulate its image cubes.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add(
-        "-o --output OBS.ecsv",
-        "the table (required without --cubes; with it, the true fluxes); overwritten if it exists",
-        type=Output,
-    )
-    add("--instrument NAME", "default: charis", default="charis")
-    add("--calibration CAL.asdf", "take the chain from this file", type=Input)
-    _add_frames(add)
-    _add_cubes(adder(parser.add_argument_group("image cubes")))
-    _add_noise(add)
-    add("--fix NAME=VALUE ...", "set a parameter of the true chain")
-    add("--without OPTIC ...", "take an optic out of the true chain")
-    add_shared(parser, "json", "quiet")
-
-
-def _add_frames(add):
-    add(
-        "--hwp DEG,DEG,...",
-        "half-wave-plate angles (default: 0 to 78.75 by 11.25)",
-        type=angles,
-    )
-    add(
-        "--derotator DEG,DEG,...",
-        "derotator angles (default: 45 to 132.5 by 12.5)",
-        type=angles,
-    )
-    add(
-        "--source",
-        "the internal source, or a star (default: %(default)s)",
-        choices=("internal", "star"),
-        default="internal",
-    )
-    for name in ("altitude", "parallactic"):
-        meaning = f"{name} angle of a star in all frames, or in the first and last"
-        add(f"--{name} DEG[,DEG]", meaning, type=angles)
-
-
-def _add_noise(add):
-    add(
-        "--flux ADU",
-        f"flux that enters, per wavelength (default: {EXAMPLE['flux']:g}; cubes: less where "
-        "the brightest pixel would be above half of the saturation)",
-        type=float,
-    )
-    add(
-        "--gain E/ADU",
-        "electrons per adu (default: %(default)g; cubes: the instrument's)",
-        type=float,
-        default=EXAMPLE["gain"],
-    )
-    add(
-        "--read-noise E",
-        "electrons per beam and frame (default: %(default)g; cubes: the instrument's)",
-        type=float,
-        default=EXAMPLE["read_noise"],
-    )
-    add("--no-noise", "leave the noise out")
-    add("--seed SEED", "default: %(default)s", type=int, default=EXAMPLE["seed"])
-
-
-def _add_cubes(add):
-    add("--cubes DIR", "write image cubes to this folder, raw headers to DIR/raw", type=Folder)
-    add(
-        "--psf",
-        "profile of a star's core (default: %(default)s)",
-        choices=("moffat", "gaussian"),
-        default=_PSF,
-    )
-    for name, (default, unit, meaning) in _IMAGES.items():
-        add(
-            f"--{name.replace('_', '-')} {unit}",
-            f"{meaning} (default: %(default)g)",
-            type=float,
-            default=default,
-        )
-    add("--saturate", "cut pixels off at the instrument's saturation")
+OPTIONS = f"""
+-o --output OBS.ecsv Output  the table (required without --cubes; with it, the true fluxes);
+    overwritten if it exists
+--instrument NAME =charis  default: charis
+--calibration CAL.asdf Input  take the chain from this file
+--hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25)
+--derotator DEG,DEG,... angles  derotator angles (default: 45 to 132.5 by 12.5)
+--source {{internal,star}} =internal  the internal source, or a star (default: %(default)s)
+--altitude DEG[,DEG] angles  altitude angle of a star in all frames, or in the first and last
+--parallactic DEG[,DEG] angles  parallactic angle of a star in all frames, or in the first and last
+--flux ADU float  flux that enters, per wavelength (default: {EXAMPLE["flux"]:g}; cubes: less where
+    the brightest pixel would be above half of the saturation)
+--gain E/ADU float ={EXAMPLE["gain"]}  electrons per adu (default: %(default)g; cubes: the
+    instrument's)
+--read-noise E float ={EXAMPLE["read_noise"]}  electrons per beam and frame (default: %(default)g;
+    cubes: the instrument's)
+--no-noise  leave the noise out
+--seed SEED int ={EXAMPLE["seed"]}  default: %(default)s
+--fix NAME=VALUE ...  set a parameter of the true chain
+--without OPTIC ...  take an optic out of the true chain
+@ json quiet
+[image cubes]
+--cubes DIR Folder  write image cubes to this folder, raw headers to DIR/raw
+{_IMAGES.strip()}
+"""
 
 
 def run(arguments):
@@ -175,8 +116,7 @@ def _check_images(arguments):
     """Refuse options of image cubes where none are made."""
     if arguments.cubes:
         return
-    usual = {name: default for name, (default, *_) in _IMAGES.items()}
-    for name, default in (usual | {"psf": _PSF, "saturate": False}).items():
+    for name, default in _USUAL.items():
         if getattr(arguments, name) != default:
             raise AstropolcalError(f"--{name.replace('_', '-')}: is for --cubes DIR")
 
@@ -239,7 +179,7 @@ def _table(arguments, instrument, chain, wavelength, frames, meta):
 def _write_cubes(arguments, instrument, chain, wavelength, frames):
     from astropolcal.reduction.cubes import simulate_cubes
 
-    names = ("source", "flux", "psf", "saturate", "seed", *_IMAGES)
+    names = ("source", "flux", "seed", *_USUAL)
     return simulate_cubes(
         arguments.cubes,
         chain,

@@ -6,18 +6,33 @@ import math
 import astropy.units as u
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import (
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    printer,
-    wrapped,
-    write_json,
-)
+from astropolcal.scripts._common import give, wrapped
 from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
+HELP = "list polarimetric standard stars and when they are observable"
+DESCRIPTION = (
+    "List the polarimetric standard stars of the catalogue. With a site and a night, those that "
+    "rise above the limit, the best for the diattenuation of the telescope first. With a name, all "
+    "that is known of that star."
+)
+OPTIONS = """
+name NAME ?  a star, such as 'HD 293396'
+--kind {polarized,unpolarized}  only stars of this kind
+--band BAND  magnitude and polarization in this band, such as H; the magnitude in V where the
+    catalogue has none in it
+--magnitude LO,HI  brightest and faintest magnitude, in --band, or in V where the catalogue has none
+    in it
+--near RA,DEC  degrees, or 05:26:06,+16:42:00
+--radius DEG float  goes with --near (default: 15)
+--site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
+--night YYYY-MM-DD  date of the evening at the site
+--min-altitude DEG float =30  lowest altitude (default: 30)
+--limit N int  how many to list, the best first (default: 20 of a night, else all)
+--json FILE Output  write it for machines (- for stdout)
+--plot FILE Output  draw altitude and parallactic angle over the night
+@ online quiet
+"""
 # R, J, H and K, for what a calibration assumes of a star
 _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 # more stars than this make a figure unreadable
@@ -26,57 +41,17 @@ _DRAWN = 5
 _LISTED = 20
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "standards",
-        run,
-        "list polarimetric standard stars and when they are observable",
-        "List the polarimetric standard stars of the catalogue. With a site and a "
-        "night, those that rise above the limit, the best for the diattenuation of the telescope "
-        "first. With a name, all that is known of that star.",
-    )
-    add = adder(parser)
-    add("name NAME", "a star, such as 'HD 293396'", nargs="?")
-    add("--kind", "only stars of this kind", choices=("polarized", "unpolarized"))
-    add(
-        "--band BAND",
-        "magnitude and polarization in this band, such as H; the magnitude in V "
-        "where the catalogue has none in it",
-    )
-    add(
-        "--magnitude LO,HI",
-        "brightest and faintest magnitude, in --band, or in V where the catalogue has none in it",
-    )
-    add("--near RA,DEC", "degrees, or 05:26:06,+16:42:00")
-    add("--radius DEG", "goes with --near (default: 15)", type=float)
-    add("--site SITE", "subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
-    add("--night YYYY-MM-DD", "date of the evening at the site")
-    add("--min-altitude DEG", "lowest altitude (default: 30)", type=float, default=30.0)
-    add(
-        "--limit N",
-        f"how many to list, the best first (default: {_LISTED} of a night, else all)",
-        type=int,
-    )
-    add("--json FILE", "write it for machines (- for stdout)", type=Output)
-    add("--plot FILE", "draw altitude and parallactic angle over the night", type=Output)
-    add_shared(parser, "online", "quiet")
-
-
 def run(arguments):
     """Print the stars."""
     _check(arguments)
     # text for people, content for machines, nights for the figure
-    text, content, seen, total = (_one if arguments.name else _many)(arguments)
+    lines, content, seen, total = (_one if arguments.name else _many)(arguments)
     if arguments.plot:
         from astropolcal.plotting import plot_observability
         from astropolcal.plotting._style import save
 
         save(plot_observability(seen, total=total), arguments.plot)
-    if arguments.json:
-        write_json(content, arguments.json)
-    printer(arguments)(text)
+    give(arguments, lines, content)
 
 
 def _check(arguments):
@@ -104,12 +79,11 @@ def _one(arguments):
     content = _facts(star)
     lines = _describe(star, content["known"])
     if arguments.night is None:
-        return "\n".join(lines), content, [], 1
+        return lines, content, [], 1
     seen = _observability(star.name, arguments)
     content |= {"site": arguments.site, "night": seen.night} | _angles(seen)
     lines += ["", f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg"]
-    lines += _night_lines(seen, content)
-    return "\n".join(lines), content, [seen], 1
+    return lines + _night_lines(seen, content), content, [seen], 1
 
 
 def _observability(name, arguments):
@@ -122,16 +96,17 @@ def _observability(name, arguments):
 def _describe(star, known):
     """Return the lines that say what is known of a star, and what a calibration assumes of it."""
     place = star.coord.to_string("hmsdms", sep=":", precision=1)
-    lines = [f"{star.name}: {star.kind} standard star"]
-    lines.append(f"  position    {place} (ICRS, +-{star.position_error.value:g} arcsec)")
-    if star.aliases:
-        lines.append(wrapped(f"  also        {', '.join(star.aliases)}", indent=14))
     bright = "  ".join(f"{b} {m.value:g}" for b, m in star.magnitudes.items())
-    lines.append(f"  magnitudes  {bright or 'not known'}")
-    if star.spectral_type:
-        lines.append(f"  type        {star.spectral_type}")
-    if star.note:
-        lines.append(wrapped(f"  note        {star.note}", indent=14))
+    facts = {
+        "position": f"{place} (ICRS, +-{star.position_error.value:g} arcsec)",
+        "also": ", ".join(star.aliases),
+        "magnitudes": bright or "not known",
+        "type": star.spectral_type,
+        "note": star.note,
+    }
+    facts = [f"  {name:<11} {words}" for name, words in facts.items() if words]
+    lines = [f"{star.name}: {star.kind} standard star"]
+    lines += [wrapped(fact, indent=14) for fact in facts]
     lines += [*_law_lines(star), *_known_lines(known)]
     if len(star.polarization):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]
@@ -144,15 +119,11 @@ def _describe(star, known):
 def _law_lines(star):
     if star.law is None:
         return []
-    law, errors = star.law, star.law_errors
-    texts = [
-        ("p_max", 100 * law.p_max.value, errors.get("p_max"), " %"),
-        ("lambda_max", law.lambda_max.value, errors.get("lambda_max"), " um"),
-        ("K", law.K.value, errors.get("K"), ""),
-        ("theta", law.theta.value, errors.get("theta"), " deg"),
-    ]
     lines = ["", f"  Serkowski law ({star.law_reference})"]
-    for name, value, error, unit in texts:
+    units = {"p_max": " %", "lambda_max": " um", "K": "", "theta": " deg"}
+    for name, unit in units.items():
+        value, error = getattr(star.law, name).value, star.law_errors.get(name)
+        value = 100 * value if name == "p_max" else value
         spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
         lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
     return lines
@@ -163,12 +134,11 @@ def _known_lines(known):
         return []
     lines = ["", "  In a calibration"]
     for row in known["stokes"]:
-        what, turned = "q, u", ""
+        degree = f"{_pair(row['p_percent'], row['p_err_percent'], '.2f')} %"
+        what = f"q, u {degree}"
         if row["theta_deg"] is not None:
-            angle = _pair(row["theta_deg"], row["theta_err_deg"], ".1f")
-            what, turned = "p", f", theta {angle} deg"
-        degree = _pair(row["p_percent"], row["p_err_percent"], ".2f")
-        lines.append(f"    {row['wavelength_um']:.2f} um   {what} {degree} %{turned}")
+            what = f"p {degree}, theta {_pair(row['theta_deg'], row['theta_err_deg'], '.1f')} deg"
+        lines.append(f"    {row['wavelength_um']:.2f} um   {what}")
     return lines + [wrapped(f"    - {words}", indent=6) for words in known["words"]]
 
 
@@ -222,36 +192,34 @@ def _many(arguments):
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")
-    content = {"site": arguments.site, "night": arguments.night}
     # a machine gets all unless it asks for fewer
-    content["stars"] = [_row(row) for row in found[: arguments.limit]]
+    rows = [_row(row) for row in found[: arguments.limit]]
+    content = {"site": arguments.site, "night": arguments.night, "stars": rows}
     shown = found[: arguments.limit or (_LISTED if arguments.night else None)]
     lines = _night_table(shown) if arguments.night else _table(shown, arguments.band)
     lines += _band_lines(shown, arguments)
-    more = len(found) - len(shown)
-    if more:
+    if more := len(found) - len(shown):
         lines += ["", f"{counted(more, 'more star')}; --limit {len(found)} lists all"]
     # ordered by the score already
     best = shown["name"][:_DRAWN] if arguments.plot else []
-    if len(best) and len(best) < len(shown):
+    if 0 < len(best) < len(shown):
         lines += ["", f"The figure shows the first {len(best)} of {len(shown)} stars."]
-    seen = [_observability(str(name), arguments) for name in best]
-    return "\n".join(lines), content, seen, len(shown)
+    return lines, content, [_observability(str(name), arguments) for name in best], len(shown)
 
 
 def _band_lines(shown, arguments):
     """Return the note on what is of another band than was asked for."""
-    band, lines = arguments.band, []
+    band, lines = arguments.band, [""]
     if band is None:
-        return lines
-    known = shown[[math.isfinite(value) for value in shown["magnitude"].value]]
-    others = sum(str(row["magnitude_band"]) != band for row in known)
+        return []
+    others = shown[[math.isfinite(value) for value in shown["magnitude"].value]]
+    others = sum(str(other) != band for other in others["magnitude_band"])
     if others:
         selects = ", by which --magnitude selects them" if arguments.magnitude else ""
         lines.append(f"{others} of {len(shown)} have no magnitude in {band}: V instead{selects}.")
     if not arguments.night and not all(_has_degree(row, band) for row in shown):
         lines.append(f"* no polarization in {band}: p is of the band nearest to V")
-    return ["", *lines] if lines else []
+    return lines if len(lines) > 1 else []
 
 
 def _has_degree(row, band):
@@ -286,23 +254,20 @@ def _table(found, band=None):
 def _night_table(found):
     lines = ["name            kind         mag     altitude  parallactic hours     M3   score"]
     for row in found:
-        low, high, first, last = (
-            row[f"{what}_{end}"].value
-            for what in ("altitude", "parallactic")
-            for end in ("min", "max")
-        )
+        angles = [f"{what}_{end}" for what in ("altitude", "parallactic") for end in ("min", "max")]
+        low, high, first, last = (row[name].value for name in angles)
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:z2.0f} to "
             f"{high:z2.0f}  {first:z4.0f} to {last:z4.0f}  {row['hours'].value:4.1f} "
             f"{_number(row['m3_error'], '6.3f'):>6}  {_number(row['m3_score'], '6.3f'):>6}"
         )
-    lines += [
+    return [
+        *lines,
         "",
         "Altitude and parallactic angle in deg. M3: error of the diattenuation of the",
         "telescope from 32 frames, in errors of one frame. score: M3 times the photon",
         "noise against that of magnitude 10; the smaller the better.",
     ]
-    return lines
 
 
 def _magnitude(row):
@@ -320,13 +285,13 @@ def _number(value, form):
 def _facts(star):
     from astropolcal.standards.priors import assumed_polarization
 
-    law = None
-    if star.law is not None:
+    law = star.law
+    if law is not None:
         law = {
-            "p_max_percent": 100 * star.law.p_max.value,
-            "lambda_max_um": star.law.lambda_max.value,
-            "K": star.law.K.value,
-            "theta_deg": star.law.theta.value,
+            "p_max_percent": 100 * law.p_max.value,
+            "lambda_max_um": law.lambda_max.value,
+            "K": law.K.value,
+            "theta_deg": law.theta.value,
             "reference": star.law_reference,
             "doi": star.law_doi or None,
         }
@@ -348,12 +313,11 @@ _UNITS = {"deg": "deg", "%": "percent", "um": "um", "mag": "", "h": ""}
 
 def _row(row):
     """Return a row of a table for JSON: unit in the name."""
-    content = {}
-    for name in row.colnames:
-        value = row[name]
-        unit = _UNITS.get(str(getattr(value, "unit", "")), "")
-        content[f"{name}_{unit}" if unit else name] = getattr(value, "value", value)
-    return content
+    units = {name: _UNITS.get(str(getattr(row[name], "unit", "")), "") for name in row.colnames}
+    return {
+        f"{name}_{unit}" if unit else name: getattr(row[name], "value", row[name])
+        for name, unit in units.items()
+    }
 
 
 def _angles(seen):

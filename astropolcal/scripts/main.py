@@ -54,11 +54,13 @@ def _number(kind, text):
 
 def build_parser():
     """Return the parser of the command and its subcommands."""
+    from astropolcal.scripts._common import add_command
+
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in _COMMANDS:
-        import_module(f"astropolcal.scripts._{name}").add_parser(commands)
+        add_command(commands, name, import_module(f"astropolcal.scripts._{name}"))
     return parser
 
 

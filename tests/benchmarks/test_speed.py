@@ -158,7 +158,7 @@ def test_fitter_against_bare_scipy(measurement, capsys):
 
     def stock():
         forget(measurement)
-        measurement.parameters = start
+        measurement.stand_at(start)
         fitter = TRFLSQFitter()
         fitter(measurement, measurement.index, measurement.observed, maxiter=500, inplace=True)
         return fitter.fit_info

@@ -434,3 +434,17 @@ def test_file_gives_the_same_errors_where_all_is_determined(full_rank, from_file
 def test_file_holds_no_data_to_predict(from_file):
     with pytest.raises(CalibrationFileError, match="holds no observations"):
         derived_data(from_file)
+
+
+def test_spectra_of_a_calibration_are_parameters_of_optics(full_rank):
+    pytest.importorskip("specutils", reason="specutils is not installed")
+    for made in (derived_retardance(full_rank, "hwp"), derived_efficiency(full_rank)):
+        spectrum = made.spectrum()
+        np.testing.assert_array_equal(spectrum.flux.value, u.Quantity(made.value).value)
+        np.testing.assert_array_equal(spectrum.spectral_axis, full_rank.wavelength)
+        np.testing.assert_allclose(spectrum.uncertainty.array, u.Quantity(made.std).value)
+    optic = optics.WollastonPrism(efficiency=spectrum)
+    np.testing.assert_array_equal(optic.efficiency.value, made.value)
+    np.testing.assert_array_equal(optic.efficiency.std, made.std)
+    with pytest.raises(ParameterError, match="one value at each of several wavelengths"):
+        derived_efficiency(full_rank, 1.6 * u.um).spectrum()

@@ -480,3 +480,5 @@ def test_words_name_what_matters(calibrated):
     assert "s_cv" in words
     assert max(len(line) for line in words.splitlines()) <= 80
     assert "11 free parameters, rank 11" in repr(calibrated)
+    assert calibrated._repr_html_().startswith("<p>Calibration of ")
+    assert "<th>std</th>" in calibrated._repr_html_()

@@ -220,7 +220,7 @@ def test_what_drifted_without_a_datum_is_brought_back(observations):
     origin, slot = live.vector(), live.free.by_name["wollaston.efficiency"].slice
     drifted = origin.copy()
     drifted[slot] = [0.9, 1.0, 0.91, 0.92]
-    live.parameters = drifted
+    live.stand_at(drifted)
     hold_silent(live, origin)
     np.testing.assert_array_equal(live.vector()[slot], [0.9, origin[slot][1], 0.91, 0.92])
 

@@ -34,7 +34,7 @@ def long():
 
 def test_thinned_measurement_is_a_part_of_the_whole(long):
     whole = Measurement(*long)
-    whole.parameters = whole.vector() + 0.01
+    whole.stand_at(whole.vector() + 0.01)
     fewer, kept = whole.thinned(100)
     vector = whole.vector()
     assert fewer.n_data == kept.sum() == 300
@@ -48,7 +48,7 @@ def test_thinning_leaves_the_whole_as_it_is(long):
     whole = Measurement(*long)
     before = whole.vector()
     fewer, _ = whole.thinned(50)
-    fewer.parameters = before + 0.1
+    fewer.stand_at(before + 0.1)
     fewer.put_back()
     np.testing.assert_array_equal(whole.vector(), before)
     chain = whole.put_back()[0]
@@ -112,7 +112,7 @@ def test_groups_in_one_step_are_as_fits_without_them(monkeypatch):
 def test_group_that_alone_determines_something_is_not_predicted(monkeypatch):
     chain, data = lamp(160, seed=5)
     measurement = Measurement(chain, data)
-    measurement.parameters = calibrate(chain, data, cross_validate=False).measurement.vector()
+    measurement.stand_at(calibrate(chain, data, cross_validate=False).measurement.vector())
     # one group holds all data of the first wavelength
     labels = np.where(measurement.bins == 0, 0, 1 + np.arange(measurement.n_data) % 20)
     with pytest.raises(FitError, match="the others do not determine"):

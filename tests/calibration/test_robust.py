@@ -45,9 +45,10 @@ def redrawn(cal, noises):
         for _ in range(2):
             step = np.linalg.lstsq(live.jacobian(vector).T, live.residuals(vector), rcond=None)[0]
             vector = vector + step
-        live.parameters = vector
+        live.stand_at(vector)
         yield cal
-    live.parameters, live.observed = before
+    live.stand_at(before[0])
+    live.observed = before[1]
 
 
 def true_stds(cal, covariance):

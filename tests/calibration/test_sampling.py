@@ -170,7 +170,7 @@ def test_noise_from_residuals_is_unbiased():
         noise = rng.normal(0, NOISE, live.n_data)
         best = vector + np.linalg.lstsq(jacobian.T, noise, rcond=None)[0]
         live.observed = live.predict(vector) + noise
-        live.parameters = best
+        live.stand_at(best)
         equal = around(live, Weighting(None, np.full(live.n_data, np.nan)))
         noise = Weighting("wavelength", np.full(live.n_data, NOISE)).updated(live, equal)
         squares.append(noise.sigma[[0, -1]] ** 2 / NOISE**2)

@@ -138,10 +138,10 @@ def test_levels_are_unbiased(truth, data):
         for _ in range(2):
             slopes = (live.jacobian(live.vector()) * noise.weight).T
             step = np.linalg.lstsq(slopes, live.residuals() * noise.weight, rcond=None)[0]
-            live.parameters = live.vector() + step
+            live.stand_at(live.vector() + step)
             noise = noise_of(live, "wavelength")
         squares.append([(noise.sigma[live.bins == b][0]) ** 2 for b in range(4)])
-        live.parameters = vector
+        live.stand_at(vector)
     error = np.sqrt(2 / 29 / 150)
     np.testing.assert_allclose(np.mean(squares, axis=0) / LEVELS**2, 1, atol=4 * error)
 

@@ -165,6 +165,13 @@ def test_shape_of_one_value_a_wavelength_survives():
     assert round_trip(optic).retardance.shape == optic.retardance.shape
 
 
+def test_wavelengths_of_the_values_survive():
+    optic = optics.LinearRetarder(retardance=[1, 2] * u.deg, wavelength=[1.2, 1.6] * u.um)
+    again = round_trip(optic)
+    np.testing.assert_array_equal(again.retardance.wavelength, optic.retardance.wavelength)
+    assert again.theta.wavelength is None
+
+
 def test_signed_zero_survives():
     again = round_trip(optics.LinearRetarder(retardance=[-0.0, 0.0] * u.deg))
     assert np.signbit(again.retardance.value).tolist() == [True, False]

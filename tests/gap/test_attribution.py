@@ -131,6 +131,17 @@ def test_a_name_has_the_evidence_of_its_cell_and_its_prior_odds(model, found):
     assert scan(model.with_effect(EFFECTS["beam_gain"])).named_as(cell, SMOOTH) == []
 
 
+def test_a_name_has_the_same_evidence_alone_and_among_all_others(model, found):
+    """Also those that exchange one optic, of which only one can be in the chain at a time."""
+    together = {one.name: one.evidence for one in found.candidates if one.is_named}
+    for effect in SMOOTH:
+        alone = scan(model, [effect], cells=False).best
+        assert (alone is None) == (effect.name not in together), effect.name
+        if alone is not None:
+            assert together[effect.name] == pytest.approx(alone.evidence, abs=1e-4), effect.name
+    assert "derotator_elliptical_retardance" in together
+
+
 def test_a_law_is_freed_where_the_data_ask_for_it():
     """A gain at one wavelength alone is no curve of second degree."""
     true = data.with_effect("beam_gain")

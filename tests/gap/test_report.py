@@ -235,6 +235,9 @@ def test_table(found, nothing):
     assert table["gap_before"][0] > table["gap_after"][0]
     assert table["gap_before"].unit == u.percent
     assert causes_table(nothing).colnames == table.colnames
+    page = grouped._repr_html_()
+    assert page.startswith("<p>Diagnosis: ")
+    assert "<th>probability</th>" in page
 
 
 @pytest.mark.slow

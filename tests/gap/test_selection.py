@@ -7,8 +7,11 @@ import pytest
 from gap_setups import SETUPS
 
 from astropolcal.gap.cells import Cell
+from astropolcal.gap.challenge import make_challenge, score_answer
+from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.report import to_dict
 from astropolcal.gap.selection import select
 from astropolcal.gap.shrinkage import frame_groups
 
@@ -110,3 +113,16 @@ def test_a_law_of_any_form_is_one_cause():
     assert [group.best.name for group in found.groups] == ["beam_gain"]
     sizes = found.model.sizes("beam_gain")["gap_beam_gain.imbalance"][0]
     np.testing.assert_allclose(sizes, true["gap_beam_gain"].imbalance.value, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_pairs_that_a_greedy_search_gets_wrong():
+    """Two of three causes that are one, and one of much freedom in place of two simple ones."""
+    for number in (27, 3):
+        rng = np.random.default_rng([99, number])
+        snr = float(np.exp(rng.uniform(np.log(30), np.log(100))))
+        made = make_challenge([99, number], kind="pair", snr=snr, fault={"type": "listed"})
+        observations, chains, case = made
+        diagnosis = diagnose(chains, observations)
+        assert len(diagnosis.causes) == 2, number
+        assert score_answer(case, to_dict(diagnosis)) == "right", number

@@ -101,7 +101,7 @@ def test_a_chain_in_which_nothing_moves_still_has_its_frames():
 
 def test_thinned_measurement_is_the_whole_one_at_fewer_data(chain, observations):
     whole = Measurement(chain, _masked(observations, (0, 0), (9, 1)))
-    whole.parameters = whole.vector() * 1.001
+    whole.stand_at(whole.vector() * 1.001)
     fewer, kept = whole.thinned(6)
     assert kept.sum() == fewer.n_data < whole.n_data
     np.testing.assert_array_equal(fewer.vector(), whole.vector())
@@ -191,7 +191,7 @@ def test_sum_of_squares_of_a_fitter_is_that_of_data_and_priors(with_prior):
 
 def test_number_of_values_is_checked(with_prior):
     with pytest.raises(ParameterError, match=r"3 values for \d+ parameters"):
-        with_prior.parameters = np.zeros(3)
+        with_prior.stand_at(np.zeros(3))
 
 
 # --- pairs of chains and tables -----------------------------------------------------------------

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic, join
-from astropolcal.exceptions import AstropolcalError, ChainError, ObservationError
+from astropolcal.exceptions import AstropolcalError, ChainError, ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
 from astropolcal.observations.observables import NormalizedSingleDifference
@@ -336,7 +336,8 @@ def test_index_picks_data(chain, observations):
     np.testing.assert_array_equal(measurement(some), measurement(measurement.index)[some])
     values = measurement.vector()
     np.testing.assert_array_equal(
-        measurement.fit_deriv(some, *values), measurement.jacobian(values)[:, some]
+        measurement.fit_deriv(some, *measurement.parameters),
+        measurement.jacobian(values)[:, some] * measurement.free.factors()[:, None],
     )
 
 
@@ -369,22 +370,28 @@ def test_results_do_not_share_memory_with_what_is_remembered(chain, observations
 # --- parameters as astropy sees them ----------------------------------------------------------
 
 
-def test_parameters_are_scalars_in_canonical_units(chain, observations):
+def test_parameters_are_scalars_in_the_units_of_the_optics(chain, observations):
     measurement = Measurement(chain, observations)
     assert measurement.param_names[:3] == ("polarizer_theta", "hwp_w_sio2", "hwp_w_mgf2")
     assert all(getattr(measurement, name).shape == () for name in measurement.param_names)
-    assert measurement.polarizer_theta.value == pytest.approx(np.pi / 2)
-    assert measurement.hwp_w_sio2.value == pytest.approx(1650.0)
-    assert measurement.derotator_horizontal_0.value == pytest.approx(np.deg2rad(-230))
-    np.testing.assert_array_equal(measurement.parameters, measurement.vector())
+    assert measurement.polarizer_theta.quantity == 90 * u.deg
+    assert u.isclose(measurement.hwp_w_sio2.quantity, 1.65 * u.mm)
+    assert u.isclose(measurement.derotator_horizontal_0.quantity, -230 * u.deg)
+    assert measurement.wollaston_efficiency_0.unit is None
+    expected = np.concatenate([[np.pi / 2, 1650, 1290], np.deg2rad([-230])])
+    np.testing.assert_allclose(measurement.vector()[:4], expected)
+    with pytest.raises(ParameterError, match=r"polarizer_theta = 1\.5 needs a unit"):
+        measurement.polarizer_theta = 1.5
 
 
 def test_bounds_are_converted(chain, observations):
     chain["polarizer"].theta.bounds = (85, 95)
     measurement = Measurement(chain, observations)
-    np.testing.assert_allclose(measurement.polarizer_theta.bounds, np.deg2rad([85, 95]))
+    np.testing.assert_allclose(measurement.polarizer_theta.bounds, [85, 95])
     assert measurement.hwp_w_sio2.bounds == (0.0, None)
-    np.testing.assert_allclose(measurement.derotator_circular_2.bounds, (-2 * np.pi, 2 * np.pi))
+    np.testing.assert_allclose(measurement.derotator_circular_2.bounds, (-360, 360))
+    measurement.polarizer_theta.bounds = (1.5, 1.6) * u.rad
+    np.testing.assert_allclose(measurement.polarizer_theta.bounds, np.rad2deg([1.5, 1.6]))
     assert measurement.wollaston_efficiency_1.bounds == (0.0, 1.0)
 
 
@@ -418,10 +425,10 @@ def test_parameters_belong_to_the_instance():
     assert two.param_names == (
         "hwp_retardance_0", "hwp_retardance_1", "hwp_retardance_2", "wollaston_efficiency",
     )  # fmt: skip
-    one.parameters = one.vector() + 0.1
-    one.hwp_retardance_0 = 1.0
-    assert one.hwp_retardance_0.value == one.parameters[0] == 1.0
-    assert two.hwp_retardance_0.value == pytest.approx(np.deg2rad(160.0))
+    one.stand_at(one.vector() + 0.1)
+    one.hwp_retardance_0 = 1.0 * u.rad
+    assert one.hwp_retardance_0.value == one.parameters[0] == np.rad2deg(1.0)
+    assert two.hwp_retardance_0.value == pytest.approx(160.0)
     assert not hasattr(two, "hwp_retardance_3")
     after = dict(vars(Measurement))
     assert after == before
@@ -439,7 +446,7 @@ def test_parameter_may_be_replaced_by_a_parameter(chain, observations):
 def test_chains_given_are_not_changed(chain, observations):
     before = [np.array(v) for leaf in chain for v in leaf.canonical_values()]
     measurement = Measurement(chain, observations)
-    measurement.parameters = measurement.vector() + 0.1
+    measurement.stand_at(measurement.vector() + 0.1)
     measurement.put_back()
     after = [np.array(v) for leaf in chain for v in leaf.canonical_values()]
     for old, new in zip(before, after, strict=True):
@@ -454,11 +461,16 @@ def test_put_back_writes_values_with_units(chain, observations):
     (own,) = measurement.put_back(vector)
     assert u.isclose(own["hwp"].w_sio2.quantity, 1.7 * u.mm)
     assert u.allclose(own["derotator"].horizontal.quantity, [10, 20, 30] * u.deg)
+    # they know their wavelengths now
+    between = np.mean(WAVELENGTH[:2].value) * u.um
+    assert u.isclose(own["derotator"].curve("horizontal")(between), 15 * u.deg)
+    with pytest.raises(ParameterError, match=r"derotator\.horizontal has values at 3 wavelengths"):
+        Measurement(own, simulate(chain, WAVELENGTH * 1.1, observations.frames, noise=False))
 
 
 def test_without_copy_the_chain_is_the_one_given(chain, observations):
     measurement = Measurement(chain, observations, copy=False)
-    measurement.polarizer_theta = 1.5
+    measurement.polarizer_theta = 1.5 * u.rad
     measurement.put_back()
     assert chain["polarizer"].theta.value == pytest.approx(np.rad2deg(1.5))
 
@@ -466,13 +478,13 @@ def test_without_copy_the_chain_is_the_one_given(chain, observations):
 def test_copy_is_independent_but_shares_the_data(chain, observations):
     measurement = Measurement(chain, observations)
     clone = measurement.copy()
-    clone.parameters = measurement.vector() + 0.1
+    clone.stand_at(measurement.vector() + 0.1)
     clone.put_back()
     assert clone.observed is measurement.observed
     assert clone.chains[0] is not measurement.chains[0]
     assert measurement.chains[0]["polarizer"].theta.value == 90
     assert clone.chains[0]["polarizer"].theta.value == pytest.approx(90 + np.rad2deg(0.1))
-    assert measurement.polarizer_theta.value == pytest.approx(np.pi / 2)
+    assert measurement.polarizer_theta.value == 90
     np.testing.assert_array_equal(
         clone.predict(clone.vector()), measurement.predict(clone.vector())
     )
@@ -545,7 +557,42 @@ def test_bounds_hold_in_a_fit(frames):
     chain["calibration_polarizer"].theta.bounds = (89.5, 90.2)
     measurement = Measurement(chain, data)
     fitted = TRFLSQFitter()(measurement, measurement.index, measurement.observed)
-    assert np.rad2deg(fitted.calibration_polarizer_theta.value) <= 90.2 + 1e-9
+    assert fitted.calibration_polarizer_theta.value <= 90.2 + 1e-9
+
+
+def test_chains_of_a_fit_have_its_values_and_errors(frames):
+    chain, data = _full_rank([1.2, 1.6, 2.0, 2.2] * u.um, frames)
+    for inplace in (False, True):
+        measurement = Measurement(chain, data)
+        arguments = measurement, measurement.index, measurement.observed
+        fitted = TRFLSQFitter(calc_uncertainties=True)(*arguments, inplace=inplace)
+        optic = fitted.chains[0]["calibration_polarizer"]
+        assert optic.theta.quantity == fitted.calibration_polarizer_theta.quantity
+        assert optic.theta.std == fitted.calibration_polarizer_theta.std > 0
+        efficiency = fitted.chains[0]["wollaston"].efficiency
+        assert efficiency.std.shape == efficiency.shape == (4,)
+        assert fitted.chains[0]["wollaston"].theta.std is None
+        # nobody else's
+        assert (measurement is fitted) == inplace
+        assert chain["calibration_polarizer"].theta.value != optic.theta.value
+    start = Measurement(chain, data)
+    TRFLSQFitter()(start, start.index, start.observed)
+    assert start.chains[0]["wollaston"].efficiency.value == pytest.approx(
+        chain["wollaston"].efficiency.value
+    )
+
+
+def test_data_of_a_fit_are_plain_numbers(chain, observations):
+    measurement = Measurement(chain, observations)
+    with pytest.raises(ParameterError, match="the data are in %; observables are plain numbers"):
+        TRFLSQFitter()(measurement, measurement.index, measurement.observed * u.percent)
+
+
+def test_a_callable_tie_is_refused_when_it_is_set(chain, observations):
+    measurement = Measurement(chain, observations)
+    with pytest.raises(ParameterError, match="hwp_w_sio2: a measurement takes no callable tie"):
+        measurement.hwp_w_sio2.tied = lambda model: 2 * model.hwp_w_mgf2
+    measurement.hwp_w_sio2.tied = False
 
 
 def test_errors_have_one_root(chain, observations):

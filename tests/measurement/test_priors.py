@@ -137,14 +137,14 @@ def test_priors_are_data_behind_the_data():
     index, observed, weights = measurement.fit_arguments(noise=0.01)
     assert index.size == observed.size == measurement.n_data + 2
     np.testing.assert_array_equal(weights[-2:], 0.01)
-    predicted = measurement.evaluate(index, *measurement.vector())
+    predicted = measurement.evaluate(index, *measurement.parameters)
     np.testing.assert_allclose(predicted[:-2], measurement.observed, atol=1e-9)
     np.testing.assert_allclose(predicted[-2:], [1.0, 0.0], atol=1e-12)
-    slope = measurement.fit_deriv(index, *measurement.vector())
+    slope = measurement.fit_deriv(index, *measurement.parameters)
     assert slope.shape == (4, measurement.n_data + 2)
     np.testing.assert_allclose(slope[2:, -2:], np.eye(2) / 0.05)
     assert (
-        measurement.fit_deriv(measurement.index, *measurement.vector()).shape[1] == index.size - 2
+        measurement.fit_deriv(measurement.index, *measurement.parameters).shape[1] == index.size - 2
     )
 
 

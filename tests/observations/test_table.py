@@ -355,6 +355,9 @@ def test_repr_and_summary(obs):
     assert repr(masked) == (
         "<Observations 'night': example polarimeter, polarized, 8 frames x 3 bins, 3 cells masked>"
     )
+    page = masked._repr_html_()
+    assert page.startswith("<p>Observations &#x27;night&#x27;: example polarimeter")
+    assert "<th>derotator</th>" in page
     lines = masked.summary().splitlines()
     assert "derotator: 45, 90 deg" in lines
     assert "errors: flux_right_err and flux_left_err" in lines

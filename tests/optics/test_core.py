@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import mueller
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.mueller import rotation_generator
 from astropolcal.optics import Diattenuator, LinearPolarizer, LinearRetarder, Optic
 
@@ -189,3 +189,67 @@ def test_values_are_canonical_floats():
     theta, retardance = optic.canonical_values()
     assert theta == pytest.approx(np.pi / 4)
     np.testing.assert_allclose(retardance, [np.pi / 2, np.pi], rtol=1e-15)
+
+
+# --- wavelengths of the values ---------------------------------------------------------
+
+
+def test_values_per_wavelength_are_interpolated_where_they_are_known():
+    optic = LinearRetarder(retardance=[100, 120, 140] * u.deg, wavelength=WAVELENGTH, name="hwp")
+    assert optic.retardance.wavelength.to_value(u.nm) == pytest.approx([1200, 1600, 2100])
+    assert optic.theta.wavelength is None
+    for copy in (optic, optic.copy(), optic.with_parameters(theta=0 * u.deg)):
+        for wavelength, retardance in (
+            (1.4 * u.um, 110),
+            ([1.4, 1.85] * u.um, [110, 130]),
+            (WAVELENGTH, [100, 120, 140]),
+        ):
+            expected = mueller.linear_retarder(retardance * u.deg)
+            np.testing.assert_allclose(copy.mueller(wavelength), expected, atol=1e-12)
+    assert optic(1.4 * u.um, 1, 0, 1, 0)[3] == pytest.approx(np.cos(np.deg2rad(110)))
+    assert u.isclose(optic.curve("retardance")(1.4 * u.um), 110 * u.deg)
+    assert optic.curve("mueller", (2, 2))(1.4 * u.um) == pytest.approx(np.cos(np.deg2rad(110)))
+    with pytest.raises(WavelengthRangeError, match=r"retardance is known from 1\.2 to 2\.1 um"):
+        optic.mueller(2.2 * u.um)
+    for wrong in ([1.2, 1.6] * u.um, [1.2, 2.1, 1.6] * u.um, [0, 1, 2] * u.um):
+        with pytest.raises(ParameterError, match="wavelengths of retardance"):
+            optic.retardance.wavelength = wrong
+    with pytest.raises(ParameterError, match="3 values, one per wavelength, but 2"):
+        LinearRetarder(retardance=[100, 120, 140] * u.deg).mueller([1.4, 1.85] * u.um)
+
+
+def test_values_come_as_spectra_and_are_resampled():
+    specutils = pytest.importorskip("specutils", reason="specutils is not installed")
+    from astropy.nddata import VarianceUncertainty
+    from specutils.manipulation import LinearInterpolatedResampler
+
+    # by frequency, so that wavelengths fall
+    spectrum = specutils.Spectrum(
+        flux=np.deg2rad([140, 120, 100]) * u.rad,
+        spectral_axis=WAVELENGTH[::-1].to(u.THz, u.spectral()),
+        uncertainty=VarianceUncertainty(np.deg2rad([3, 2, 1]) ** 2 * u.rad**2),
+    )
+    optic = LinearRetarder(retardance=spectrum, name="film")
+    np.testing.assert_allclose(optic.retardance.value, [100, 120, 140])
+    np.testing.assert_allclose(optic.retardance.std, [1, 2, 3])
+    np.testing.assert_allclose(optic.retardance.wavelength.value, WAVELENGTH.value)
+    grid = [1.3, 1.6, 1.9] * u.um
+    new = optic.resampled(grid)
+    by_wavelength = specutils.Spectrum(
+        flux=optic.retardance.quantity, spectral_axis=optic.retardance.wavelength
+    )
+    expected = LinearInterpolatedResampler()(by_wavelength, grid)
+    np.testing.assert_allclose(new.retardance.quantity, expected.flux)
+    np.testing.assert_allclose(new.retardance.wavelength, grid)
+    np.testing.assert_allclose(new.retardance.std, [1.25, 2, 2.6])
+    assert new.with_parameters(retardance=spectrum).retardance.wavelength[0] == 1.2 * u.um
+    with pytest.raises(WavelengthRangeError, match=r"not at 1\.1 um"):
+        optic.resampled([1.1, 1.2] * u.um)
+    with pytest.raises(ParameterError, match="its wavelengths are not known"):
+        LinearRetarder(retardance=[1, 2] * u.deg).resampled(grid)
+    with pytest.raises(ParameterError, match="masked"):
+        LinearRetarder(
+            retardance=specutils.Spectrum(
+                flux=spectrum.flux, spectral_axis=WAVELENGTH, mask=np.array([True, False, False])
+            )
+        )

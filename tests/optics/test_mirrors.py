@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.materials import GOLD, SILVER, Metal, TabulatedLaw
+from astropolcal.materials import GOLD, SILVER, IsotropicMaterial, TabulatedLaw
 from astropolcal.optics import (
     DiattenuatorRetarder,
     KMirror,
@@ -169,7 +169,7 @@ def test_an_unknown_material_is_refused():
     for cls in [MetalMirror, KMirror]:
         for key in ["material", "film"]:
             law = TabulatedLaw([1.0, 2.5] * u.um, [0.3 + 6j, 1.0 + 16j])
-            stranger = Metal("stranger", law, measured_range=[1.0, 2.5] * u.um)
+            stranger = IsotropicMaterial("stranger", law, measured_range=[1.0, 2.5] * u.um)
             with pytest.raises(ParameterError, match="did you mean 'silver'"):
                 cls(**{key: "silvr"})
             for bad in (stranger, 1.5 + 3j, None, 3):

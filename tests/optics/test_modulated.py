@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from astropolcal import mueller, optics
 from astropolcal.chain import system_mueller
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import _diattenuator
+from astropolcal.mueller import diattenuator
 from astropolcal.optics import (
     COORDINATES,
     OPTICS,
@@ -155,7 +155,7 @@ class Dusty(FrameOptic):
     slope = Parameter(default=0.0, bounds=(-0.3, 0.3), description="diattenuation a radian")
 
     def _matrix(self, coordinate, slope):
-        return _diattenuator(slope * np.asarray(coordinate))
+        return diattenuator(slope * np.asarray(coordinate))
 
     def _derivatives(self, coordinate, slope):
         step = 1e-6

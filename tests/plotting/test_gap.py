@@ -309,25 +309,6 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
 # ---- axes of the other figures -------------------------------------------------------------
 
 
-def test_axis_of_percent():
-    for values, scale, limits in [
-        ([1.0, 4.0], "linear", (0, 4.6)),
-        ([1.0, 6.0], "log", (1 / 1.6, 9.6)),
-        # a wavelength that is masked wholly does not count
-        ([1.0, np.nan, 4.0], "linear", (0, 4.6)),
-        ([0.0, 1.0, 40.0], "log", (1 / 1.6, 64)),
-    ]:
-        axes = Figure().subplots()
-        figures._percent_axis(axes, np.array(values))
-        assert axes.get_yscale() == scale, (values, scale, limits)
-        assert axes.get_ylim() == pytest.approx(limits), (values, scale, limits)
-
-
-def test_plain_numbers_on_a_logarithmic_axis():
-    text = figures._plain((1, 2, 5))
-    assert [text(value, 0) for value in (0.02, 0.1, 5.0, 30.0)] == ["0.02", "0.1", "5", ""]
-
-
 def test_frames_are_named_by_their_derotator_angle():
     for derotator, label, ticks in [
         (np.repeat([45.0, 70.125, 95.0], 4), "frames by derotator angle (deg)", 3),

@@ -374,8 +374,6 @@ def test_values_of_a_law_are_words():
         "many": entry([1.0, 2.0], 0.1),
     }
     assert list(parameters._words(own)) == ["w_sio2 = 1.6500 ± 0.0100 deg", "w_mgf2 = 1.2500 deg"]
-    rows = list(parameters._in_rows(["x" * 30, "y" * 30, "z"]))
-    assert rows == [["x" * 30], ["y" * 30, "z"]]
 
 
 def test_legend_says_how_much_is_open():

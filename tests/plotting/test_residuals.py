@@ -13,13 +13,12 @@ from astropolcal import Observations, calibrate, instruments, optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError, ParameterError, WavelengthRangeError
 from astropolcal.observations.observables import get_observable
-from astropolcal.plotting import plot_double_differences
+from astropolcal.plotting import _style, plot_double_differences
 from astropolcal.plotting.residuals import (
     DataGrid,
     _layout,
-    _limit,
     _looks,
-    _name_groups,
+    _name_axis,
     _scales,
     plot_residuals,
 )
@@ -365,17 +364,6 @@ def test_series_of_a_modulator_name_its_states(modulated_of_data_grid):
     assert all(label.endswith(f", A {MINUS} B") for label in labels)
 
 
-# ---- the model between the data ------------------------------------------------------------
-
-
-def test_a_stage_that_moves_leaves_no_curve(grid):
-    moving = SimpleNamespace(positions={"hwp": np.deg2rad([[0.0, 0.2, 3.0]])})
-    fake = SimpleNamespace(part=moving)
-    assert DataGrid._steady(fake, np.array([True, True, True])) is None
-    steady = DataGrid._steady(fake, np.array([True, True, False]))
-    assert np.rad2deg(steady["hwp"]) == pytest.approx([0.1])
-
-
 # ---- wavelengths ---------------------------------------------------------------------------
 
 
@@ -506,17 +494,18 @@ def test_scale_covers_nearly_all_residuals():
         ([*([0.01] * 999), 5.0], 1.0, True),
         ([0.01, np.nan, -0.01], 1.0, False),
     ]:
-        found, beyond = _limit([grid_of(residual)])
+        found, beyond = _style.color_limit(100 * np.asarray(residual), 99)
         assert found == pytest.approx(limit), (residual, limit, clipped)
         assert beyond == clipped, (residual, limit, clipped)
 
 
 def test_many_groups_have_few_labels():
     n = 30
-    series = [SimpleNamespace(label=f"{i}°") for i in range(9)]
+    parts = np.array_split(np.arange(n), 9)
+    series = [SimpleNamespace(label=f"{i}°", data=data) for i, data in enumerate(parts)]
     grid = SimpleNamespace(derotator=np.arange(n) * 5.0, series=lambda: series)
     axes = Figure().subplots()
-    _name_groups(axes, grid, np.arange(n), np.arange(n), np.arange(1, n + 1))
+    _name_axis(axes, grid)
     assert len(axes.get_xticks()) <= 12
     # more than eight settings of the plate are named by the first and the last
     assert axes.get_xlabel().endswith("0° to 8°")

@@ -199,3 +199,19 @@ def test_unknown_formats_are_refused_before_anything_is_written(tmp_path):
         with pytest.raises(AstropolcalError):
             _style.save(Figure(), tmp_path / name)
         assert not list(tmp_path.iterdir()), name
+
+
+def test_an_axis_is_logarithmic_where_the_values_need_it():
+    for values, scale, limits in [
+        ([1.0, 4.0], "linear", (0, 4.32)),
+        ([1.0, 7.0], "log", (1 / 1.3, 9.1)),
+        # a wavelength that is masked wholly does not count, nor does what is missing
+        ([1.0, np.nan, 4.0], "linear", (0, 4.32)),
+        ([0.0, 1.0, 40.0], "log", (1 / 1.3, 52)),
+    ]:
+        axes = Figure().subplots()
+        _style.scale_axis(axes, np.array(values))
+        assert axes.get_yscale() == scale, (values, scale, limits)
+        assert axes.get_ylim() == pytest.approx(limits), (values, scale, limits)
+        if scale == "log":
+            assert axes.yaxis.get_major_formatter()(0.02, 0) == "0.02"

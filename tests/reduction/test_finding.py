@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reduction_lab import star_image
 
-from astropolcal.reduction.finding import _matches, find_pair
+from astropolcal.reduction.finding import find_pair
 
 SHAPE, OFFSET = (60, 90), (40.0, 12.0)
 
@@ -98,11 +98,3 @@ def test_two_peaks_of_one_image_are_one_star():
     """A double core closer than twice the width is not another star."""
     array = image(*both(), *both(25.0, 20.0, 0.9))
     assert found(array).reason == ""
-
-
-def test_matches_are_all_pairs_at_the_offset():
-    peaks = np.array([[0, 0], [40, 12], [41, 13], [80, 24]])
-    right, left = _matches(peaks, OFFSET, 2.0)
-    assert sorted(zip(right.tolist(), left.tolist(), strict=True)) == [
-        (1, 0), (2, 0), (3, 1), (3, 2),
-    ]  # fmt: skip

@@ -1,6 +1,5 @@
 """``astropolcal challenge``, as a person or a pipeline calls it."""
 
-import argparse
 import json
 import time
 from concurrent.futures import CancelledError
@@ -10,6 +9,7 @@ import pytest
 
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts import _challenge
+from astropolcal.scripts.main import build_parser
 
 SMALL = ["-n", "2", "--kinds", "none", "--wavelengths", "5", "--derotator-angles", "3"]
 
@@ -17,11 +17,9 @@ SMALL = ["-n", "2", "--kinds", "none", "--wavelengths", "5", "--derotator-angles
 @pytest.fixture
 def command():
     """Function that runs the subcommand with arguments."""
-    parser = argparse.ArgumentParser()
-    _challenge.add_parser(parser.add_subparsers())
 
     def call(*arguments):
-        parsed = parser.parse_args(["challenge", *map(str, arguments)])
+        parsed = build_parser().parse_args(["challenge", *map(str, arguments)])
         parsed.run(parsed)
 
     return call

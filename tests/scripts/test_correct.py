@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal correct``."""
 
-import argparse
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,15 +30,14 @@ from astropolcal.scripts._correct import (
     _position_angles,
     choose_calibration,
 )
+from astropolcal.scripts.main import build_parser
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 Q, U = 0.03, -0.02
 
 
 def command(*words):
-    parser = argparse.ArgumentParser()
-    _correct.add_parser(parser.add_subparsers())
-    arguments = parser.parse_args(["correct", *map(str, words)])
+    arguments = build_parser().parse_args(["correct", *map(str, words)])
     arguments.run(arguments)
 
 

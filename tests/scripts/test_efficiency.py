@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal efficiency``."""
 
-import argparse
 import json
 import re
 
@@ -12,16 +11,14 @@ import pytest
 from astropolcal import calibrate, instruments
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
 from astropolcal.plotting import _style
-from astropolcal.scripts import _efficiency
+from astropolcal.scripts.main import build_parser
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NIGHT = "2025-11-03T10:00/2025-11-03T13:00"
 
 
 def run(*argv):
-    parser = argparse.ArgumentParser()
-    _efficiency.add_parser(parser.add_subparsers())
-    arguments = parser.parse_args(["efficiency", *(str(word) for word in argv)])
+    arguments = build_parser().parse_args(["efficiency", *(str(word) for word in argv)])
     arguments.run(arguments)
 
 

@@ -70,5 +70,5 @@ def test_stated_defaults_are_those_of_the_parser(sections):
     ]:
         (row,) = re.findall(rf"^``{option} .*(?:\n {{27}}.*)*", sections[command], re.MULTILINE)
         assert stated in " ".join(row.split()), (command, option, stated)
-        default = COMMANDS[command].get_default(option.strip("-").replace("-", "_"))
+        default = COMMANDS[command]._option_string_actions[option].default
         assert float(re.search(r"\d[\d.e]*", stated).group()) == default, (command, option, stated)

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal reduce``."""
 
-import argparse
 import json
 from types import SimpleNamespace
 
@@ -12,16 +11,14 @@ from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.observations import Observations
 from astropolcal.reduction.cubes import simulate_cubes
-from astropolcal.scripts import _reduce
 from astropolcal.scripts._common import check_paths
 from astropolcal.scripts._reduce import _options, _report
+from astropolcal.scripts.main import build_parser
 from astropolcal.simulation import half_wave_plate_cycles
 
 
 def command(*words):
-    parser = argparse.ArgumentParser()
-    _reduce.add_parser(parser.add_subparsers())
-    arguments = parser.parse_args(["reduce", *map(str, words)])
+    arguments = build_parser().parse_args(["reduce", *map(str, words)])
     check_paths(arguments)
     arguments.run(arguments)
 

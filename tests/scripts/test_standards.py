@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal standards``."""
 
-import argparse
 import json
 
 import astropy.units as u
@@ -11,16 +10,13 @@ from astropy.table import QTable
 from astropolcal import standards
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.observations import pointings
-from astropolcal.scripts import _standards
-from astropolcal.scripts.main import main
+from astropolcal.scripts.main import build_parser, main
 
 NIGHT = ["--site", "subaru", "--night", "2025-11-03"]
 
 
 def call(*argv):
-    parser = argparse.ArgumentParser(prog="astropolcal", exit_on_error=False)
-    _standards.add_parser(parser.add_subparsers())
-    arguments = parser.parse_args(["standards", *argv])
+    arguments = build_parser().parse_args(["standards", *argv])
     arguments.run(arguments)
 
 

@@ -278,7 +278,7 @@ def _check(measurement):
     vector, inside = measurement.vector(), np.clip(measurement.vector(), *measurement.free.bounds())
     # fitters refuse a start that is outside by a rounding error, too
     if (vector != inside).any():
-        measurement.parameters = inside
+        measurement.stand_at(inside)
 
 
 def _run(measurement, weighting, fitter):
@@ -302,12 +302,13 @@ def _run(measurement, weighting, fitter):
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
+    canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:
         # recorded, not shown: whether the fit arrived is told once, in the words of this package
         warnings.simplefilter("always", AstropyWarning)
         try:
             fitter(
-                measurement,
+                canonical,
                 index,
                 observed,
                 weights=weights,
@@ -316,6 +317,7 @@ def _fit(measurement, weighting, fitter):
             )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise FitError(f"{type(fitter).__name__} failed: {error}") from error
+    measurement.stand_at(canonical.vector())
     info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
     said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]
     outside = _outside_bounds(measurement)
@@ -344,12 +346,12 @@ def _joint(measurement, weighting, fitter, search, prepare):
     origin = measurement.vector()
     small, noise = _thinned(measurement, weighting)
     if search:
-        small.parameters = _first_search(small, noise, origin)
+        small.stand_at(_first_search(small, noise, origin))
     prepare(small)
     # branches are found on few frames, so the long table starts from their fit
     if small is not measurement:
         _run(small, noise, fitter)
-        measurement.parameters = small.vector()
+        measurement.stand_at(small.vector())
     for left in reversed(range(_MAX_ROUNDS)):
         outcome, weighting = _run(measurement, weighting, fitter)
         # the last word belongs to the fit of all parameters, not to a search by bin
@@ -360,7 +362,7 @@ def _joint(measurement, weighting, fitter, search, prepare):
         better, moved = search_branches(problem, small.vector(), origin)
         if not moved.any():
             break
-        measurement.parameters = better
+        measurement.stand_at(better)
     return outcome, weighting
 
 
@@ -378,7 +380,7 @@ def _first_search(measurement, weighting, origin):
     found = search_branches(problem, origin)[0]
     if weighting.is_known or not problem.has_priors:
         return found
-    measurement.parameters = found
+    measurement.stand_at(found)
     weighting = weighting.started(measurement)
     problem = BinProblem(measurement, weighting.weight, weighting.level)
     return search_branches(problem, origin)[0]

@@ -247,7 +247,7 @@ def two_step(measurement, weighting, joint, run, options):
             outcomes.append(outcome)
         stages.append(_stage(title, step))
         _copy_values(step.put_back(), measurement.chains)
-    measurement.parameters = measurement.free.start()
+    measurement.stand_at(measurement.free.start())
     return _worst(outcomes), weighting, stages
 
 
@@ -289,7 +289,7 @@ def sequential(measurement, weights, joint, run, options):
         _copy_values(step.put_back(), chains)
         # what this step has found is known for the next ones
         held |= {slot.name for slot in step.free.slots}
-    measurement.parameters = measurement.free.start()
+    measurement.stand_at(measurement.free.start())
     return _worst(outcomes), stages
 
 
@@ -327,7 +327,7 @@ def copy_fitted(origin, target):
         known = target.free.by_name.get(slot.name)
         if known is not None and known.size == slot.size:
             vector[known.slice] = origin.vector()[slot.slice]
-    target.parameters = vector
+    target.stand_at(vector)
 
 
 def _worst(outcomes):
@@ -410,7 +410,7 @@ def settled(problem, weighting, origin):
             break
         vector = moved
         whitened = around(measurement, weighting, vector)
-    measurement.parameters = vector
+    measurement.stand_at(vector)
     return open_parameters(measurement.free, whitened), whitened
 
 
@@ -436,7 +436,7 @@ def hold_silent(measurement, origin):
         if np.abs(measurement.predict(trial) - predicted).max() < _SILENT:
             vector = trial
     if still.any():
-        measurement.parameters = vector
+        measurement.stand_at(vector)
 
 
 def _leaders(free):

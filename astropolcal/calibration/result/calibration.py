@@ -24,6 +24,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
+from astropolcal.words import html
 
 __all__ = ["Calibration"]
 
@@ -486,6 +487,9 @@ class Calibration:
             f"<Calibration of {self.instrument or 'an instrument'} from {names}: "
             f"{len(self.covariance)} free parameters, rank {self.identifiability.rank}{sampled}>"
         )
+
+    def _repr_html_(self):
+        return html(repr(self), self.parameters)
 
 
 # ---- bring a calibration that was read from a file and its observations together again ----

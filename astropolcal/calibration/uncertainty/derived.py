@@ -23,7 +23,12 @@ from astropolcal.chain import (
     system_mueller_derivatives,
     with_beam,
 )
-from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    ChainError,
+    ParameterError,
+    WavelengthRangeError,
+)
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import (
     Diattenuator,
@@ -67,6 +72,8 @@ class Derived:
         For each open direction that moves the quantity, named by its leading
         parameter, the change of the quantity for +1 degree (micrometre,
         percent) of that parameter.
+    wavelength : `~astropy.units.Quantity`, optional
+        Wavelengths of the values, where there is one value per wavelength.
 
     Examples
     --------
@@ -80,6 +87,28 @@ class Derived:
     std: object
     covariance: object
     open_directions: dict = field(default_factory=dict)
+    wavelength: object = None
+
+    def spectrum(self):
+        """
+        Return the quantity as a `~specutils.Spectrum` with standard deviations.
+
+        What the data leave open is masked. An optic takes a spectrum for a parameter.
+        """
+        if np.shape(self.value) != np.shape(self.wavelength) or np.ndim(self.value) != 1:
+            raise ParameterError("a spectrum has one value at each of several wavelengths")
+        from astropy.nddata import StdDevUncertainty
+
+        try:
+            from specutils import Spectrum
+        except ImportError:
+            raise AstropolcalError("spectra need specutils 2, which is not installed") from None
+        return Spectrum(
+            flux=u.Quantity(self.value),
+            spectral_axis=self.wavelength,
+            uncertainty=StdDevUncertainty(u.Quantity(self.std)),
+            mask=~self.is_determined,
+        )
 
     @property
     def is_determined(self):
@@ -269,9 +298,11 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     if not components:
         if not callable(getattr(leaf, "retardance", None)):
             raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
-        return propagate(
+        found = propagate(
             calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
         )
+        found.wavelength = lam
+        return found
     parts, weights = _at_wavelengths(calibration, leaf, components, lam)
     if len(components) == 1:
         value, slopes = parts[0], np.ones((1, *np.shape(lam)))
@@ -279,7 +310,9 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
         value = np.sqrt(np.sum(parts**2, axis=0))
         # d|Delta| / d Delta_k = Delta_k / |Delta|
         slopes = parts / np.where(value > 0, value, 1.0)
-    return _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
+    found = _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
+    found.wavelength = lam
+    return found
 
 
 def derived_efficiency(calibration, wavelength=None, dataset=0):
@@ -327,7 +360,9 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
     (value,), weights = _at_wavelengths(calibration, found[0], ["efficiency"], lam)
     slopes = np.ones((1, *np.shape(lam)))
-    return _of_parameters(calibration, found[0], ["efficiency"], value, slopes, weights)
+    derived = _of_parameters(calibration, found[0], ["efficiency"], value, slopes, weights)
+    derived.wavelength = lam
+    return derived
 
 
 def _at_wavelengths(calibration, leaf, keys, lam):

@@ -181,8 +181,8 @@ def _listed(names):
 
 
 def _fit_without(measurement, vector, out, weights):
-    model = measurement.copy()
-    model.parameters = vector
+    model = measurement.canonical()
+    model.stand_at(vector)
     noise = prior_noise(model, weights)
     index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
     with warnings.catch_warnings():

@@ -1,0 +1,364 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Curves: what an optic or a chain does against the wavelength or against the angle of a stage.
+
+A curve is a model of one input and one output, to be plotted, and to be fitted by any of astropy's
+fitters to what was measured in the laboratory. Its parameters are those of the optics.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.mueller import inverse, turned
+from astropolcal.optics._modelling import SharedParameters
+from astropolcal.optics.core import COORDINATES, finite_position
+from astropolcal.units import canonical_factor, length_to_um, to_unit
+from astropolcal.words import did_you_mean
+
+__all__ = []
+
+_STOKES = ("I", "Q", "U", "V")
+
+
+def curve_of(chain, optics, what, element=None, against="wavelength", wavelength=None, **positions):
+    """Return the curve of an optic or a chain, whose optics are in a list; see `Optic.curve`."""
+    laws = _laws(optics[0]) if len(optics) == 1 else ()
+    if isinstance(what, str) and what in laws:
+        if element is not None or against != "wavelength" or wavelength is not None or positions:
+            raise ParameterError(f"the curve of {what} is one against wavelength, without more")
+        return LawCurve(chain, optics, what)
+    if what == "mueller":
+        if np.shape(element) != (2,) or not {*element} <= {0, 1, 2, 3}:
+            raise ParameterError(
+                f"element = {element!r}; allowed are two numbers from 0 to 3, row and column"
+            )
+        row, column = element
+    elif what in _STOKES or hasattr(what, "frames_per_datum"):
+        row, column = _STOKES.index(what) if what in _STOKES else 0, 0
+    else:
+        known = ["mueller", *_STOKES, *laws]
+        raise ParameterError(
+            f"no curve of {what!r}{did_you_mean(str(what), known)}; there are those of "
+            f"{', '.join(known)} and of an Observable"
+        )
+    observable = what if hasattr(what, "frames_per_datum") else None
+    return LightCurve(chain, optics, (row, column), observable, against, wavelength, positions)
+
+
+def _laws(optic):
+    """Return what an optic has a value of at each wavelength, with the unit."""
+    own = {key: optic._declared(key).unit for key in optic.own_names}
+    return own | optic._laws
+
+
+class Curve(SharedParameters):
+    """What is common to all curves; a subclass works on canonical floats."""
+
+    def __init__(self, chain, optics, input_unit, unit=None):
+        super().__init__()
+        self._chain, self._input_unit, self._unit = chain, input_unit, unit
+        self._plan_for(optics)
+        self._take(optics)
+
+    def _plan_for(self, optics):
+        """Note which number each value of the optics is, and its factor to canonical units."""
+        self._names_of, self._plan = {}, []
+        for i, optic in enumerate(optics):
+            plan = []
+            for key in self._names(optic):
+                factor = canonical_factor(optic._declared(key).unit)
+                if np.size(getattr(optic, key).value) == 1:
+                    plan.append((len(self._names_of), factor))
+                    label = f"{optic.name}_{key}" if optic.name else f"{key}_{i}"
+                    self._names_of[key if len(optics) == 1 else label] = i, key
+                else:
+                    # fitters of astropy take no parameters of several values
+                    plan.append((None, factor))
+            self._plan.append(plan)
+        self._several = any(place is None for plan in self._plan for place, _ in plan)
+
+    def _take(self, optics):
+        self._optics = optics
+        self._adopt({name: (optics[i], key) for name, (i, key) in self._names_of.items()})
+        # what a fitter asks for again: setting an attribute of a model takes astropy a while
+        self._memo = {}
+
+    def _names(self, optic):
+        """Return the parameters of an optic on which the curve depends."""
+        return optic.param_names
+
+    @property
+    def chain(self):
+        """The optic or the chain to which the parameters belong."""
+        return self._chain
+
+    @property
+    def input_units(self):
+        """Unit of the input: micrometre, or degree of the angle of a stage."""
+        return {self.inputs[0]: self._input_unit}
+
+    def __deepcopy__(self, memo):
+        memo[id(self)] = new = self.__class__.__new__(self.__class__)
+        new.__dict__.update(self.__dict__)
+        new._chain = self._chain.copy()
+        new._take(list(new._chain) if len(self._optics) > 1 else [new._chain])
+        return new
+
+    def prepare_inputs(self, x, **kwargs):
+        """Return what `evaluate` takes, as astropy does; refuse an input without its unit."""
+        to_unit(x, self._input_unit, self.inputs[0])
+        return super().prepare_inputs(x, **kwargs)
+
+    def evaluate(self, x, *parameters):
+        """Return the values at ``x``; without units numbers are in the units of the curve."""
+        values = self._values(self._at(x), self._canonical(parameters))
+        return values.reshape(np.shape(x)) / canonical_factor(self._unit)
+
+    @property
+    def fit_deriv(self):
+        """Derivatives to the parameters, or None where a tie would make them wrong."""
+        return None if self.has_tied else self._fit_deriv
+
+    def _fit_deriv(self, x, *parameters):
+        slopes = self._slopes(self._at(x), self._canonical(parameters))
+        out = np.zeros((len(parameters), np.size(x)))
+        for plan, own in zip(self._plan, slopes, strict=True):
+            for (place, factor), slope in zip(plan, own, strict=True):
+                if place is not None:
+                    out[place] = slope * (factor / canonical_factor(self._unit))
+        return out
+
+    def _canonical(self, parameters):
+        """Return the canonical values of each optic, the same object for the same parameters."""
+        # astropy calls with arrays of one, with or without unit, fitters with numbers
+        numbers = [getattr(value, "value", value) for value in parameters]
+        numbers = [value.item() if hasattr(value, "item") else value for value in numbers]
+        known, values = self._memo.get("values", (None, None))
+        if known != numbers:
+            values = [
+                [
+                    factor * (getattr(optic, key).value if place is None else numbers[place])
+                    for key, (place, factor) in zip(self._names(optic), plan, strict=True)
+                ]
+                for optic, plan in zip(self._optics, self._plan, strict=True)
+            ]
+            # arrays are no parameters of the curve, and may be others next time
+            self._memo["values"] = (None if self._several else numbers), values
+        return values
+
+    def _values_at(self, wavelength, values):
+        """Return the values of each optic at the wavelengths, where some have several."""
+        if not self._several:
+            return values
+        found = []
+        for optic, own in zip(self._optics, values, strict=True):
+            # the curve of a law leaves theta out
+            theta = optic.canonical_values()[: len(optic.param_names) - len(own)]
+            full = optic.values_at(wavelength, [np.asarray(value) for value in (*theta, *own)])
+            found.append(full[len(theta) :])
+        return found
+
+    def _at(self, x):
+        """Return what depends on the input alone."""
+        x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
+        x = x.ravel()
+        known, found = self._memo.get("inputs", (None, None))
+        if known is None or not np.array_equal(known, x):
+            found = self._located(x)
+            self._memo["inputs"] = np.array(x, dtype=float), found
+        return found
+
+
+class LawCurve(Curve):
+    """A law in wavelength of one optic, such as its retardance, or one of its parameters."""
+
+    def __init__(self, chain, optics, law):
+        self._law = law
+        super().__init__(chain, optics, u.um, _laws(optics[0])[law])
+
+    def _names(self, optic):
+        # a law is that of the optic in its own frame
+        return optic.own_names
+
+    def _located(self, x):
+        return x, self._optics[0]._dispersion_at(_positive(x))
+
+    def _values(self, place, values):
+        (optic,), (x, dispersion) = self._optics, place
+        (own,) = self._values_at(x, values)
+        if self._law in optic._laws:
+            return getattr(optic, f"_{self._law}")(dispersion, *own) + np.zeros(x.shape)
+        return own[optic.own_names.index(self._law)] + np.zeros(x.shape)
+
+    def _slopes(self, place, values):
+        (optic,), (x, dispersion) = self._optics, place
+        (own,) = self._values_at(x, values)
+        if self._law in optic._laws:
+            return [getattr(optic, f"_{self._law}_slopes")(dispersion, *own)]
+        return [[float(key == self._law) for key in optic.own_names]]
+
+
+class LightCurve(Curve):
+    """
+    What comes out of optics: an element of their Mueller matrix, or an observable of both beams.
+
+    All that light can do is of shape (k, n): k frames a datum, n inputs of the curve.
+    """
+
+    def __init__(self, chain, optics, element, observable, against, wavelength, positions):
+        self._element, self._observable, self._against = element, observable, against
+        self._frames = getattr(observable, "frames_per_datum", 1)
+        self._wavelength = None if wavelength is None else length_to_um(wavelength)
+        self._positions = {
+            stage: finite_position(value, stage)[..., None] for stage, value in positions.items()
+        }
+        self._check(optics)
+        unit = u.um if against == "wavelength" else None if against in COORDINATES else u.deg
+        super().__init__(chain, optics, unit)
+
+    def _check(self, optics):
+        stages = dict.fromkeys(optic.stage for optic in optics if optic.stage)
+        for stage in {self._against, *self._positions} - {"wavelength"}:
+            if stage not in stages:
+                raise ChainError(f"no stage {stage!r}; there are {', '.join(stages) or 'none'}")
+        for stage, position in self._positions.items():
+            if position.shape not in ((1,), (self._frames, 1)):
+                raise ParameterError(
+                    f"{stage} has shape {position.shape[:-1]}; allowed are one position and one "
+                    f"for each frame of a datum, {self._frames}"
+                )
+        if (self._against == "wavelength") and self._wavelength is not None:
+            raise ParameterError("a curve against wavelength is at no single wavelength")
+        if np.ndim(self._wavelength) or not np.all(np.asarray(self._wavelength or 1.0) > 0):
+            raise ParameterError("a curve against a stage is at one positive wavelength")
+        if self._observable is not None and not any(optic.splits_light for optic in optics):
+            raise ChainError("the chain has no beam splitter, so it has no such observable")
+
+    def _take(self, optics):
+        super()._take(optics)
+        # an observable needs the optics of either beam
+        beams = [None] if self._observable is None else ["right", "left"]
+        self._arms = [[_of_beam(optic, beam) for optic in optics] for beam in beams]
+
+    def _located(self, x):
+        wavelength, positions = self._wavelength, dict(self._positions)
+        if self._against == "wavelength":
+            wavelength = _positive(x)
+        else:
+            # what is given of this stage is added
+            positions[self._against] = positions.get(self._against, 0.0) + (
+                x * canonical_factor(self._input_unit)
+            )
+        shifts = [positions.get(optic.stage, optic._position) for optic in self._optics]
+        return wavelength, [
+            (optic._dispersion_at(wavelength), optic.stage_sign * np.atleast_2d(shift))
+            for optic, shift in zip(self._optics, shifts, strict=True)
+        ]
+
+    def _beams(self, place, values):
+        """Return of each beam what happens at its optics, and the light that leaves them."""
+        # a fitter asks for values and derivatives at the same point
+        there, then, beams = self._memo.get("beams", (None, None, None))
+        if there is not place or then is not values:
+            beams = [self._beam(arm, place, values) for arm in self._arms]
+            self._memo["beams"] = place, values, beams
+        return beams
+
+    def _beam(self, arm, place, values):
+        wavelength, places = place
+        light = np.zeros((1, 1, 4))
+        light[..., self._element[1]] = 1.0
+        steps = []
+        values = self._values_at(wavelength, values)
+        for optic, (dispersion, shift), (theta, *own) in zip(arm, places, values, strict=True):
+            dispersion, angle = optic._moved(dispersion, theta, shift)
+            # an angle against a stage is an array, whatever its values
+            phase = np.exp(-2j * angle) if np.size(angle) > 1 or angle else None
+            back = inverse(phase)
+            entered = turned(light, phase)
+            if optic.rotates_frame:
+                light, matrix = entered, None
+            else:
+                matrix = optic._matrix(dispersion, *own)
+                left = _act(matrix, entered)
+                light = turned(left, back)
+                entered = entered, left
+            steps.append((optic, (phase, back), matrix, entered, dispersion, own))
+        return steps, light
+
+    def _values(self, place, values):
+        found = [self._flux(light) for _, light in self._beams(place, values)]
+        return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
+
+    def _flux(self, light):
+        """Return what is measured of the light, (k, 1, n), as observables take it."""
+        shape, flux = (self._frames, self._memo["inputs"][0].size), light[..., self._element[0]]
+        return (flux if flux.shape == shape else np.broadcast_to(flux, shape))[:, None]
+
+    def _slopes(self, place, values):
+        beams = self._beams(place, values)
+        if self._observable is None:
+            return self._slopes_of_beam(beams[0][0])
+        found = [self._flux(light) for _, light in beams]
+        weights = [weight[:, 0] for weight in self._observable.derivative(*found)]
+        parts = [self._slopes_of_beam(steps) for steps, _ in beams]
+        return [
+            [
+                sum(np.sum(w * slope, axis=0) for w, slope in zip(weights, slopes, strict=True))
+                for slopes in zip(*own, strict=True)
+            ]
+            for own in zip(*parts, strict=True)
+        ]
+
+    def _slopes_of_beam(self, steps):
+        """Return the derivatives of the flux of a beam, (k, n)."""
+        row = np.zeros((1, 1, 4))
+        row[..., self._element[0]] = 1.0
+        found = []
+        for optic, (phase, back), matrix, entered, dispersion, own in reversed(steps):
+            if optic.rotates_frame:
+                slopes = [_turning(row, entered)]
+                row = turned(row, back)
+            else:
+                entered, left = entered
+                row = turned(row, phase)
+                inward = _act(np.swapaxes(matrix, -2, -1), row)
+                slopes = [
+                    # T(-theta) M T(theta) by theta, and M by the other parameters
+                    _turning(inward, entered) - _turning(row, left),
+                    *(
+                        _product(row, _act(slope, entered))
+                        for slope in optic._derivatives(dispersion, *own)
+                    ),
+                ]
+                row = turned(inward, back) if len(found) + 1 < len(steps) else None
+            found.append(slopes)
+        return found[::-1]
+
+
+def _positive(wavelength):
+    if not np.all(wavelength > 0):
+        raise ParameterError(f"wavelength = {wavelength} um must be positive")
+    return wavelength
+
+
+def _of_beam(optic, beam):
+    if beam is None or not hasattr(optic, "beam"):
+        return optic
+    copy = optic.copy()
+    copy.beam = beam
+    return copy
+
+
+def _act(matrix, light):
+    return light @ matrix.T if matrix.ndim == 2 else (matrix @ light[..., None])[..., 0]
+
+
+def _turning(row, light):
+    """Return row times the derivative of T(theta) to theta, at theta = 0, times light."""
+    return 2 * (row[..., 1] * light[..., 2] - row[..., 2] * light[..., 1])
+
+
+def _product(row, light):
+    return np.einsum("...i,...i", row, light)
