@@ -473,7 +473,7 @@ def _four_each(value):
 
 
 def _turned(light, angle):
-    """Return T(angle) applied to the light of four sources a frame."""
+    """Return T(angle) applied to the light of four sources per frame."""
     return turned(light, _four_each(np.exp(-2j * angle)) if np.any(angle) else None)
 
 

@@ -19,5 +19,5 @@ def pytest_ignore_collect(config):
 
 @pytest.fixture(autouse=True)
 def _in_empty_folder(tmp_path, monkeypatch):
-    """Run each example in a folder of its own, so that none leaves files behind."""
+    """Run each example in a folder of its own, so that none leaves files there."""
     monkeypatch.chdir(tmp_path)

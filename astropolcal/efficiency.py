@@ -4,7 +4,7 @@
 What a retarder turns into circular polarization is lost for an instrument that measures linear
 polarization only. The efficiency is the degree of linear polarization that a cycle of the
 half-wave plate measures of a source that is completely polarized (McIntosh et al. 2026, Sec. 7.1):
-of the normalized double differences at 0 and 22.5 deg, behind an ideal beam splitter. The
+of the normalized double differences at 0 and 22.5 deg, downstream of an ideal beam splitter. The
 modulation efficiency of the real one does not enter.
 
 Of any sequence of frames, of any polarimeter, `demodulation` gives the modulation matrix, what
@@ -59,7 +59,7 @@ def sky_path(chain):
     )
     train = list(found[next(moving, end) : end])
     if not train:
-        raise ChainError("the chain has no optic on a stage in front of a beam splitter")
+        raise ChainError("the chain has no optic on a stage upstream of a beam splitter")
     if end < len(found) and found[end].theta.value:
         # the frame of a beam splitter that does not stand straight
         train.append(Rotator(theta=found[end].theta.quantity, name="analyser"))
@@ -91,7 +91,7 @@ def polarimetric_efficiency(
     r"""
     Return the degree of linear polarization measured of a completely polarized source.
 
-    For a linear retarder :math:`\Delta` at the angle D behind an ideal half-wave plate it is
+    For a linear retarder :math:`\Delta` at the angle D downstream of an ideal half-wave plate it is
     :math:`\sqrt{\cos^2 2D + \sin^2 2D \cos^2\Delta}`, at all angles of polarization: least at
     45 and 135 deg. Telescope and half-wave plate change that by a few percent.
 
@@ -103,19 +103,19 @@ def polarimetric_efficiency(
         Shape (n_wavelengths,); that of the chain's parameters where these are given per
         wavelength.
     derotator : `~astropy.units.Quantity`, optional
-        Angle of the derotator, whatever its stage is called; needed if there is one. The angles
-        broadcast against each other.
+        Angle of the derotator, regardless of the name of its stage; needed if there is one. The
+        angles broadcast against each other.
     altitude, parallactic : `~astropy.units.Quantity`, optional
         Where the telescope points; needed for a chain from the sky, the altitude only if it
         turns an optic. The half-wave plate then follows the tracking law.
     aolp : `~astropy.units.Quantity` or None
-        Angle of the source's polarization, on sky or behind an internal source; 90 deg, the
+        Angle of the source's polarization, on sky or downstream of an internal source; 90 deg, the
         paper's choice, is -Q. With None the angle that is measured worst.
     instrument : str or Instrument, optional
         Whose half-wave plate it is: its ``sky_law`` is the tracking law. Without it that of
         `~astropolcal.instruments.SkyLaw`.
     mode : str, optional
-        What the derotator keeps still, such as ``"field"``; needed where the law of the plate
+        What the derotator stabilizes, such as ``"field"``; needed where the law of the plate
         depends on it.
     law : (float, float), optional
         Another tracking law of the half-wave plate: factors of parallactic angle and altitude.
@@ -272,7 +272,7 @@ class BestDerotator:
         the wavelengths, at the worst angle of polarization; and ``now``, the same at the first
         moment.
     law : str
-        What the derotator keeps still.
+        What the derotator stabilizes.
 
     Examples
     --------
@@ -312,7 +312,7 @@ def best_derotator(
         Over the observation, shape (n_times,); `~astropolcal.observations.pointing` gives them for
         target, time and site.
     law : str
-        What the derotator keeps still, usually ``"pupil"`` or ``"field"``: one of the modes of the
+        What the derotator stabilizes, usually ``"pupil"`` or ``"field"``: one of the modes of the
         instrument's law.
     offsets : `~astropy.units.Quantity`, optional
         Offsets to try, by default 0 to 179 deg in steps of 1 deg.

@@ -3,7 +3,7 @@
 Every error and warning that astropolcal raises on purpose.
 
 All errors derive from `AstropolcalError`, so that a pipeline can catch
-whatever the package objects to in one clause; each also derives from the
+what the package objects to in one clause; each also derives from the
 builtin that a Python user expects (`ValueError` for a bad value, `KeyError`
 never, because it mangles its message).
 """

@@ -1,12 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Files that appear complete or not at all, and files that may be anything.
+Files that appear complete or not at all, and files that are not trusted.
 
 What is read may come from anywhere. Every reader stands in a door, ``understood``,
-that lets through objects and errors of ours only; YAML is looked at by ``check_yaml``
+that lets through objects and errors of this package only; YAML is looked at by ``check_yaml``
 before any of it is loaded.
 """
 
+import datetime
 import errno
 import os
 import re
@@ -18,6 +19,10 @@ import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.time import Time
 
 from astropolcal.exceptions import AstropolcalError
 
@@ -52,7 +57,7 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     """
     Return the path of a file to write, before the work of writing it is done.
 
-    It is no folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
+    It is not a folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
     content.
     """
     path = Path(path)
@@ -98,7 +103,7 @@ def atomic_path(path, error=AstropolcalError):
 def _named(path, error):
     path = Path(path)
     if not path.name or "\0" in str(path):
-        raise error(f"{str(path)!r}: is no name of a file")
+        raise error(f"{str(path)!r}: is not the name of a file")
     return path
 
 
@@ -153,7 +158,7 @@ def _poured(path):
 
 
 def _is_stream(path):
-    """Return whether a file is no regular one, or is where our own words go."""
+    """Return whether a file is not a regular one, or is where our own words go."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -259,10 +264,10 @@ def check_kind(path, error=AstropolcalError):
 @contextmanager
 def understood(path, error, words, *, reads=True):
     """
-    Turn whatever goes wrong in a reader into one line that names the file and says what it is not.
+    Turn any failure of a reader into one line that names the file and says what it is not.
 
-    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What is
-    no regular file is refused before it is opened, where it is going to be read, see
+    Parsers raise errors of every kind for a damaged file. Errors of this package pass unchanged.
+    What is not a regular file is refused before it is opened, where it is going to be read, see
     ``check_kind``.
     """
     if reads:
@@ -305,12 +310,54 @@ def printable(text):
     )
 
 
+def plain(value, where="value"):
+    """
+    Return a value as JSON knows it: null for a number that is not finite, text for keys and names.
+
+    A quantity has ``value`` and ``unit``. ``where`` is for the message of what JSON cannot hold.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(each, f"{where}.{key}") for key, each in value.items()}
+    if isinstance(value, u.Quantity):
+        return {"value": plain(value.value, where), "unit": str(value.unit)}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(each, f"{where}[{i}]") for i, each in enumerate(value)]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, os.PathLike | datetime.date | Time | u.UnitBase):
+        return one_line(value, None)
+    if value is None or isinstance(value, str | int):
+        return value
+    raise AstropolcalError(
+        f"{where} is a {type(value).__name__}, which JSON cannot hold; allowed are numbers, text, "
+        "dates, paths, units, quantities, arrays, lists and mappings"
+    )
+
+
+_COLUMN_UNITS = {"percent": u.percent, "deg": u.deg, "nm": u.nm}
+
+
+def columns(table, *keys):
+    """Return columns of a table, by default all, as lists by name and unit: ``s_cv_percent``."""
+    found = {}
+    for key in keys or table.colnames:
+        values = np.asarray(table[key])
+        for name, unit in _COLUMN_UNITS.items():
+            if table[key].unit is not None and table[key].unit.is_equivalent(unit):
+                key, values = f"{key}_{name}", table[key].to_value(unit)
+                break
+        found[key] = values.tolist()
+    return found
+
+
 def check_yaml(text, error=AstropolcalError):
     """
     Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.
 
     Links make a document of a kilobyte grow without bounds, loops never end, and a loader that
-    calls itself for each level takes the whole process with it. Nothing is loaded here. What is no
+    calls itself for each level takes the whole process with it. Nothing is loaded here. What is not
     YAML at all raises yaml.YAMLError.
     """
     import yaml

@@ -47,7 +47,7 @@ _NEEDS_MEMORY = (b"\xfd7zXZ",)
 
 @contextmanager
 def readable_fits(path, error=ObservationError):
-    """Turn whatever goes wrong with a FITS file into one line that names it, see ``understood``."""
+    """Turn any failure with a FITS file into one line that names it, see ``understood``."""
     with understood(path, error, "not a readable FITS file"):
         yield
 

@@ -152,7 +152,7 @@ class IsotropicMaterial(_Ranged):
         Law of the index; any object with a method ``_index_um`` that turns
         wavelengths in micrometre into indices n + ik.
     measured_range : `~astropy.units.Quantity`
-        The two ends of the wavelengths of the measurements behind the law.
+        The two ends of the wavelengths of the measurements of the law.
     valid_range : `~astropy.units.Quantity`, optional
         The two ends between which the law is evaluated; the measured range
         if left out.
@@ -197,7 +197,7 @@ class UniaxialMaterial(_Ranged):
     ordinary_law, extraordinary_law : SellmeierLaw
         Laws of the ordinary and the extraordinary index.
     measured_range : `~astropy.units.Quantity`
-        The two ends of the wavelengths of the measurements behind the laws.
+        The two ends of the wavelengths of the measurements of the laws.
     valid_range : `~astropy.units.Quantity`, optional
         The two ends between which the laws are evaluated; the measured range
         if left out. Where it is wider, the material's own documentation says

@@ -44,7 +44,7 @@ class _Node:
 
     def follow(self, frame):
         """
-        Take up the stage angle of the frame in front of the optic; return the one behind it.
+        Add the stage angle of the frame upstream of the optic; return the one downstream of it.
 
         The stages stay where they are in a fit, so that their cosines are worked out once.
         """
@@ -56,7 +56,7 @@ class _Node:
 
     @property
     def moves(self):
-        """Whether the optic turns against the one in front of it from frame to frame."""
+        """Whether the optic turns against the one upstream of it from frame to frame."""
         return np.ndim(self.phase) > 0
 
     def matrix(self, values):
@@ -208,9 +208,10 @@ def _column_count(positions):
 
 def _meeting(common, arms):
     """
-    Return the index of the first optic behind which no optic moves from frame to frame.
+    Return the index of the first optic downstream of which no optic moves from frame to frame.
 
-    It is the splitter where one in front of it moves against it, and None where one behind does.
+    It is the splitter where one upstream of it moves against it, and None where one downstream of
+    does.
     """
     if any(node.per_frame or node.moves for arm in arms for node in arm[1:]) or any(
         arm[0].per_frame for arm in arms
@@ -247,8 +248,9 @@ class Sweep:
         Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
 
         A change of the matrix by E changes the sum by a . E s, with the light s that enters the
-        optic and the analyser row a behind it. Of each ``wanted`` index of an optic in front of
-        the beam splitter: a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic.
+        optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic upstream
+        of the beam splitter: a and s, (n_wavelengths, n_columns, 4) each, in the frame of the
+        optic.
         """
         found = {}
         self.derivatives([(index, _CROSSING) for index in wanted], weights, found)
@@ -261,7 +263,7 @@ class Sweep:
 
         ``wanted`` are pairs, index of the optic and of its parameter, the keys of what is
         returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns).
-        A dictionary ``crossings`` takes up what the method of that name returns.
+        A dictionary ``crossings`` receives what the method of that name returns.
         """
         result = {}
         by_optic = {}
@@ -281,7 +283,7 @@ class Sweep:
 
 
 def _follow(nodes, frame):
-    """Tell every node the stage angle of the frame in front of it; return the last one's."""
+    """Tell every node the stage angle of the frame upstream of it; return the last one's."""
     for node in nodes:
         frame = node.follow(frame)
     return frame
@@ -289,9 +291,9 @@ def _follow(nodes, frame):
 
 def _at(nodes, values, frame):
     """
-    Return the optics of nodes at given values, as steps, and theta of the frame behind them.
+    Return the optics of nodes at given values, as steps, and theta of the frame downstream of them.
 
-    ``frame`` is theta of the frame in front of them.
+    ``frame`` is theta of the frame upstream of them.
     """
     steps = []
     for node in nodes:
@@ -329,7 +331,7 @@ def _enter(steps, light, *, entered=False, keep=True):
 
 
 def _behind(steps, light, keep=True):
-    """Return the light behind all optics, and whether it may be overwritten."""
+    """Return the light downstream of all optics, and whether it may be overwritten."""
     last, light = _enter(steps, light, keep=keep)
     return (light, False) if last is None else (act(last.matrix, light), True)
 
@@ -338,7 +340,8 @@ def _inward(steps, rows=None, phase=None):
     """
     Carry analyser rows, (w, n, 4), to the first optic with a matrix; return them and its phase.
 
-    They come from behind all steps, where light is turned by ``phase``, or from the detector.
+    They come from downstream of all steps, where light is turned by ``phase``, or from the
+    detector.
     """
     for step in reversed(steps):
         if step.matrix is not None:
@@ -351,7 +354,7 @@ def _inward(steps, rows=None, phase=None):
 
 
 def _flux(last, light, shape):
-    """Return the intensity behind the last optic, which no rotation changes."""
+    """Return the intensity downstream of the last optic, which no rotation changes."""
     row = last.matrix[..., 0, :]
     if last.node.per_frame:
         return _whole(np.einsum("wcs,wcs->wc", row, light), shape)
@@ -371,8 +374,8 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
     Carry the adjoint back through ``steps``, adding derivatives to ``result``.
 
     Returns the adjoint, and adjoint and light as they enter the first optic. ``behind`` has such
-    pairs for the optics behind the steps. The product a . G s of a pair is the same on either side
-    of a rotation, so that each is needed at one optic only.
+    pairs for the optics downstream of the steps. The product a . G s of a pair is the same on
+    either side of a rotation, so that each is needed at one optic only.
     """
     for step in reversed(steps):
         wanted = by_optic.get(step.node.index, ())

@@ -82,7 +82,7 @@ def simulate(
         Shape (n_wavelengths,).
     frames : `~astropy.table.QTable`
         One row per frame: the position of every stage (``hwp``, ``derotator``,
-        ...) and whatever else is to stand in the table.
+        ...) and any other column of the table.
     flux : float or array_like
         Flux that enters the chain, in adu; scalar or one value per wavelength.
     lamp : array_like, optional

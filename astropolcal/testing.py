@@ -89,7 +89,7 @@ def check_keyword(column, keyword):
     words = keyword.split(" ")
     known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
     short = len(keyword) <= 8 or len(words) > 1
-    require(known and short, f"{column}: {keyword!r} is no FITS keyword")
+    require(known and short, f"{column}: {keyword!r} is not a FITS keyword")
 
 
 def check_same(source, optic, old, new):
@@ -273,14 +273,14 @@ class Probe:
         if self.instrument.entrance in (own := [leaf.name for leaf in inner]):
             first = own.index(self.instrument.entrance)
         left = [leaf.name for leaf in inner[:first] if leaf.name in names]
-        require(not left, f"{source}: {', '.join(left)} of the source would be in front of a star")
+        require(not left, f"{source}: {', '.join(left)} of the source would be upstream of a star")
         kept = [leaf.name for leaf in inner[first:]]
         lights = [o.name for o in found if isinstance(o, _LIGHTS) and o.name not in kept]
         require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
         words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
         require(names[-len(kept) :] == kept, f"{source}: {words}")
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
-        words = f"no optic in front of {kept[0]} stands on the stage parallactic"
+        words = f"no optic upstream of {kept[0]} stands on the stage parallactic"
         require("parallactic" in front, f"{source}: {words}")
         again = optic_names(self.instrument.on_sky(sky))
         require(again == names, f"{source}: a chain from the sky gets another telescope")
@@ -293,7 +293,7 @@ class Probe:
         for source, chain in self.chains():
             angles = [s for s in stages(chain) if s not in COORDINATES]
             lost = ", ".join(s for s in angles if s not in known)
-            words = f"the stage {lost} is no column of tables and in no keyword; known are "
+            words = f"the stage {lost} is not a column of tables and in no keyword; known are "
             require(not lost, f"{source}: {words}{', '.join(sorted(known))}")
             placed = not is_star(source) or self.instrument.location is not None or not angles
             require(placed, f"{source}: a star needs the site of the telescope")
@@ -463,7 +463,7 @@ RULES = {
     "on sky": "a chain from the sky starts with the telescope, and nothing of the source is in it",
     "mounts": "the position of every stage is a column of tables, or comes from a keyword",
     "headers": "keywords are those of FITS, differ, and are the same in the file layout",
-    "setup": "a table is told source and optics of its chain, and a strange one is refused",
+    "setup": "a table is given source and optics of its chain, and a strange one is refused",
     "published": "published values are within their bounds and physical, and their meta fit",
     "round trip": "every chain is the same after an ASDF file",
     "predicts": "both beams change with the modulator, and positions are those of the frames",

@@ -64,7 +64,7 @@ class _Film(_Medium):
         self.echo = np.exp(self.wave * thickness * self.normal)
 
     def times(self, upper, lower):
-        """Return the tangential fields in front of the film from those behind it."""
+        """Return the tangential fields upstream of the film from those downstream of it."""
         plus, minus = (1 + self.echo) / 2, (1 - self.echo) / 2
         front = plus * upper + minus / self.admittance * lower
         return front, self.admittance * minus * upper + plus * lower
@@ -140,7 +140,7 @@ class _Stack:
         """
         Return the derivatives of `log_ratio`.
 
-        To the incidence (one), to the indices behind the ambient (a list with the substrate
+        To the incidence (one), to the indices downstream of the ambient (a list with the substrate
         last), and to the thicknesses (a list). It is holomorphic in the indices.
         """
         rows = self._rows()
@@ -166,7 +166,7 @@ class _Stack:
         )
 
     def _rows(self):
-        """Return the derivative of the amplitudes to the fields in front of each layer."""
+        """Return the derivative of the amplitudes to the fields upstream of each layer."""
         eta, r = self.ambient.admittance, self.tangential
         # r = (eta E - H) / (eta E + H), by E and by H
         rows = [(eta * (1 - r) / self.total, -(1 + r) / self.total)]
@@ -283,7 +283,7 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
         Material (as ``substrate``) and thickness of each film, the first where the
         light arrives.
     ambient : float
-        Real index in front of the films.
+        Real index upstream of the films.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Words that messages share: near matches of a name, and numbers with their nouns.
+Words that messages share: near matches of a name, numbers with their nouns, and p-values.
 """
 
 import difflib
@@ -10,6 +10,8 @@ __all__ = []
 
 # difflib's own default: from this similarity on, 1 being the same, a name is suggested
 _SIMILAR = 0.6
+# smaller p-values depend on the far wings of a law that nobody knows
+_LEAST_P = 1e-6
 
 
 def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
@@ -34,3 +36,8 @@ def html(text, table=None):
     """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
     shown = "" if table is None else table._repr_html_()
     return f"<p>{escape(text.removeprefix('<').removesuffix('>'))}</p>{shown}"
+
+
+def p_words(value):
+    """Return a p-value as all messages have it: "p = 0.02", or "p < 1e-6"."""
+    return f"p = {value:.2g}" if not value < _LEAST_P else "p < 1e-6"

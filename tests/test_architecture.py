@@ -346,6 +346,35 @@ def test_import_contract_holds():
     )
 
 
+def test_map_shows_contract_and_imports(monkeypatch):
+    if not (REPOSITORY / "docs").is_dir():
+        pytest.skip("the documentation is not here")
+    monkeypatch.syspath_prepend(REPOSITORY / "docs")
+    draw_architecture = importlib.import_module("draw_architecture")
+    page = (REPOSITORY / "docs" / "architecture.rst").read_text(encoding="utf-8")
+    table = re.split(r"^=+ +=+$", page, flags=re.MULTILINE)[2]
+    rows = [re.findall(r"``(\w+)``", line[:38]) for line in table.splitlines()]
+    layers, rooms, core = draw_architecture.contract()
+    names = [name for layer in layers for name in layer]
+    assert sorted(name for row in rows for name in row) == sorted(names), (
+        "docs/architecture.rst: say in its table what each layer of setup.cfg holds"
+    )
+    drawn = draw_architecture.MAP.read_text(encoding="utf-8")
+    assert drawn == draw_architecture.draw(), (
+        "the map is not that of setup.cfg and the imports: run 'python docs/draw_architecture.py'"
+    )
+    for name in [*names, *(room for row in rooms for room in row)]:
+        assert re.search(rf"\b{name}\b", drawn), name
+    assert {"optics", "measurement"} <= core
+
+
+def test_imports_that_others_imply_are_left_out(monkeypatch):
+    monkeypatch.syspath_prepend(REPOSITORY / "docs")
+    draw_architecture = importlib.import_module("draw_architecture")
+    graph = {"a": {"b", "c", "d"}, "b": {"c"}, "c": set(), "d": set()}
+    assert draw_architecture.reduced(graph) == [("a", "b"), ("a", "d"), ("b", "c")]
+
+
 def test_metadata_live_in_one_place():
     # dependencies in both files make setuptools build a wheel without any
     text = (REPOSITORY / "setup.cfg").read_text(encoding="utf-8")

@@ -80,7 +80,7 @@ def test_laws_in_words(pages):
         (1, "one number"),
         (2, "polynomial of degree 1 in wavelength"),
         (4, "polynomial of degree 3 in wavelength"),
-        (22, "one value a wavelength"),
+        (22, "one value per wavelength"),
     ]:
         from astropolcal.gap.problem import law_basis
 
@@ -95,7 +95,7 @@ def test_laws_that_are_no_polynomials(pages):
         "a function of wavelength, times a number"
     )
     assert pages._law(np.sin(np.outer(grid, [7, 9, 11])), True, grid) == "3 functions of wavelength"
-    assert pages._law(None, True, grid) == "one value a wavelength"
+    assert pages._law(None, True, grid) == "one value per wavelength"
     assert pages._law(None, False, grid) == "one number"
 
 

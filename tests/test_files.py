@@ -2,7 +2,9 @@
 """Files appear complete or not at all, and what is read may be anything."""
 
 import contextlib
+import datetime
 import errno
+import json
 import os
 import socket
 import stat
@@ -10,9 +12,13 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
+import astropy.units as u
+import numpy as np
 import pytest
 import yaml
+from astropy.time import Time
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,6 +29,7 @@ from astropolcal.files import (
     check_new,
     check_yaml,
     one_line,
+    plain,
     printable,
     understood,
 )
@@ -462,3 +469,35 @@ def test_immense_yaml_is_refused_before_it_takes_time():
     with pytest.raises(AstropolcalError, match="repeats itself"):
         check_yaml(laughs(40))
     assert time.process_time() - start < 1
+
+
+# --- for machines ---------------------------------------------------------------------------------
+
+
+def test_what_json_knows():
+    for value, expected in [
+        (np.float64(1.5), 1.5),
+        (np.int32(3), 3),
+        (np.bool_(True), True),
+        (np.nan, None),
+        (np.inf, None),
+        (np.array([[1.0, np.nan]]), [[1.0, None]]),
+        ((1, "a", None), [1, "a", None]),
+        (2 * u.deg, {"value": 2.0, "unit": "deg"}),
+        ([1, np.nan] * u.mm, {"value": [1.0, None], "unit": "mm"}),
+        ({"a": {1: np.array([1])}}, {"a": {"1": [1]}}),
+        (u.mm, "mm"),
+        (Path("x\ny"), "x y"),
+        (Time("2025-10-02T03:04:05"), "2025-10-02T03:04:05.000"),
+        (datetime.date(2025, 10, 2), "2025-10-02"),
+    ]:
+        found = plain(value)
+        assert found == expected
+        assert json.loads(json.dumps(found, allow_nan=False)) == expected
+
+
+def test_what_json_cannot_hold_is_named():
+    for value in [{1, 2}, object(), len, b"bytes", 1j]:
+        name = type(value).__name__
+        with pytest.raises(AstropolcalError, match=rf"report\.lamps\[1\] is a {name}, which"):
+            plain({"lamps": [1, value]}, "report")

@@ -602,7 +602,7 @@ def test_no_effect_of_an_optic_that_is_absent():
 
 def test_relay_stands_behind_the_plate_where_there_is_no_derotator():
     named = {effect.name: effect for effect in adapted(EFFECTS.values(), [minimal()])}
-    assert named["static_retarder"].place == "relay behind the half-wave plate"
+    assert named["static_retarder"].place == "relay downstream of the half-wave plate"
     assert "derotator" not in named["mirror_flip"].title
     with_one = adapted([EFFECTS["static_retarder"]], [IRDIS_.chain("polarized")])
     assert with_one == [EFFECTS["static_retarder"]]

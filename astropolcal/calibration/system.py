@@ -7,6 +7,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations.reading import nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 from astropolcal.units import canonical_factor
@@ -58,22 +59,9 @@ class Rows:
         return result
 
     def spread(self, slopes):
-        """Lay derivatives by name, per canonical unit, out over the free parameters on a last axis.
-
-        The first axis is that of the wavelengths; the result is per declared unit.
-        """
+        """Return derivatives to the free parameters on a last axis, see `spread_out`."""
         shape = next(iter(slopes.values())).shape if slopes else self._shape
-        result = np.zeros((*shape, self.free.size))
-        for name, slope in slopes.items():
-            slot, factor, _ = self.free.lookup(name)
-            # tie (own value by the source) and unit (canonical by declared)
-            part = slope * factor * slot.factor
-            if slot.per_wavelength:
-                # w: wavelengths of the data, weighted means of those of the calibration, i
-                result[..., slot.slice] += np.einsum("w...,wi->w...i", part, self._mix)
-            else:
-                result[..., slot.start] += part
-        return result
+        return spread_out(self.free, slopes, shape, self._mix)
 
     def changes(self, gain, n=3, scale=1.0):
         r"""Return how the Stokes parameters that a solution finds change with the free parameters.
@@ -123,7 +111,7 @@ class Rows:
         if value.size != self._mix.shape[1]:
             raise ParameterError(
                 f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
-                "one a wavelength"
+                "one per wavelength"
             )
         return self._mix @ value
 
@@ -159,7 +147,6 @@ def model_error(fit, lam, n=3):
 
 
 _TELESCOPE = ("parallactic", "altitude")
-_SAME_WAVELENGTH = 1e-6
 
 
 def match_wavelengths(grid, chain, wavelength):
@@ -170,10 +157,7 @@ def match_wavelengths(grid, chain, wavelength):
         lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
     except (TypeError, u.UnitConversionError):
         raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
-    # relative, (n_wanted, n_grid)
-    far = np.abs(lam[:, None] - grid) / grid
-    bins = far.argmin(axis=1)
-    off = far.min(axis=1) > _SAME_WAVELENGTH
+    bins, off = nearest_bins(lam, grid)
     if not off.any():
         return lam, bins
     several = [
@@ -197,36 +181,63 @@ def match_wavelengths(grid, chain, wavelength):
     return lam, None
 
 
-def errors(calibration, axes, value, slopes, bins):
-    """Return the factor of the covariance, and which elements are open or blind."""
-    free, shape = free_of(calibration), value.shape
-    factor = np.empty((*shape, len(axes.sigmas)))
-    is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    for w in range(shape[-3]):
-        at = (..., w, slice(None), slice(None))
-        place = None if bins is None else bins[w]
-        slopes_here = _along(free, slopes, at, place, value[at].shape)
-        spread = axes.spread(*axes.along(slopes_here))
-        here = value[at].shape
-        factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
-        is_open[at] = spread.is_open.reshape(here)
-        is_blind[at] = spread.is_blind.reshape(here)
-    return factor, is_open, is_blind
+def spread_out(free, slopes, shape, mix, axis=0):
+    r"""Lay derivatives by name, per canonical unit, out over the free parameters on a last axis.
 
-
-def _along(free, slopes, at, place, shape):
-    """Return derivatives to the flat vector at a wavelength, (n_elements, n_free)."""
-    result = np.zeros((int(np.prod(shape)), free.size))
+    ``axis`` is that of the wavelengths, which are weighted means of those of the calibration, by
+    ``mix`` (n_wavelengths, n_grid). The result, (\*shape, n_free), is per declared unit.
+    """
+    result = np.zeros((*shape, free.size))
     for name, slope in slopes.items():
         slot, factor, _ = free.lookup(name)
         if slot is None:
             continue
-        own = getattr(free.values_of(name), "unit", None)
-        # at one wavelength only its own value of a parameter per wavelength matters
-        column = slot.start + (place if slot.per_wavelength else 0)
-        # per unit of the follower -> canonical -> the source of the tie -> per unit of the source
-        result[:, column] += slope.value[at].ravel() / canonical_factor(own) * factor * slot.factor
+        # tie (own value by the source) and unit (canonical by declared)
+        part = slope * factor * slot.factor
+        if slot.per_wavelength:
+            # w: wavelengths of the data, i: those of the calibration
+            own = np.einsum("w...,wi->w...i", np.moveaxis(part, axis, 0), mix)
+            result[..., slot.slice] += np.moveaxis(own, 0, part.ndim + axis if axis < 0 else axis)
+        else:
+            result[..., slot.start] += part
     return result
+
+
+def per_canonical(free, slopes):
+    """Return derivatives by name per canonical unit, of those per declared unit."""
+    return {
+        name: getattr(slope, "value", slope)
+        / canonical_factor(getattr(free.values_of(name), "unit", None))
+        for name, slope in slopes.items()
+        if free.lookup(name)[0] is not None
+    }
+
+
+def between(lam, grid):
+    """Return the weights of linear interpolation between wavelengths, (n_wanted, n_grid)."""
+    order = np.argsort(grid)
+    rows = np.eye(len(grid))[order]
+    return np.stack([np.interp(lam, grid[order], row) for row in rows.T], axis=1)
+
+
+def errors(calibration, axes, value, slopes, bins):
+    """Return the factor of the covariance, and which elements are open or blind."""
+    free, shape = free_of(calibration), value.shape
+    # where a law gives all wavelengths no parameter has a value at each
+    mix = np.eye(len(calibration.wavelength))[np.zeros(shape[-3], int) if bins is None else bins]
+    slopes = per_canonical(free, slopes)
+    factor = np.empty((*shape, len(axes.sigmas)))
+    is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for w in range(shape[-3]):
+        # at one after the other, as all derivatives at once would be large
+        at = (..., slice(w, w + 1), slice(None), slice(None))
+        here, own = value[at].shape, {name: slope[at] for name, slope in slopes.items()}
+        along = axes.along(spread_out(free, own, here, mix[w : w + 1], -3).reshape(-1, free.size))
+        spread = axes.spread(*along)
+        factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
+        is_open[at] = spread.is_open.reshape(here)
+        is_blind[at] = spread.is_blind.reshape(here)
+    return factor, is_open, is_blind
 
 
 def free_of(calibration):
@@ -252,7 +263,7 @@ def from_first_stage(chain, wanted=None):
 
 
 def split_chain(chain):
-    """Return the optics in front of the first stage of the instrument, and the others."""
+    """Return the optics upstream of the first stage of the instrument, and the others."""
     found = leaves(chain)
     # up to there it is the telescope or the calibration source
     start = next(

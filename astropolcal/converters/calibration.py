@@ -361,7 +361,7 @@ def _check_laws(chains, wavelength):
 
 
 def _check_values(chains, free):
-    """Refuse values that no fit gives, whatever the checksum says."""
+    """Refuse values that no fit gives, regardless of the checksum."""
     for leaf in (leaf for chain in chains for leaf in leaves(chain)):
         for key in leaf.param_names:
             name, parameter = f"{leaf.name}.{key}", getattr(leaf, key)
@@ -394,8 +394,7 @@ def _check_shared(chains, free):
 def _check_covariance(covariance, free):
     _check_names("covariance", covariance.names, free.names)
     # a parameter with one value a wavelength has as many rows of the covariance
-    units = [slot.unit for slot in free.slots for _ in range(slot.size)]
-    for name, unit, expected in zip(free.names, covariance.units, units, strict=True):
+    for name, unit, expected in zip(free.names, covariance.units, free.units, strict=True):
         if unit != expected:
             raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
 
@@ -443,11 +442,11 @@ def _check_fit(fit):
     """Check what a schema does not: what is masked, at odds with the fit, or at a bound."""
     bounds = fit.get("bounds") or {}
     if not _are_bounds(bounds):
-        raise CalibrationFileError("fit.bounds lacks what an error at a bound is told by")
+        raise CalibrationFileError("fit.bounds lacks what an error at a bound is described by")
     _check_sky(fit)
     masked = fit.get("masked") or []
     if not isinstance(masked, list) or not all(isinstance(one, dict) for one in masked):
-        raise CalibrationFileError("fit.masked is no list of reasons, one entry a dataset")
+        raise CalibrationFileError("fit.masked is not a list of reasons, one entry per dataset")
     numbers = ("residual_percent", "sigma", "brightness")
     outliers = fit.get("outliers") or []
     if not isinstance(outliers, list):
@@ -455,7 +454,7 @@ def _check_fit(fit):
     for one in outliers:
         good = isinstance(one, dict) and {"frames", "dataset", *numbers} <= set(one)
         if not good or not all(isinstance(one[key], int | float) for key in numbers):
-            raise CalibrationFileError("fit.outliers lacks what a pair of frames is told by")
+            raise CalibrationFileError("fit.outliers lacks what a pair of frames is described by")
 
 
 def _check_sky(fit):
@@ -489,7 +488,7 @@ def _is_numbers(value):
 
 
 def _are_bounds(bounds):
-    """Return whether errors at bounds, and what hangs on these, are all there."""
+    """Return whether errors at bounds, and what depends on these, are all there."""
     if not isinstance(bounds, dict):
         return False
     inward, released = (bounds.get(key, {}) for key in ("inward", "released"))
@@ -507,7 +506,7 @@ def _are_bounds(bounds):
 def _check_words(calibration, names):
     unknown = sorted(set(calibration.at_bound) - set(names))
     if unknown:
-        raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is no free parameter")
+        raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is not a free parameter")
     for record in calibration.datasets:
         known = _ACCURACY if record.accuracy is None else record.accuracy.colnames
         missing = [name for name in _ACCURACY if name not in known]
@@ -524,13 +523,13 @@ def _check_accuracy(record):
         column = record.accuracy[name]
         if column.dtype.kind not in "iuf" or column.ndim != 1:
             raise CalibrationFileError(
-                f"the accuracy of {record.name}: {name} is no list of numbers"
+                f"the accuracy of {record.name}: {name} is not a list of numbers"
             )
         # s_res, s_mean and s_cv are shares of the light, in percent
         unit = getattr(column, "unit", None) or u.one
         if name.startswith("s_") and not unit.is_equivalent(u.percent):
             raise CalibrationFileError(
-                f"the accuracy of {record.name}: {name} is in {unit}, which is no fraction"
+                f"the accuracy of {record.name}: {name} is in {unit}, which is not a fraction"
             )
     if record.accuracy is not None:
         length = u.Quantity(record.accuracy["wavelength"])

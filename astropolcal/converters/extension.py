@@ -3,7 +3,7 @@
 What ASDF asks astropolcal for: schemas, tags and converters.
 
 ASDF calls `get_extensions` and `get_resource_mappings` whenever any ASDF file is
-opened, so no physics is imported here before a node of ours is read or written.
+opened, so no physics is imported here before a node of this package is read or written.
 """
 
 import re
@@ -68,7 +68,7 @@ def optic_tag(name):
 
 
 class CalibrationConverter(Converter):
-    """Convert calibrations; whatever version was read, the newest is written."""
+    """Convert calibrations; from any version that was read, the newest is written."""
 
     tags = list(CALIBRATION_TAGS)
     types = ["astropolcal.calibration.result.calibration.Calibration"]

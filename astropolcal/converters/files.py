@@ -205,7 +205,7 @@ def _check_nodes(tree, size):
 
 
 def _check_array(node, size):
-    """Refuse arrays that are no plain numbers, or more than the bytes of the file."""
+    """Refuse arrays that are not plain numbers, or more than the bytes of the file."""
     kind, shape = node.get("datatype"), node.get("shape", [])
     if not (isinstance(kind, str) and _NUMBERS.fullmatch(kind)):
         raise CalibrationFileError(f"an array of {one_line(kind)}, plain numbers are allowed")
@@ -222,7 +222,7 @@ def _check_array(node, size):
 
 @contextmanager
 def _speaking_of(path, words, prefix="", reads=True):
-    """Turn whatever goes wrong into one line that names the file."""
+    """Turn anything that goes wrong into one line that names the file."""
     with understood(path, CalibrationFileError, words, reads=reads):
         try:
             yield

@@ -2,8 +2,8 @@
 """
 What nodes are made of: plain values, quantities, tables, priors, posteriors; a checksum.
 
-A prior belongs to a parameter, in whatever chain its optic stands; so the file lists priors by the
-parameter's name, beside the chains. Of a posterior it keeps a part of the samples, and what the
+A prior belongs to a parameter, in any chain in which its optic stands; so the file lists priors by
+the parameter's name, beside the chains. Of a posterior it keeps a part of the samples, and what the
 whole run says of its convergence, its quantiles among it.
 """
 
@@ -113,8 +113,8 @@ def _plain_scalar(value, where):
 def checksum(node, expand=None):
     """Return the SHA-256 of the content of a node, however a file spells it.
 
-    Equal for equal bits, whatever the order of the keys and whether arrays are inline or in blocks.
-    ``expand`` turns any other object into such a node.
+    Equal for equal bits, regardless of the order of the keys and whether arrays are inline or in
+    blocks. ``expand`` turns any other object into such a node.
     """
     # the order of keys in YAML means nothing
     text = json.dumps(_spelled(node, expand), sort_keys=True)
@@ -194,7 +194,7 @@ def _frozen_node(prior, name):
 
 
 def _frozen(node):
-    """Return the distribution of a node; nothing but those of scipy can be named."""
+    """Return the distribution of a node; only those of scipy can be named."""
     import scipy.stats
 
     name = node["distribution"]
@@ -206,7 +206,7 @@ def _frozen(node):
     # scipy looks at the parameters when they are used, and gives NaN for those that cannot be
     low, high = found.support()
     if not low < high:
-        raise ValueError(f"{name} of {node['args']} and {node['kwds']} is no distribution")
+        raise ValueError(f"{name} of {node['args']} and {node['kwds']} is not a distribution")
     return found
 
 
@@ -303,7 +303,7 @@ def check_posterior(posterior, covariance):
         raise CalibrationFileError("posterior: a parameter is named twice")
     for name, unit in zip(posterior.names, posterior.units, strict=True):
         if name not in units:
-            raise CalibrationFileError(f"posterior of {name!r}, which is no free parameter")
+            raise CalibrationFileError(f"posterior of {name!r}, which is not a free parameter")
         if unit != units[name]:
             raise CalibrationFileError(
                 f"posterior of {name} is in {unit}, allowed is {units[name]}"

@@ -65,7 +65,7 @@ def _stored(value, label):
     value = np.array(value, dtype=float)
     if value.ndim > 1 or not np.isfinite(value).all():
         raise CalibrationFileError(
-            f"{label} = {value} must be a finite number, or one a wavelength"
+            f"{label} = {value} must be a finite number, or one per wavelength"
         )
     return value if value.ndim else float(value)
 

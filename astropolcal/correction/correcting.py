@@ -26,6 +26,9 @@ __all__ = ["correct"]
 #: The whole Mueller matrix, or instrumental polarization only.
 MODES = ("stokes", "ip")
 
+# what a result keeps of the solution and of the frames
+_OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
+_OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
 # what a caller can do about frames that do not say enough
 _WAYS = {
     "date": "ScienceFrames(..., date=) states it, any_date=True takes any",
@@ -95,18 +98,18 @@ def correct(
         Whether parameters known at the calibrated wavelengths only are interpolated linearly
         between them; else each wavelength of the frames must be one of the calibrated.
     open_directions : {"infinite", "ignore"} or float
-        Errors along directions that the calibration leaves open: infinite; zero, as if the choice
-        that it made were true; or the standard deviation of the parameter that each direction is
-        named after (``calibration.identifiability.directions``), in degrees of an angle,
-        micrometres of a thickness, percent of anything else. All that cannot be told from it
-        moves along.
+        Errors along directions that the calibration does not determine: infinite; zero, as if the
+        choice that it made were true; or the standard deviation of the parameter that each
+        direction is named after (``calibration.identifiability.directions``), in degrees of an
+        angle, micrometres of a thickness, percent of anything else. All that cannot be
+        distinguished from it moves along.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
         by default that of the instrument, see `~astropolcal.pipeline.load`.
     any_date : bool
-        Take the calibration whatever the date of the frames.
+        Take the calibration regardless of the date of the frames.
     n_samples : int
-        If above zero, systematic errors are those of solving anew for so many samples of the
+        If above zero, systematic errors are those of solving again for so many samples of the
         calibration's posterior, or covariance; else they are linearized.
     seed : int, optional
         Of the samples.
@@ -140,7 +143,7 @@ def correct(
     AstropolcalWarning
         If the frames have no pairs, or some have none, where the calibration fitted pairs; their
         brightness cannot be measured; combinations of Stokes parameters are poorly determined at
-        some wavelengths; the calibration leaves open how they change; or it is old.
+        some wavelengths; the calibration does not determine how they change; or it is old.
 
     Examples
     --------
@@ -179,40 +182,38 @@ def correct(
     estimator(rows, scale=frames.scale, **how)
     frames, unmeasured = _with_brightness(frames, rows, brightness, how)
     solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
-    for words in (*doubts, *unmeasured):
+    for words in (*doubts, *unmeasured, *_weak(solution, frames.wavelength)):
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
-    _warn_of_weak(solution, frames.wavelength)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    n = len(components)
-    source = frames.source
+    division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
+    stokes, covariance = _stokes(frames.source, solution, by_variance, **division)
+    known = {key: getattr(solution, key) for key in _OF_SOLUTION}
+    known |= {key: getattr(frames, key) for key in _OF_FRAMES}
+    return Corrected(
+        stokes=stokes,
+        covariance=covariance,
+        systematic=systematic,
+        mode=mode,
+        observable=observable,
+        provenance=_provenance(calibration, frames, systematic, provenance),
+        **known,
+    )
+
+
+def _stokes(source, solution, by_variance, **division):
+    """Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
+
+    Both have the shape (n, n_wavelengths, *image_shape).
+    """
+    n = len(solution.components)
     # first the components, then their covariances as the engine lays them out
     planes = n + (len(covariance_index(n)) if source.has_variances else 0)
     out = run_blocks(
         partial(correct_block, source, solution, by_variance=by_variance),
         (planes, source.n_wavelengths, *source.image_shape),
-        chunk=chunk,
-        workers=workers,
-        cluster=cluster,
-        progress=progress,
+        **division,
     )
-    return Corrected(
-        components,
-        frames.wavelength,
-        out[:n],
-        out[n:] if planes > n else None,
-        systematic,
-        solution.condition,
-        solution.determined,
-        solution.leakage,
-        solution.weak,
-        mode,
-        observable,
-        frames.unit,
-        frames.north_up,
-        frames.centre,
-        frames.pixel_scale,
-        _provenance(calibration, frames, systematic, provenance),
-    )
+    return out[:n], out[n:] if planes > n else None
 
 
 def _check_choices(mode, weights):
@@ -237,7 +238,8 @@ def _observable(calibration, frames, observable):
             return "intensity", [
                 "the calibration fitted pairs of frames, and these frames have none (half-wave "
                 "plate angles 45 deg apart, hwp=): their intensities are fitted, so that unequal "
-                "gains of the beams, and what the optics behind the half-wave plate polarize "
+                "gains of the beams, and what the optics downstream of the half-wave plate "
+                "polarize "
                 "unknown to the calibration, do not cancel"
             ]
     # of a chain that nobody fitted: what cancels most
@@ -277,17 +279,17 @@ def _rows(model, rows, frames, mode):
     return np.concatenate([rows[..., :1], ideal.rows()[..., 1:]], axis=-1)
 
 
-def _warn_of_weak(solution, wavelength):
+def _weak(solution, wavelength):
+    """Return in words what is poorly determined, if anything is."""
     flags = solution.flags()
-    if flags:
-        first = next(iter(flags))
-        warnings.warn(
-            f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
-            f"at {wavelength[first]:.6g} {flags[first]} (condition "
-            f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
+    if not flags:
+        return []
+    first = next(iter(flags))
+    return [
+        f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
+        f"at {wavelength[first]:.6g} {flags[first]} (condition "
+        f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})"
+    ]
 
 
 def _systematic(model, solution, mode, open_directions, n_samples, seed):
@@ -298,7 +300,8 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     found = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
     if found.is_open:
         warnings.warn(
-            "the calibration leaves open how Q and U turn: their systematic errors are infinite. "
+            "the calibration does not determine how Q and U turn: "
+            "their systematic errors are infinite. "
             "Ways out: a calibration with priors on what is open (calibrate --prior), or "
             "open_directions (--open-directions) 'ignore' or a standard deviation",
             AstropolcalWarning,

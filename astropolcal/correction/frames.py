@@ -311,7 +311,7 @@ class ScienceFrames:
         position_angle, mirrored, order
             As for `from_arrays`.
         left_scale : array_like
-            By what the left beam is multiplied, one number or one a frame.
+            By what the left beam is multiplied, one number or one per frame.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 
@@ -441,8 +441,8 @@ def frame_positions(instrument, table, chain, names=None):
     """
     Return the position of every stage of a chain in each frame, radian, (n_frames,), by name.
 
-    ``table`` has one row a frame with the angles of the headers, and ``flc_state``, A or B, if the
-    chain has a modulator; ``names`` are those of the frames in messages.
+    ``table`` has one row per frame with the angles of the headers, and ``flc_state``, A or B, if
+    the chain has a modulator; ``names`` are those of the frames in messages.
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))

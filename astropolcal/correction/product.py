@@ -223,7 +223,7 @@ def _read(path, hdus):
 
 
 def _table(path, hdu):
-    """Return a table; one of ours has no arrays in a heap, which may claim any length."""
+    """Return a table; one of this package has no arrays in a heap, which may claim any length."""
     heap = [form for form in hdu.columns.formats if "P" in form or "Q" in form]
     if heap:
         raise ObservationError(f"{path}: not a readable product: a column of {heap[0]!r}")
@@ -232,7 +232,7 @@ def _table(path, hdu):
         if table[name].dtype.kind == "c":
             raise ObservationError(f"{path}: not a readable product: {name} is complex")
         if table[name].dtype.kind in "US" and not all(str(text).isascii() for text in table[name]):
-            raise ObservationError(f"{path}: not a readable product: text in {name} is no ASCII")
+            raise ObservationError(f"{path}: not a readable product: text in {name} is not ASCII")
     return table
 
 
@@ -273,7 +273,7 @@ def _check(path, hdus, stokes, codes, table):
     if not np.all(np.isfinite(values) & (values > 0)) or not u.Unit(
         table["wavelength"].unit
     ).is_equivalent(u.um):
-        raise ObservationError(f"{path}: not a readable product: its wavelengths are no lengths")
+        raise ObservationError(f"{path}: not a readable product: its wavelengths are not lengths")
     if "COVSTAT" in hdus and n:
         diagonal = [i for i, (a, b) in enumerate(covariance_index(n)) if a == b]
         if np.any(hdus["COVSTAT"].data[diagonal] < 0):

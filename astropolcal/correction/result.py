@@ -49,7 +49,7 @@ class Corrected:
     leakage : `~numpy.ndarray`
         What each component takes from a V that is taken as zero, (n_wavelengths, n_components).
     weak : list of str
-        The poorly determined combinations in words, one a wavelength; else "".
+        The poorly determined combinations in words, one per wavelength; else "".
     mode, observable : str
         How it was corrected.
     unit : `~astropy.units.UnitBase`
@@ -264,7 +264,7 @@ class Corrected:
         Returns
         -------
         `~astropy.table.QTable`
-            One row a wavelength: I, q, u (and v) with both errors, degree and angle of linear
+            One row per wavelength: I, q, u (and v) with both errors, degree and angle of linear
             polarization with both errors, ``condition``, ``leakage_q`` and ``leakage_u`` (what
             they take from v), ``determined``.
         """
@@ -296,7 +296,7 @@ class Corrected:
         -------
         dict of str to `~specutils.Spectrum`
             ``"I"``, ``"q"``, ``"u"`` (and ``"v"``). The uncertainty is the statistical one; the
-            systematic one, one value a wavelength, stands in ``meta["systematic"]``.
+            systematic one, one value per wavelength, stands in ``meta["systematic"]``.
         """
         try:
             from specutils import Spectrum

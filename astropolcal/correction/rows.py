@@ -13,16 +13,15 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
-from astropolcal.calibration.system import Rows
+from astropolcal.calibration.system import Rows, between, free_of
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
     WavelengthRangeError,
 )
-from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.pointings import plain_states
-from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
@@ -70,8 +69,7 @@ class RowModel(Rows):
         self.calibration = calibration if hasattr(calibration, "covariance") else None
         lam, free = length_to_um(self.wavelength), None
         if self.calibration is not None:
-            grid = len(calibration.wavelength)
-            free = FreeParameters(calibration.chains, grid, calibration.ties)
+            free = free_of(calibration)
         mix = self._mixing(chain, lam, interpolate)
         placed, nodes = _placed(positions, stages(chain))
         super().__init__(chain, lam, placed, free, mix, nodes)
@@ -88,8 +86,7 @@ class RowModel(Rows):
         if not names or self.calibration is None:
             return None
         grid = np.atleast_1d(self.calibration.wavelength.to_value(u.um))
-        nearest = np.abs(lam[:, None] - grid).argmin(axis=1)
-        off = np.abs(lam / grid[nearest] - 1) > SAME_WAVELENGTH
+        nearest, off = nearest_bins(lam, grid)
         if not off.any():
             return np.eye(len(grid))[nearest]
         if not interpolate:
@@ -156,7 +153,6 @@ def _not_calibrated(wavelength, off, grid, names):
 
 def _between(lam, wavelength, grid, names):
     """Return the weights of linear interpolation, and say that there is one."""
-    order = np.argsort(grid)
     beyond = (lam < grid.min() * (1 - SAME_WAVELENGTH)) | (lam > grid.max() * (1 + SAME_WAVELENGTH))
     if beyond.any():
         raise WavelengthRangeError(
@@ -168,8 +164,7 @@ def _between(lam, wavelength, grid, names):
         AstropolcalWarning,
         stacklevel=4,
     )
-    units = np.eye(len(grid))[order]
-    return np.stack([np.interp(lam, grid[order], column) for column in units.T], axis=1)
+    return between(lam, grid)
 
 
 def _placed(positions, wanted):
@@ -214,7 +209,7 @@ def ideal_chain(chain, wavelength):
     Return a chain of perfect optics at the places and angles of those of a chain.
 
     What turns with a stage is a half-wave plate (a derotator of an odd number of mirrors
-    included), a splitter is perfect, and whatever stands still is what it comes closest to: a
+    included), a splitter is perfect, and what is static is what it comes closest to: a
     mirror, a flip of the image, or nothing. Rotations stay.
 
     Parameters

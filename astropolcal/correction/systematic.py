@@ -34,7 +34,7 @@ class Systematic:
         Shape (n_directions, n_wavelengths, n_components, n_components): the last axis is the
         true Stokes vector, the one before what is found.
     open : `~numpy.ndarray` of bool
-        Where the calibration leaves it open how they change, (n_wavelengths, n_components,
+        Where the calibration does not determine how they change, (n_wavelengths, n_components,
         n_components).
     method : str
         ``"linear"`` or ``"sampled"``.
@@ -110,7 +110,7 @@ class Systematic:
 
     @property
     def is_open(self):
-        """Whether something is left open at some wavelength."""
+        """Whether something is not determined at some wavelength."""
         return bool(self.open.any())
 
 
@@ -147,10 +147,11 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
 
 def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stokes"):
     """
-    Return the systematic errors by solving anew for samples of the parameters.
+    Return the systematic errors by solving again for samples of the parameters.
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
-    drawn from its covariance; directions that the calibration leaves open stay where they are.
+    drawn from its covariance; directions that the calibration does not determine stay where they
+    are.
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")

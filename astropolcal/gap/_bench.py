@@ -148,7 +148,7 @@ class Setup:
 
 
 class Bench:
-    """A true instrument, its lamps and its nominal model, fitted to whatever the faults give."""
+    """A true instrument, its lamps and its nominal model, fitted to what the faults give."""
 
     def __init__(self, setup, rng):
         self.setup, self.rng = setup, rng
@@ -237,7 +237,7 @@ class Bench:
         return light[..., 0, 0]
 
     def anchor(self, dataset, place):
-        """Return the optic behind which a place is; the source ends where the first stage is."""
+        """Return the optic upstream of a place; the source ends where the first stage is."""
         if place != "source":
             return place.split(":")[1]
         names = [pair[0].name for pair in self.optics[dataset]]
@@ -491,7 +491,7 @@ class Bench:
             )
 
     def _ends(self, dataset, sweep, place):
-        """Return analyser rows behind a place, light in front of it, and the turn of its frame."""
+        """Return the analyser rows and the light of a place, and the turn of its frame."""
         names = [name for name, _, _ in sweep]
         cut = names.index(self.anchor(dataset, place)) + 1
         light = np.array([1.0, 0, 0, 0])[:, None]
@@ -549,7 +549,7 @@ class Bench:
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def taken_up(self, share):
-        """Return place and kind of a constant cell that the nominal parameters take up."""
+        """Return place and kind of a constant cell that the nominal parameters absorb."""
         jacobian = self._jacobian(self._start)
         taken, found = np.linalg.qr(jacobian)[0], []
         for name, columns in self._cells(self._start):

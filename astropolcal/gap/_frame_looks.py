@@ -415,7 +415,7 @@ def _shifted(difference, log_ratio):
 
 
 def _occam(size, error, between):
-    """Return the cost of a size that may be anything between two, log-uniform, either sign."""
+    """Return the cost of a size that may be any value between two, log-uniform, either sign."""
     density = 1 / (2 * np.log(between[1] / between[0]) * max(abs(size), between[0]))
     return _share(error, 1 / density)
 

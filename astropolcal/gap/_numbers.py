@@ -38,7 +38,7 @@ class Fitted:
         """
         Return the fitted parameters of an added effect, ready for JSON.
 
-        Each is a dictionary of ``value`` and ``std`` (a number, or one a wavelength),
+        Each is a dictionary of ``value`` and ``std`` (a number, or one per wavelength),
         ``unit`` and ``limit``, the largest size that is physical. The errors are those
         of the noise, or of the scatter of the residuals where it is larger.
         """
@@ -70,7 +70,7 @@ class Fitted:
         """
         Return the share of what a cause does that is left in double differences, or None.
 
-        To first order, and less what the rest of the model takes up.
+        To first order, and less what the rest of the model absorbs.
         """
         doubles = self.doubles
         if not self.model.added.get(name) or doubles is None:
@@ -149,7 +149,7 @@ class Fitted:
 
     @cached_property
     def covariance(self):
-        """Covariance of the coefficients, without what the data leave open."""
+        """Covariance of the coefficients, without what the data do not determine."""
         singular, right, scale = self._decomposed
         good = singular > OPEN * singular[0]
         # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
@@ -162,13 +162,13 @@ class Fitted:
 
     @property
     def null(self):
-        """Directions of unit columns that the data leave open, shape (n, n_coefficients)."""
+        """Directions of unit columns that the data do not determine, shape (n, n_coefficients)."""
         singular, right, _ = self._decomposed
         return right[singular <= OPEN * singular[0]]
 
     @property
     def is_open(self):
-        """Which coefficients the data leave open."""
+        """Which coefficients the data do not determine."""
         return np.sum(self.null**2, axis=0) > TOUCHES**2
 
 

@@ -7,12 +7,13 @@ import textwrap
 import numpy as np
 
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
+from astropolcal.words import p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
 _DETERMINED = 0.1
-# smaller probabilities than this are no doubt; above the second the sum of squares alone is not
+# above this probability the sum of squares alone is not
 # conspicuous
-_TINY, _CONSPICUOUS = 1e-6, 0.01
+_CONSPICUOUS = 0.01
 _WIDTH = 80
 # so many causes are named in a sentence, in a title, and in place of another
 _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
@@ -47,13 +48,13 @@ def percent(value, digits=3):
 
 
 def p(value):
-    """Return a probability as short text."""
-    return f"< {_TINY:.0e}".replace("e-0", "e-") if value < _TINY else f"{value:.2g}"
+    """Return a p-value for a column of a table."""
+    return p_words(value).removeprefix("p ").removeprefix("= ")
 
 
 def doubt(value):
-    """Return how sure it is that noise alone does not do it."""
-    return "beyond doubt" if value < _TINY else f"(p = {p(value)})"
+    """Return how probable it is that noise alone does it, in parentheses."""
+    return f"({p_words(value)})"
 
 
 def share(value):
@@ -101,7 +102,7 @@ def shortened(name, width):
 
 
 def sizes(entry):
-    """Return a line a parameter of a cause: its size, its error, how much the data tell of it."""
+    """Return a line per parameter of a cause: its size, its error, how much the data tell of it."""
     pairs = zip(labels(entry), entry["size"].values(), strict=True)
     return [f"{label}: {_size(**size)}" for label, size in pairs]
 
@@ -206,7 +207,7 @@ def title(entry):
 
 
 def own_share(entry):
-    """Return how probable a cause is among its aliases, at whichever of its places."""
+    """Return how probable a cause is among its aliases, regardless of its place."""
     return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
 
 
@@ -370,7 +371,7 @@ def _how_large(content):
 
 def _what_is_left(content):
     if content["verdict"] == "none":
-        return "What is below the noise, or what the parameters take up entirely, does not show."
+        return "What is below the noise, or what the parameters absorb entirely, does not show."
     if not content["causes"]:
         return "Nothing should be added to the model before its cause is known."
     where, part = content["where_left"], content["left_share"]
@@ -397,7 +398,7 @@ def _on_sky(content):
         f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
         for old, new in zip(before[:_TARGETS], after[:_TARGETS], strict=True)
     ]
-    known = " if what the data leave open were known" if "as if" in before[0]["words"] else ""
+    known = " if the undetermined parameters were known" if "as if" in before[0]["words"] else ""
     return (
         "Errors on sky that calibrate claims, with the nominal -> with the improved model"
         f"{known}: {'; '.join(targets)}. --save keeps the improved one."
@@ -450,7 +451,7 @@ def _wrapped(lines):
 
 
 def _table_lines(causes, most):
-    """Return a line a cause: rank, probability, what it explains, what double differences see."""
+    """Return a line per cause: rank, probability, what it explains, what double differences see."""
     if not causes:
         return []
     more = [f"and {len(causes) - most} more"] if len(causes) > most else []

@@ -60,7 +60,7 @@ class Candidate:
     named : Effect or None
         The effect of the library, None for a cell without a name.
     cell : Cell or None
-        Its place, kind and dependence; None where it is no single cell.
+        Its place, kind and dependence; None where it is not a single cell.
     statistic : float
         By how much it lowers chi-square.
     rank : int
@@ -72,7 +72,7 @@ class Candidate:
     spectrum : tuple
         Eigenvalues of its normal equations, what lies along each, and the usual size.
     degree : int or None
-        Degree of the law in wavelength of a cell, None for one value a wavelength.
+        Degree of the law in wavelength of a cell, None for one value per wavelength.
     context : Context or None
         With which a named effect is added, None for that of the data.
     """

@@ -5,8 +5,8 @@ The gap as a perturbation of the chain: place, kind and dependence of a small er
 A small error of any optic is a small Mueller perturbation somewhere in the chain, of some kind,
 with some dependence on the frame. The product of all places, kinds and dependences is a table of
 *cells*. The derivative of the data to a cell is a . G s times a function of the frame, with the
-light s that arrives at the place, the analyser row a behind it and the generator G of the kind:
-light and rows of all places come from one forward and one backward sweep.
+light s that arrives at the place, the analyser row a downstream of it and the generator G of the
+kind: light and rows of all places come from one forward and one backward sweep.
 """
 
 from collections import Counter
@@ -65,13 +65,13 @@ class Cell:
     ----------
     place : str
         ``"source"``, ``"telescope"``, ``"in:OPTIC"`` (the frame that turns with it),
-        ``"after:OPTIC"`` (the frame that stands still) or ``"detector"``.
+        ``"after:OPTIC"`` (the frame that is static) or ``"detector"``.
     kind : str
         Key of `~astropolcal.optics.GENERATORS`, or ``"background"``,
         ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
     dependence : str
         As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of
-        several runs only with ``"/dataset:NAME"`` behind it.
+        several runs only with ``"/dataset:NAME"`` after it.
     """
 
     place: str
@@ -140,10 +140,10 @@ def _place_words(place):
     head, _, optic = place.partition(":")
     if head in ("in", "after"):
         own = {"hwp": "half-wave plate"}.get(optic, optic)
-        return f"of the {own}" if head == "in" else f"behind the {own}"
+        return f"of the {own}" if head == "in" else f"downstream of the {own}"
     return {
-        "source": "of the source, or in front of the first optic that turns",
-        "telescope": "in front of the half-wave plate",
+        "source": "of the source, or upstream of the first optic that turns",
+        "telescope": "upstream of the half-wave plate",
         "detector": "at the detector",
     }[head]
 
@@ -227,7 +227,7 @@ def places(chain):
 
 
 def _mixes(optic):
-    """Whether an optic that stands still makes the place behind it another one."""
+    """Whether an optic that is static makes the place downstream of it another one."""
     kinds = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)
     return optic.stage is None and not optic.splits_light and not isinstance(optic, kinds)
 
@@ -484,7 +484,7 @@ class Probes:
         return np.concatenate([*parts, np.zeros(len(self.problem.known))])
 
     def _left(self, slopes):
-        """Return how much of it the model cannot take up."""
+        """Return how much of it the model cannot absorb."""
         column = self._white(slopes)
         return float(np.linalg.norm(column - self.tangent @ (self.tangent.T @ column)))
 

@@ -188,7 +188,7 @@ def score_answer(case, answer):
         Of ``key.json``.
     answer : dict
         As ``astropolcal diagnose --json`` writes it: ``verdict``, ``causes`` and ``frames``;
-        an empty one is no answer.
+        an empty one is not an answer.
 
     Returns
     -------
@@ -318,14 +318,14 @@ def make_cases(
 def score_cases(folder, outputs):
     """Score the answers of any tool to cases in files."""
     path, records = Path(folder) / "key.json", []
-    with understood(path, GapError, "is no key of challenges"):
+    with understood(path, GapError, "is not a key of challenges"):
         key = json.loads(path.read_text())
         for case in key.values():
             _scored(case, {})
     for index, (name, case) in enumerate(sorted(key.items())):
         answer = Path(outputs) / f"{name}.json"
         if answer.exists():
-            with understood(answer, GapError, "is no answer to a challenge"):
+            with understood(answer, GapError, "is not an answer to a challenge"):
                 records.append({"index": index, **_scored(case, json.loads(answer.read_text()))})
         else:
             records.append({"index": index, **_scored(case, {}), "verdict": "missing"})
@@ -449,7 +449,7 @@ def _journal(path, settings):
         for record in others:
             check_record(record)
     except Exception:  # a damaged line may hold anything
-        raise GapError(f"{path}: is no checkpoint of challenges") from None
+        raise GapError(f"{path}: is not a checkpoint of challenges") from None
     wrong = [key for key in settings if known.get(key) != settings[key]]
     if wrong:
         raise GapError(f"{path}: is of other settings ({', '.join(wrong)}); remove it")

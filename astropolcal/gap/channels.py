@@ -2,8 +2,8 @@
 """
 The two channels in which a model is compared with every frame.
 
-Double differences throw away what the optics behind the half-wave plate and
-the detector leave in the data. Two numbers a frame and wavelength keep nearly
+Double differences throw away what the optics downstream of the half-wave plate and
+the detector leave in the data. Two numbers per frame and wavelength keep nearly
 all of it: the difference normalized by the frame's own sum, which knows no
 lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
 The lamp is common to all wavelengths of a frame: its drift is a smooth curve
@@ -14,11 +14,12 @@ A single beam has the sum only, and of the lamp nothing is known but that the fr
 share its brightness, a number for each wavelength.
 """
 
-import numpy as np
-from scipy.linalg import qr
+from types import SimpleNamespace
 
-from astropolcal.exceptions import FitError
-from astropolcal.observations.quality import MAD_TO_SIGMA
+import numpy as np
+
+from astropolcal.calibration.identifiability.linearized import orthonormal
+from astropolcal.calibration.noise.estimates import by_state, frame_noise
 
 __all__ = []
 
@@ -30,8 +31,6 @@ _LARGEST_COLOR = 2
 _LARGE_FLICKER = 0.1
 # a single beam of fewer standard deviations than this is no datum
 _FAINT = 5.0
-# the share of the frames' freedom that harmonics may take from the measure of the noise
-_MOST_TURNING = 0.7
 
 
 class Channels:
@@ -285,14 +284,6 @@ def _best_degree(sequence, values, seen):
     return degree
 
 
-def _by_state(waves, angles):
-    """Return the waves, and for a modulator with two states those that change sign with them."""
-    state = angles.get("flc_state", np.zeros(1))
-    if np.ptp(state) == 0:
-        return waves
-    return [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
-
-
 def settings(angles, n):
     """
     Return what optics could do to the sums: columns of the plate angle, (F, k).
@@ -310,86 +301,19 @@ def settings(angles, n):
     # last, as the list is cut where frames are few: two columns each, at most a third of the
     # frames
     columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
-    columns = _by_state(columns, angles)[: n // 6]
+    columns = by_state(columns, angles)[: n // 6]
     return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
 
 
 def noise(channel, residual, angles):
-    """
-    Return the noise of every datum: the stated errors, or more where the data say so.
-
-    What optics that stand still or turn can do to a beam is a sum of a few
-    harmonics of the stages' angles, sharp in wavelength or not; everything else
-    is smooth in wavelength. So noise is what is left without either.
-    """
-    sigma = np.sqrt(channel.variance)
-    basis = _turning(angles, channel.valid)
-    if channel.groups is not None:
-        sigma[0] = 1.0
-        residual = np.stack([residual[0], _ungrouped(channel, residual[1])])
-    for i in range(2 - channel.count, 2):
-        rough = _roughness(residual[i], channel.valid, basis)
-        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
-        if not stated.any():
-            if not rough > 0:
-                raise FitError("no errors in the table, and the residuals tell no noise")
-            sigma[i] = rough
-            continue
-        if np.isfinite(rough):
-            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
-        sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
-    return sigma
-
-
-def _ungrouped(channel, residual):
-    """Return residuals of a single beam less the mean of each group."""
+    """Return the noise of every datum, see `frame_noise`; of a single beam less its groups."""
+    if channel.groups is None:
+        return frame_noise(channel, residual, angles)
     lamp = _GroupLamp(channel.groups)
-    return np.where(channel.valid, residual - lamp.mean(residual, channel.valid * 1.0), 0.0)
-
-
-def _turning(angles, valid):
-    """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
-    waves = [np.ones(valid.shape[1], dtype=complex)]
-    for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
-        if stage in angles:
-            turns = [np.exp(1j * k * angles[stage]) for k in orders]
-            waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
-    waves = _by_state(waves, angles)
-    whole = _whole(valid)
-    columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
-    basis = orthonormal(columns * whole[:, None], keep=1e-6)
-    # too few frames would be left to tell the noise
-    return basis if basis.shape[1] <= _MOST_TURNING * whole.sum() else basis[:, :0]
-
-
-def _whole(valid):
-    """Return which frames have a datum at every wavelength, (F,)."""
-    # a wavelength that is masked through the run, as in a band of water, makes no frame incomplete
-    return valid[valid.any(axis=1)].all(axis=0)
-
-
-def _roughness(residual, valid, basis):
-    """Return the scatter of second differences along the wavelengths, per datum."""
-    if len(residual) < 5:
-        return np.nan
-    whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
-    left = np.where(whole, residual, 0.0)
-    left = left - (left @ basis) @ basis.T
-    # white noise of unit variance has second differences of variance 1 + 4 + 1
-    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
-    # what stands still at a wavelength, as its brightness, is no noise
-    second = second - np.median(second, axis=1, keepdims=True)
-    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
-    # projection takes the freedom of its columns from the scatter
-    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
-    # a median, lest a few sharp features of the optics count as noise
-    return float(MAD_TO_SIGMA * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
-
-
-def _roughness_of(sigma, valid):
-    total = np.sqrt((sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2) / 6)
-    keep = valid[:-2] & valid[1:-1] & valid[2:]
-    return float(np.median(total[keep]))
+    level = residual[1] - lamp.mean(residual[1], channel.valid * 1.0)
+    sums = SimpleNamespace(variance=channel.variance[1:], valid=channel.valid)
+    (sigma,) = frame_noise(sums, np.where(channel.valid, level, 0.0)[None], angles)
+    return np.stack([np.ones_like(sigma), sigma])
 
 
 def expected_fluxes(channel, sweep):
@@ -409,16 +333,3 @@ def expected_fluxes(channel, sweep):
     shift = channel.lamp.brightness(shift, certain)
     lamp = np.exp(scale[:, None] + shift)
     return np.stack([right * lamp, left * lamp])
-
-
-def orthonormal(columns, keep=1e-9):
-    """
-    Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
-    """
-    norm = np.linalg.norm(columns, axis=0)
-    columns = columns[:, norm > 0] / norm[norm > 0]
-    if not columns.shape[1]:
-        return np.zeros((len(columns), 0))
-    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
-    size = np.abs(np.diag(triangle))
-    return basis[:, : len(size)][:, size > keep * size[0]]

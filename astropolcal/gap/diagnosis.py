@@ -33,7 +33,7 @@ _SURE, _LIKELY = 0.9, 0.5
 @dataclass
 class Cause:
     """
-    One cause that the model lacked, with what cannot be told from it.
+    One cause that the model lacked, with what cannot be distinguished from it.
 
     Parameters
     ----------
@@ -152,6 +152,8 @@ class Diagnosis:
     frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
     nested: object = None
+    #: What `astropolcal.gap.report.to_dict` has worked out, None before it was asked.
+    content: dict | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def noise_floor_percent(self):
@@ -230,7 +232,7 @@ def diagnose(
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
     nested : bool
-        Whether to choose the causes anew without each group of frames, and predict that with
+        Whether to choose the causes again without each group of frames, and predict that with
         them: the one measure of the shrinkage in which the choice has no part. It takes as many
         times the time as there are groups.
     progress : callable, optional
@@ -270,7 +272,7 @@ def diagnose(
     library = _library(effects)
     _check_instruments(observations)
     if changes and not cells:
-        raise GapError("what changed between runs is told by cells; ask for them, too")
+        raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
     groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")

@@ -5,10 +5,10 @@ Single frames whose data are not what the table says of them.
 A wave plate that did not reach its angle, two frames whose files were exchanged,
 or a beam that was clipped once bends the whole fit, and an optic is blamed for it.
 So frames are looked at first: each is left out in turn, at the cost of one linear
-step (the deletion residual of Cook & Weisberg 1982), and whatever stands out from
+step (the deletion residual of Cook & Weisberg 1982), and what stands out from
 noise and from all other frames is named, taken out, and the search goes on. A gap
 that is in all frames is none of theirs: without the few frames that are named the
-fit must be down to the noise, or nearly all of its excess be gone.
+fit must be down to the noise, or have lost nearly all of its excess.
 """
 
 import copy
@@ -18,8 +18,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
+from astropolcal.calibration.noise.estimates import frame_noise
 from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages
-from astropolcal.gap.channels import noise, settings
+from astropolcal.gap.channels import settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
@@ -88,8 +89,8 @@ def suspect_frames(model):
 
     Those of which only the lamp is off come last. There are none where no frame stands out, or so
     many that the model is at fault and not the frames. Where an optic is missing from the model
-    everywhere, a small fault of one frame cannot be told from it: look again once the optic is in.
-    A single beam, which the next frames have to be compared with, accuses no frame.
+    everywhere, a small fault of one frame cannot be distinguished from it: look again once the
+    optic is in. A single beam accuses no frame, as others of its group would have to tell.
     """
     if any(channel.groups is not None for channel in model.problem.channels):
         return []
@@ -404,7 +405,7 @@ class Search:
         return look.chance < _NOISE and n > 2 and gone < 0.5 * n / self.most
 
     def is_settled(self, places, look):
-        """Return whether what was wrong is gone without some frames."""
+        """Return whether what was wrong is removed without some frames."""
         if not places or len(places) > self.most:
             return False
         marked = {(i, int(f)) for i, out in enumerate(look.out) for f in np.flatnonzero(out)}
@@ -424,7 +425,7 @@ def _noise_of_others(channel, residual, angles, without):
     """Return the noise of every datum, as it is where some frames take no part."""
     others = copy.copy(channel)
     others.valid = channel.valid & ~without
-    sigma, stated = noise(others, residual, angles), np.sqrt(channel.variance)
+    sigma, stated = frame_noise(others, residual, angles), np.sqrt(channel.variance)
     for own, told in zip(sigma, stated, strict=True):
         known = others.valid & np.isfinite(told) & (told > 0)
         if known.any():
@@ -434,7 +435,7 @@ def _noise_of_others(channel, residual, angles, without):
 
 
 def _marked(problem, places):
-    """Return which frames are among some places, one array a dataset."""
+    """Return which frames are among some places, one array per dataset."""
     out = [np.zeros(c.shape[2], dtype=bool) for c in problem.channels]
     for i, f in places:
         out[i][f] = True

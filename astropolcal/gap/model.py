@@ -241,7 +241,7 @@ class Model:
 
         They are within its limits and the bounds of the optics that have them, whose Mueller
         matrices are physical. A parameter that the fit left at its limit at more than one
-        wavelength in ten wants to be beyond it.
+        wavelength in ten needs to be beyond it.
         """
         vector = self.problem.vector(self.fit.coefficients)
         low, high = self.problem.free.bounds()
@@ -265,10 +265,10 @@ class Model:
 
     def keeps_polarization(self, name):
         """
-        Return whether no beam would be negative for some light in front of an effect.
+        Return whether no beam would be negative for some light upstream of an effect.
 
         What makes polarization larger may be a change of an optic that makes it smaller, or of one
-        behind it, but all optics together never measure more than there is.
+        downstream of it, but all optics together never measure more than there is.
         """
         own = {p.name.partition(".")[0] for p in self.added[name]}
         for dataset in self.problem.datasets:

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What to observe next: exposures that answer the questions which a diagnosis leaves open.
+What to observe next: exposures that answer the questions which a diagnosis cannot answer.
 
 Two causes that fit the data alike predict different data elsewhere. Each exposure that the set-ups
 allow is simulated with each cause of an alias group as the truth, and what the others foresee is
@@ -222,7 +222,7 @@ def _in_order(run, order, what):
 
 def plan(diagnosis, candidates=None, limit=4):
     """
-    Return exposures that answer the questions that a diagnosis leaves open, a list of dict.
+    Return exposures that answer the questions that a diagnosis cannot answer, a list of dict.
 
     Keys are ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``;
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
@@ -477,7 +477,7 @@ class Forecast:
         return out / self.scale
 
     def open_directions(self):
-        """Return what the data determine, as few rows, and the directions that they leave open."""
+        """Return what the data determine, as few rows, and the directions that they do not."""
         if not self.problem.size:
             return (np.empty((0, 0)),) * 4
         singular, right, scale = self.model.problem.decomposed(self.model.fit.coefficients)

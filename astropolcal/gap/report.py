@@ -8,6 +8,7 @@ All of them say the same: `to_dict` works it out, and the others show it.
 import base64
 import io
 import warnings
+from copy import deepcopy
 
 import astropy.units as u
 import numpy as np
@@ -16,7 +17,7 @@ from astropy.table import QTable
 from astropolcal import instruments
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
-from astropolcal.files import atomic_path, printable
+from astropolcal.files import atomic_path, plain, printable
 from astropolcal.gap import _numbers, _words, runs
 from astropolcal.gap.planning import plan
 from astropolcal.gap.residuals import locate
@@ -68,6 +69,12 @@ def to_dict(diagnosis):
     >>> content["verdict"], content["n_free"], content["causes"]
     ('none', 17, [])
     """
+    if diagnosis.content is None:
+        diagnosis.content = _worked_out(diagnosis)
+    return deepcopy(diagnosis.content)
+
+
+def _worked_out(diagnosis):
     crossed = bool(diagnosis.held_out)
     # a model with the wrong parity is not worth a fit, and so has no prediction
     exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
@@ -120,7 +127,7 @@ def to_dict(diagnosis):
     names = [o.name for o in diagnosis.improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
-    return _plain(content | {"sentences": words})
+    return plain(content | {"sentences": words})
 
 
 def _nominal(model):
@@ -193,17 +200,6 @@ def _named(one):
     return {"name": one.name, "effect": effect, "title": one.effect.title}
 
 
-def _plain(value):
-    """Turn numpy scalars into plain ones, and what is not finite into None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    # JSON knows neither numpy's numbers nor NaN
-    value = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 # ---- tables --------------------------------------------------------------------------------
 
 
@@ -253,7 +249,7 @@ def causes_table(diagnosis):
 # ---- for the terminal ------------------------------------------------------------------------
 
 
-def summary(diagnosis, content=None, written=()):
+def summary(diagnosis, written=()):
     """
     Return a diagnosis as text of at most 80 columns.
 
@@ -261,8 +257,6 @@ def summary(diagnosis, content=None, written=()):
     ----------
     diagnosis : Diagnosis
         The diagnosis.
-    content : dict, optional
-        What `to_dict` returned for it, if it is known already.
     written : sequence of path-like
         Files that were written.
 
@@ -287,14 +281,13 @@ def summary(diagnosis, content=None, written=()):
     >>> print(summary(diagnose(chain, data)).splitlines()[0])
     The model agrees with the measurements: it lacks nothing that these data show.
     """
-    content = to_dict(diagnosis) if content is None else content
-    return _words.text(content, _about_frames(diagnosis), written)
+    return _words.text(to_dict(diagnosis), _about_frames(diagnosis), written)
 
 
 # ---- a page ------------------------------------------------------------------------------------
 
 
-def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None):
+def write_html(diagnosis, path, *, figures=None, size_figures=None):
     """
     Write a diagnosis as one self-contained page.
 
@@ -309,8 +302,6 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
         become part of the page.
     size_figures : dict of str to `~matplotlib.figure.Figure`, optional
         Figures by the name of an effect, shown with that cause.
-    content : dict, optional
-        What `to_dict` returned for the diagnosis, if it is known already.
 
     Raises
     ------
@@ -346,7 +337,7 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
     environment.filters |= {"title_of": _words.title, "zip": zip}
     images = _images(figures)
     page = environment.get_template("report.html").render(
-        content=to_dict(diagnosis) if content is None else content,
+        content=to_dict(diagnosis),
         datasets=_about(diagnosis),
         frames=_about_frames(diagnosis),
         figures={name: image for name, image in images.items() if name != MAP},

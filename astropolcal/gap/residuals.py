@@ -3,7 +3,7 @@
 Where the gap lies: in which wavelengths, angles, frames, beam and dataset.
 
 The whitened residuals of a fitted model are noise of unit variance, less the
-directions that model and lamp have taken up. What exceeds that is divided in
+directions that model and lamp have absorbed. What exceeds that is divided in
 two ways. *Patterns* are functions of an axis (a harmonic of an angle, a trend,
 a product of two), with a law in wavelength that is smooth or, as a pair with
 the wavelength, free: they are taken in one after the other, the most telling

@@ -36,7 +36,7 @@ def distinct(observations, changes=False):
     sources = [o.source for o in observations]
     if changes and len(set(sources)) == len(sources):
         raise GapError(
-            "what changed can be told between runs of the same kind of source only; given: "
+            "what changed can be determined between runs of the same kind of source only; given: "
             + ", ".join(f"{o.name} ({o.source or 'no source stated'})" for o in observations)
         )
     names, found = set(), []
@@ -61,7 +61,7 @@ def changes(diagnosis, causes):
     Return the causes that are in one of several runs only, a list of dict.
 
     Keys are ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
-    ``probability``, ``brought_by`` (optics that only this run has, in front of the place) and
+    ``probability``, ``brought_by`` (optics that only this run has, upstream of the place) and
     ``words``; the most probable first, and among these the most significant.
     """
     if not causes or count_runs(diagnosis.improved.problem) < 2:
@@ -106,7 +106,7 @@ def _run_of(cell, names, chains):
 
 
 def _brought(cell, run, names, chains):
-    """Return the optics that only a run has, at or in front of the place of a cell."""
+    """Return the optics that only a run has, at or upstream of the place of a cell."""
     mine = [
         optic.name
         for optic in chains[names.index(run)]
@@ -148,7 +148,8 @@ def paragraph(content, names, asked=False):
         optics = dict.fromkeys(name for one in brought for name in one["brought_by"])
         many = f"{len(brought)} of the changes are" if len(brought) > 1 else "One change is"
         words.append(
-            f"{many} at or behind what only one run has ({listed(list(optics))}): that may have "
+            f"{many} at or downstream of what only one run has ({listed(list(optics))}): "
+            "that may have "
             "brought them."
         )
     return words

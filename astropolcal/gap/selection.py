@@ -70,7 +70,7 @@ _LEFT = 0.1
 @dataclass
 class Group:
     """
-    One cause, with all that cannot be told from it.
+    One cause, with all that cannot be distinguished from it.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def _possible(base, best, scans):
 
 def _checked(base, best, groups, say):
     """
-    Return the set without causes that left-out frames speak against.
+    Return the set without causes that left-out frames contradict.
 
     With it, what is left with one cause more each, and the errors on left-out frames.
     """
@@ -237,7 +237,7 @@ def _checked(base, best, groups, say):
 
 
 def _worse(best, steps, history, groups):
-    """Return the numbers of causes that are impossible, or that left-out frames speak against."""
+    """Return the numbers of causes that are impossible or contradicted by left-out frames."""
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
     if impossible or groups is None:
         return impossible[-1:]
@@ -257,7 +257,7 @@ def _worse(best, steps, history, groups):
 
 
 def _worsens(after, before, scatter):
-    """Whether frames that were left out of the fit speak against a cause."""
+    """Whether frames that were left out of the fit contradict a cause."""
     better = after.better_than(before)
     # among noise the evidence is to be trusted; among structure it has to hold elsewhere too
     return better < (-2.0 if scatter < _STRUCTURED else 0.0)
@@ -519,8 +519,9 @@ def _unlisted(base, best):
     """
     Return the probability that the gap has a cause that no table has.
 
-    A remainder of probability p speaks for it by a Bayes factor of at most -1/(e p ln p) (Sellke,
-    Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger its share is.
+    A remainder of probability p is evidence for it by a Bayes factor of at most -1/(e p ln p)
+    (Sellke, Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger its share
+    is.
     """
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))

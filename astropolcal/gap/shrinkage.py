@@ -14,11 +14,10 @@ import numpy as np
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.model import Linear
+from astropolcal.observations.quality import clusters, runs_of_frames
 
 __all__ = []
 
-# degree; angles that differ by less are one group
-_SAME_ANGLE = 0.5
 # next to the solution of all frames the fit to most of them takes few steps
 _STEPS, _SHARE = 8, 1e-5
 # singular values below this share of the largest belong to directions that are open
@@ -40,7 +39,7 @@ class HeldOut:
         What was left out.
     squares : `~numpy.ndarray`
         Sum of squared prediction errors of the normalized single difference,
-        one a group.
+        one per group.
     whitened : `~numpy.ndarray`
         Half the sum of squares of the whitened prediction errors of both channels.
     counts : `~numpy.ndarray`
@@ -93,16 +92,15 @@ def frame_groups(observations):
     Fewer than three groups are refused: a derotator angle each, or blocks in time.
     """
     if all("derotator" in o.frames.colnames for o in observations):
-        angles = [np.rad2deg(o.position("derotator")) for o in observations]
-        rounded = [np.round(a / _SAME_ANGLE) for a in angles]
-        kinds = np.unique(np.concatenate(rounded))
+        angle = np.concatenate([o.position("derotator") for o in observations])
+        number = clusters(angle)
+        count = number.max() + 1
         # an angle that moves from frame to frame would make every frame a group
-        several = len(kinds) < sum(map(len, rounded)) / 2
-        if several and len(kinds) >= 3:
-            every = np.concatenate(rounded)
-            middle = [np.concatenate(angles)[every == k].mean() for k in kinds]
+        if 3 <= count < len(number) / 2:
+            middle = np.rad2deg(np.bincount(number, angle) / np.bincount(number))
             labels = [f"derotator at {value:g} deg" for value in np.round(middle, 1)]
-            return labels, [np.searchsorted(kinds, r) for r in rounded]
+            ends = np.cumsum([o.n_frames for o in observations])[:-1]
+            return labels, np.split(number, ends)
     return _blocks(observations)
 
 
@@ -116,7 +114,7 @@ def _blocks(observations, count=8):
             "three derotator angles, or twelve frames, are the least"
         )
     labels = [f"frames {i + 1} of {count}" for i in range(count)]
-    return labels, [np.arange(o.n_frames) * count // o.n_frames for o in observations]
+    return labels, [runs_of_frames(o.n_frames, count) for o in observations]
 
 
 def held_out(model, groups):

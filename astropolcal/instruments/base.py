@@ -65,7 +65,7 @@ class SkyLaw:
     ----------
     plate : (float, float) or dict of str to (float, float)
         (f, g) of the half-wave plate; (0, 0) for one that stays where it is put. Where it depends
-        on what the derotator keeps still, one for each mode, such as ``"field"`` and ``"pupil"``.
+        on what the derotator stabilizes, one for each mode, such as ``"field"`` and ``"pupil"``.
         Without it that of Subaru, (0.5, 1).
     derotator : dict of str to (float, float)
         (f, g) of the derotator for each mode; empty where there is none. Without it that of a
@@ -113,7 +113,7 @@ class SkyLaw:
 
     @property
     def modes(self):
-        """What the derotator may keep still, or what the law of the plate depends on."""
+        """What the derotator may stabilize, or what the law of the plate depends on."""
         return tuple(self.derotator) or tuple(mode for mode in self.plate if mode)
 
     @property
@@ -126,7 +126,7 @@ class SkyLaw:
         """
         Return the factors of parallactic angle and altitude in the plate's true angle.
 
-        The ``mode``, what the derotator keeps still, is needed where the law depends on it.
+        The ``mode``, what the derotator stabilizes, is needed where the law depends on it.
         """
         if mode is not None and self.modes:
             check_choice("mode", mode, self.modes)
@@ -168,8 +168,8 @@ def add_nuisance(chains, datasets, nuisance):
     flux, one value per wavelength. ``"beam_gain"``, half the relative difference of the gains
     of the two beams, one value per wavelength; normalized double differences see it in second
     order only, single differences in first. ``"lamp"``, q and u of an internal source without
-    polarizer, for all wavelengths; q cannot be told from the diattenuation of a mirror that
-    stands straight, except by the prior.
+    polarizer, for all wavelengths; q cannot be distinguished from the diattenuation of a mirror
+    that stands straight, except by the prior.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ class Instrument(ABC):
     sources : tuple of str
         What may send the light; empty where the chain is the same for all.
     optional_optics : tuple of str
-        Optics that are in the beam only now and then.
+        Optics that are in the beam only sometimes.
     files : FileLayout or None
         How the instrument's FITS files look; None if they cannot be reduced here.
     references : tuple of str
@@ -432,7 +432,7 @@ class Instrument(ABC):
 
     def chains_for(self, datasets, *, nuisance=(), exact=False, **options):
         """
-        Return one chain a dataset, all on the common wavelength grid.
+        Return one chain per dataset, all on the common wavelength grid.
 
         Parameters
         ----------
@@ -477,7 +477,7 @@ class Instrument(ABC):
 
         Parameters
         ----------
-        behind : list of Optic
+        downstream of : list of Optic
             The optics from the half-wave plate on, whose wavelengths the telescope must have.
         **options
             Particular to the instrument, see ``sky_options``.
@@ -613,7 +613,7 @@ class Instrument(ABC):
         Parameters
         ----------
         observations : Observations
-            Where the law depends on what the derotator keeps still, ``tracking`` in its meta
+            Where the law depends on what the derotator stabilizes, ``tracking`` in its meta
             names that.
 
         Returns

@@ -149,8 +149,8 @@ class CHARIS(Instrument):
         source : str
             ``"polarized"`` or ``"unpolarized"``: internal source with or without its
             polarizer; without it the fold mirror's diattenuation is a free parameter for each
-            wavelength. ``"unpolarized standard star"``: a star of zero polarization, behind the
-            telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
+            wavelength. ``"unpolarized standard star"``: a star of zero polarization, downstream of
+            the telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
             q and u are free parameters for each wavelength, in the frame of the sky.
         optics_in : sequence of str
             Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip)
@@ -163,7 +163,7 @@ class CHARIS(Instrument):
             mirrors with films of silica: their thickness and factors on n and k of silver are
             free, the factors with normal priors of 0.5 and 0.1 around 1.
         bounds : {"physical", "paper"}
-            Retardances within one turn of either sign, or within the paper's
+            Retardances within 360 deg of zero, or within the paper's
             bounds (0 to 360 deg in the published signs). Either way
             thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
             within 5 deg, efficiencies between 0 and 1.

@@ -4,8 +4,8 @@ VLT/SPHERE/IRDIS, near-infrared dual-beam imaging polarimeter.
 
 The chain and its values are those of van Holstein et al. (2020): the mirrors M1 to M3 of the
 Unit Telescope as one optic, M4, half-wave plate, derotator, and the pair of polarizers. A
-wavelength stands for one of the four broadband filters. The telescope's mirrors were coated
-anew on 2017-04-16; diattenuations are known before and after.
+wavelength stands for one of the four broadband filters. The telescope's mirrors were
+recoated on 2017-04-16; diattenuations are known before and after.
 
 Beams have the names of the halves of the detector. The left one passes +Q, so single
 differences here, right minus left, have the opposite sign of the published ones.
@@ -364,7 +364,7 @@ class IRDIS(Instrument):
     )
     sources = (*INTERNAL, *STARS)
     sky_options = ("wavelength", "date")
-    changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were coated anew"),)
+    changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were recoated"),)
     #: Names of the filters with coefficients, in the order of ``wavelength``.
     filters = FILTERS
     #: What keeps the direction of polarization that is measured fixed to the image.
@@ -399,7 +399,7 @@ class IRDIS(Instrument):
             ``"polarized"``: internal source with its polarizer, whose angle is free.
             ``"unpolarized"``: without it; q and u of the light that reaches the half-wave plate
             are free, one per filter. ``"unpolarized standard star"``,
-            ``"polarized standard star"`` or ``"star"``: behind telescope and M4.
+            ``"polarized standard star"`` or ``"star"``: downstream of telescope and M4.
         optics_in : sequence of str
             Nothing is optional here.
         wavelength : `~astropy.units.Quantity`, optional
@@ -456,7 +456,7 @@ class IRDIS(Instrument):
 
         Parameters
         ----------
-        behind : list of Optic
+        downstream of : list of Optic
             The optics from the half-wave plate on.
         wavelength : `~astropy.units.Quantity`, optional
             Filters of the chain by their central wavelengths; needed if it is not of all four.

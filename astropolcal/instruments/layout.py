@@ -144,7 +144,7 @@ class FileLayout:
         writes files of its own. The shape, and all places, are then those of both images side by
         side, the left one first.
     weights : {"inverse variance", "error"}
-        What the extension behind the cube holds.
+        What the extension after the cube holds.
     states : dict of str to str
         Value of the ``flc_state`` keyword to state of the modulator, "A" or "B"; "" for none.
     read_outs : dict of str to ReadOut
@@ -363,7 +363,11 @@ def frame_time(header, layout):
 
     A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
     """
-    mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
+    return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
+
+
+def time_of(mjd=None, date=None, clock=None):
+    """Return the time (UTC) that a number of days, or a date and a time of day, state, or None."""
     if mjd is not None:
         return in_calendar(Time(plain_number(mjd), format="mjd", scale="utc"))
     if date is None:

@@ -58,8 +58,8 @@ def tertiary_mirror(model, wavelength, name="m3"):
     """
     Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
 
-    ``"free"``: one free diattenuation per wavelength; the retardance, of which an unpolarized star
-    tells nothing, is fixed at that of the published law. ``"power law"``: the paper's
+    ``"free"``: one free diattenuation per wavelength; the retardance, which an unpolarized star
+    does not constrain, is fixed at that of the published law. ``"power law"``: the paper's
     permittivity, four free numbers for all wavelengths. ``"metal"``: silver with a film of silica;
     its thickness and factors on n and k are free, the factors with normal priors of 0.5 and 0.1
     around 1. All are ``mounted``.
@@ -228,7 +228,7 @@ def _check_standard(source, target):
                 f"{target} as a polarized standard star: {error}; with the source 'star' its "
                 "polarization is fitted without a prior"
             ) from error
-        words = f"{error}; it is unpolarized because the table says so"
+        words = f"{error}; it is unpolarized according to the table"
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
         return
     if not source.startswith(known.kind):
@@ -274,7 +274,7 @@ _THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
 #: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
 CHANGES = (
     (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
-    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was coated anew"),
+    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was recoated"),
 )
 
 

@@ -316,9 +316,9 @@ class VAMPIRES(Instrument):
         source : str
             ``"polarized"`` or ``"unpolarized"``: with or without the polarizer; without it the
             fold mirror's diattenuation is a free parameter for each wavelength.
-            ``"unpolarized standard star"``: a star of zero polarization, behind the telescope's
-            tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's q and u are
-            free parameters for each wavelength, in the frame of the sky.
+            ``"unpolarized standard star"``: a star of zero polarization, downstream of the
+            telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's q
+            and u are free parameters for each wavelength, in the frame of the sky.
         optics_in : sequence of str
             ``"flc"`` where the liquid crystal is in the beam.
         wavelength : `~astropy.units.Quantity`, optional
@@ -419,7 +419,7 @@ class VAMPIRES(Instrument):
         return source, ("flc",) if _is_modulated(observations) else ()
 
     def meta_without(self, names):
-        """Return what a liquid crystal leaves behind: no states by which frames are paired."""
+        """Return what a liquid crystal leaves: no states by which frames are paired."""
         return {"flc": "out", "pairing": "hwp"} if "flc" in names else {}
 
     def prepare(self, observations):

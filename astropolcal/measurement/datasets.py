@@ -11,7 +11,7 @@ from astropolcal import instruments
 from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
 from astropolcal.observations.pointings import plain_states
-from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator, splits
 
@@ -46,7 +46,7 @@ class Dataset:
         self.observable = observable
         self.n_free = free.size
         # indices of this dataset's wavelengths on the grid common to all, (n_wavelengths,)
-        self.bins = _bins_on_grid(observations, wavelength)
+        self.bins = bins_on_grid(observations, wavelength)
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)
@@ -233,19 +233,6 @@ def _check_fit(chain, observations, observable):
                 f"{name}: {column} = {', '.join(strange)} in the table; the chain knows "
                 f"{', '.join(states)}"
             )
-
-
-def _bins_on_grid(observations, wavelength):
-    own = observations.wavelength.to_value(u.um)
-    # (n_own, n_grid)
-    nearest = np.abs(own[:, None] - wavelength[None, :]).argmin(axis=1)
-    off = np.abs(wavelength[nearest] - own) > SAME_WAVELENGTH * own
-    if off.any():
-        raise ObservationError(
-            f"{observations.name}: wavelength {own[off][0] * 1e3:.3f} nm is not on the grid of the "
-            f"parameters (nearest {wavelength[nearest][off][0] * 1e3:.3f} nm)"
-        )
-    return nearest
 
 
 def _positions(chain, observations, positions):

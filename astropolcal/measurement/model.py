@@ -316,7 +316,7 @@ class Measurement(FittableModel):
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def evaluate(self, x, *parameters):
-        """Return the predicted data of index ``x``; behind the data come the priors."""
+        """Return the predicted data of index ``x``; after the data come the priors."""
         vector = _numbers(parameters) * self._factors
         return self._pick(self.predict(vector), x, self.free.prior_residuals, vector)
 
@@ -342,7 +342,7 @@ class Measurement(FittableModel):
 
     def fit_arguments(self, weights=None, noise=1.0, keep=None):
         """
-        Return what a fitter takes: index, data and weights, with the priors as data behind them.
+        Return what a fitter takes: index, data and weights, with the priors as data after them.
 
         ``weights`` of the data may be None for equal ones, ``noise`` is the standard deviation of
         a datum of weight one, which sets how much a prior weighs against the data, and ``keep`` is

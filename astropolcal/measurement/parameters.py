@@ -148,7 +148,7 @@ class FreeParameters:
 
     Refused are shapes that do not fit the common grid of ``n_wavelengths``, parameters that are
     free in one chain and fixed in another, ties that are circular or unknown, and astropy's
-    callable ``tied``, which spoils analytic Jacobians.
+    callable ``tied``, which corrupts analytic Jacobians.
     """
 
     def __init__(self, chains, n_wavelengths, ties=None):
@@ -252,6 +252,11 @@ class FreeParameters:
             for slot in self.slots
             for i in range(slot.size)
         ]
+
+    @property
+    def units(self):
+        """Declared units of the elements, None for what has none."""
+        return [slot.unit for slot in self.slots for _ in range(slot.size)]
 
     def start(self):
         """Return the current values of the chains as one vector."""

@@ -75,9 +75,9 @@ class Grid:
 
 def build_grid(table, label):
     """
-    Check a table of observations (one row a frame and wavelength) and sort it into a `Grid`.
+    Check a table of observations (one row per frame and wavelength) and sort it into a `Grid`.
 
-    ``label`` is the file or name for messages. Cells that are masked give one warning a reason.
+    ``label`` is the file or name for messages. Cells that are masked give one warning per reason.
     """
     if isinstance(table, Table) and len(table):
         table = beams_as_frames(check_table(table, label, ()), label)
@@ -205,7 +205,7 @@ def _check_cells(cell, frame, bins, shape, label):
         before = int(np.argmax(cell == cell[row]))
         raise ObservationError(
             f"{label}, row {row + 1}: frame = {frame[row]}, bin = {bins[row]} is given already in "
-            f"row {before + 1}; one row a frame and bin is allowed"
+            f"row {before + 1}; one row per frame and bin is allowed"
         )
     if shape[0] * shape[1] > max(_MAX_EMPTY, 20 * len(cell)):
         raise ObservationError(
@@ -225,7 +225,7 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
         raise ObservationError(
             f"{label}, row {row + 1}: wavelength = {wavelength[row]:.9g} {unit} in bin "
             f"{bins[row]}, other rows of this bin have {by_bin[bin_index[row]]:.9g} {unit}; "
-            "one a bin is allowed"
+            "one per bin is allowed"
         )
     order = np.argsort(by_bin)
     # two bins of one wavelength would count every photon twice in a fit
@@ -273,7 +273,7 @@ def _check_constant(column, name, reference, frame, label):
         value, other = (" ".join(str(column[i]).split()) for i in (row, reference[row]))
         raise ObservationError(
             f"{label}, row {row + 1}: {name} = {value} in frame {frame[row]}, but {other} in row "
-            f"{reference[row] + 1}; one value a frame is allowed"
+            f"{reference[row] + 1}; one value per frame is allowed"
         )
 
 
@@ -408,9 +408,9 @@ def beam_variances(flux_right, flux_left, errors):
 
     ``errors`` are standard deviations under the names of `BEAM_ERRORS` or `SINGLE_ERRORS`; none
     give NaN. With S = R + L and D = R - L, var(S) + var(D) = 2 (var(R) + var(L)) and var(S) -
-    var(D) = 4 cov(R, L). Errors of S and D leave open how the variance is shared between the beams:
-    it is shared in proportion to their fluxes, as photon noise would be, but never so unevenly that
-    the matrix ceases to be a covariance.
+    var(D) = 4 cov(R, L). Errors of S and D do not determine how the variance is shared between the
+    beams: it is shared in proportion to their fluxes, as photon noise would be, but never so
+    unevenly that the matrix ceases to be a covariance.
     """
     if not errors:
         return tuple(np.full_like(flux_right, np.nan) for _ in range(3))

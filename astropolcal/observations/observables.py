@@ -3,7 +3,7 @@
 What is compared with the model: differences of the two beams, with derivatives.
 
 Every observable is a small strategy object. Fluxes come as two arrays of shape
-``(k, W, P)``: ``k`` frames a datum (index 0 the plus frame, index 1 the minus
+``(k, W, P)``: ``k`` frames per datum (index 0 the plus frame, index 1 the minus
 frame, whose half-wave plate is 45 degrees further; of four frames see
 `NormalizedTripleDifference`), ``W`` wavelengths and ``P`` data. The derivatives
 are analytic, because a fit evaluates them at every step. The names X and I

@@ -3,7 +3,7 @@
 Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ, or both.
 
 Pairs are found from the angles, never from the order of the rows: the angles
-must differ by 45 degrees modulo 180, the derotator must stand still and the
+must differ by 45 degrees modulo 180, the derotator must be static and the
 modulator must be in the same state. Among the candidates the nearest in time wins.
 """
 

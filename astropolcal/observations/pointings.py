@@ -3,7 +3,7 @@
 Where the telescope points: altitude, parallactic angle, and what follows them.
 
 On sky, the light turns by the parallactic angle before the telescope and by the
-altitude behind it, and the half-wave plate follows both. The angles come from the table, or
+altitude downstream of it, and the half-wave plate follows both. The angles come from the table, or
 from time, target and site. An exposure takes time, and the angles change while it lasts:
 a frame is then the mean over a few nodes of Gauss and Legendre.
 """
@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import Angle
 from astropy.time import Time
 from astropy.utils import iers
 from astropy.utils.data import download_file
@@ -24,7 +25,7 @@ from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import MOVES
-from astropolcal.units import angle_to_rad
+from astropolcal.units import angle_to_rad, plain_number
 
 __all__ = ["location_of", "pointing"]
 
@@ -44,7 +45,7 @@ _SAID = set()
 
 @contextmanager
 def offline():
-    """Use the tables of leap seconds and of the Earth's rotation at hand; never the network."""
+    """Use the tables of leap seconds and of the Earth's rotation available; never the network."""
     with (
         # a calibration must not depend on a server, nor wait for one
         iers.conf.set_temp("auto_download", False),
@@ -94,6 +95,20 @@ def _warn_of_uncovered(time):
                 AstropolcalWarning,
                 stacklevel=3,
             )
+
+
+def sky_angle(name, value):
+    """
+    Return a right ascension or a declination, by name, in degree.
+
+    Plain numbers are degrees; sexagesimal right ascensions are hours. What is not an angle
+    raises a ValueError.
+    """
+    try:
+        return plain_number(value)
+    except (TypeError, ValueError):
+        unit = u.hourangle if name == "right_ascension" else u.deg
+        return float(Angle(str(value), unit=unit).to_value(u.deg))
 
 
 def pointing(coord, time, location):

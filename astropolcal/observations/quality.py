@@ -2,8 +2,8 @@
 """
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
-Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
-reason says how many there are and which. Single cells are
+Nothing is dropped: a masked frame stays in the table with its reason, and one warning
+per reason says how many there are and which. Single cells are
 judged while a table is read.
 """
 
@@ -20,8 +20,8 @@ from astropolcal.words import counted
 
 __all__ = []
 
-# derotator angles that differ by less belong to one run
-_SAME_ANGLE = np.deg2rad(0.5)
+#: Derotator angles, radian, that differ by less belong to one run.
+SAME_ANGLE = np.deg2rad(0.5)
 # angles closer than this are one step, as for pairs
 _PLATE_STEPS = np.deg2rad(0.3)
 #: Median absolute deviation to standard deviation, for normal noise.
@@ -45,6 +45,25 @@ def plain_source(source):
     return "star" if words == "standard star" else words
 
 
+def clusters(values, gap=SAME_ANGLE):
+    """Return the number of each value's cluster; clusters are more than ``gap`` apart."""
+    order = np.argsort(values, kind="stable")
+    number = np.empty(len(values), dtype=int)
+    number[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap)])
+    return number
+
+
+def runs_of_frames(count, number):
+    """Return the run of each frame where frames, one after the other, fall in so many, (F,)."""
+    return np.arange(count) * number // count
+
+
+def derotator_runs(observations):
+    """Return the number of the run of frames at one derotator angle of every frame, (F,)."""
+    angle = angle_or_zero(observations, "derotator")
+    return np.cumsum(np.abs(np.diff(angle, prepend=angle[:1])) > SAME_ANGLE)
+
+
 # ---- cycles of the half-wave plate ---------------------------------------------------------------
 
 
@@ -62,7 +81,7 @@ def cycle_numbers(observations, start=None):
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
     plate = _step_of(angle_or_zero(observations, "hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
-    moved = np.abs(np.diff(angle_or_zero(observations, "derotator"), prepend=0.0)) > _SAME_ANGLE
+    moved = np.diff(derotator_runs(observations), prepend=0) > 0
     first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
@@ -160,9 +179,7 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     spread = MAD_TO_SIGMA * np.nanmedian(off)
     # NaN, a frame masked already, is not far
     far = np.nan_to_num(off) > max(limit, sigma * spread)
-    moved = np.abs(np.diff(angle_or_zero(observations, "derotator"))) > _SAME_ANGLE
-    # number of the derotator angle in the order of the frames
-    run = np.concatenate([[0], np.cumsum(moved)])
+    run = derotator_runs(observations)
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]
     return _masked(observations, far, "unstable lamp")
 

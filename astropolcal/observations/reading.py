@@ -2,7 +2,7 @@
 """
 Safe reading and checked columns of an observation table.
 
-Files come from anywhere, so whatever is wrong with one ends in a single-line
+Files come from anywhere, so everything that is wrong with one ends in a single-line
 `~astropolcal.exceptions.ObservationError` that names the file and the place.
 Nothing in a file is executed: the text goes through the safe loader of astropy,
 and columns of Python objects are refused.
@@ -131,7 +131,7 @@ def _check_plain(column, name, label):
         )
     if getattr(column, "shape", (0,))[1:]:
         raise ObservationError(
-            f"{label}: column {name} has shape {column.shape}, one value a row is allowed"
+            f"{label}: column {name} has shape {column.shape}, one value per row is allowed"
         )
 
 
@@ -239,6 +239,26 @@ _FILTERS = Path(__file__).parents[1] / "data" / "filters.ecsv"
 
 #: Wavelengths of two tables are the same when they agree to this share.
 SAME_WAVELENGTH = 1e-5
+
+
+def nearest_bins(wavelength, grid):
+    """Return the bin of a grid that is nearest to each wavelength, and which are off the grid."""
+    nearest = np.abs(wavelength[:, None] - grid).argmin(axis=1)
+    return nearest, np.abs(grid[nearest] - wavelength) > SAME_WAVELENGTH * wavelength
+
+
+def bins_on_grid(observations, grid):
+    """Return the bin of a grid, micrometre, of each wavelength; refuse what is off it."""
+    own = observations.wavelength.to_value(u.um)
+    nearest, off = nearest_bins(own, grid)
+    if off.any():
+        raise ObservationError(
+            f"{observations.name}: {off.sum()} of {own.size} wavelengths, such as "
+            f"{1e3 * own[off][0]:.3f} nm, are none of the {grid.size} of the parameters, "
+            f"{1e3 * grid.min():.3f} to {1e3 * grid.max():.3f} nm "
+            f"(nearest {1e3 * grid[nearest][off][0]:.3f} nm)"
+        )
+    return nearest
 
 
 def common_wavelengths(observations, wavelength=None):

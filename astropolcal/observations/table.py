@@ -35,14 +35,14 @@ class Observations:
     Beam fluxes of a series of frames, validated.
 
     Make one with `read` or `from_table`; an instance does not change, and
-    `with_mask` and `select` return new ones. The table has one row a frame and
+    `with_mask` and `select` return new ones. The table has one row per frame and
     wavelength, in any order:
 
     ============================== ========= =========================================
     column                         unit      meaning
     ============================== ========= =========================================
     frame, bin                               whole numbers
-    wavelength                     length    one value a bin
+    wavelength                     length    one value per bin
     hwp, derotator, ...            angle     positions of the stages that the chain has
     parallactic, altitude          angle     optional, on sky
     flux_right, flux_left          any, one  ordinary and extraordinary beam; or
@@ -188,7 +188,7 @@ class Observations:
 
     @property
     def frames(self):
-        """One row a frame with every column that belongs to frames (a copy)."""
+        """One row per frame with every column that belongs to frames (a copy)."""
         return self._grid.frames.copy()
 
     @property
@@ -493,7 +493,7 @@ class Observations:
         Parameters
         ----------
         size : {1, 2, 4}
-            Frames a datum: single frames, `pairs`, or pairs in both states of a modulator.
+            Frames per datum: single frames, `pairs`, or pairs in both states of a modulator.
 
         Returns
         -------
@@ -564,7 +564,7 @@ class Observations:
         Parameters
         ----------
         frames : array_like of bool or int
-            One boolean a frame, or indices of frames, each at most once.
+            One boolean per frame, or indices of frames, each at most once.
 
         Returns
         -------
@@ -591,7 +591,7 @@ class Observations:
         Parameters
         ----------
         bins : array_like of bool
-            One boolean a bin, shape (B,).
+            One boolean per bin, shape (B,).
 
         Returns
         -------
@@ -623,7 +623,7 @@ class Observations:
         Returns
         -------
         `~astropy.table.QTable`
-            One row a frame and bin, masked cells with NaN and a ``mask_reason``.
+            One row per frame and bin, masked cells with NaN and a ``mask_reason``.
 
         Examples
         --------
@@ -754,7 +754,7 @@ def some_frames(grid, frames, label):
 
 
 def some_bins(grid, bins, label):
-    """Return the grid at some wavelengths, one boolean a bin."""
+    """Return the grid at some wavelengths, one boolean per bin."""
     chosen, n_bins = np.asarray(bins), len(grid.bin)
     if chosen.dtype != bool or chosen.shape != (n_bins,):
         raise ObservationError(

@@ -1,12 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do otherwise than those of astropy: keywords, settings, units, chains, cheap copies.
+How our models differ from those of astropy: keywords, settings, units, chains, cheap copies.
 
-Nothing else in the package touches what `astropy.modeling` keeps to itself. Copies do (the
+Nothing else in the package touches what `astropy.modeling` keeps private. Copies do (the
 dictionaries of models and parameters), because a calibration copies chains and measurements
 thousands of times, and a deep copy of everything takes five times as long. Chains do, because a
 fitter asks every model of a compound for its units, and astropy's ``Mapping`` has no answer.
-Parameters do, because astropy drops the unit of a bound.
+Bounds and ties do, because astropy drops their units.
 """
 
 import inspect
@@ -18,6 +18,7 @@ from operator import or_
 import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
+from astropy.modeling.utils import _ConstraintsDict
 
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.units import length_to_um, to_unit
@@ -93,10 +94,14 @@ class KeywordOnly(type(FittableModel)):
 
 
 class OpticParameter(Parameter):
-    """A parameter that converts bounds and ties to its unit, and knows to what they belong."""
+    """A parameter that converts bounds to its unit, and knows the wavelengths of its values."""
 
     #: Wavelengths of its values in micrometre, or None where nobody has said.
     grid = None
+
+    def __delete__(self, model):
+        # with it, tables of attributes in a documentation show the description
+        raise AttributeError(f"parameter {self.name} cannot be deleted")
 
     @property
     def wavelength(self):
@@ -136,11 +141,16 @@ class OpticParameter(Parameter):
         plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
         Parameter.bounds.fset(self, plain)
 
-    @Parameter.tied.setter
-    def tied(self, value):
-        # a fitter puts what the callable returns into an array of plain numbers
-        wrap = callable(value) and not isinstance(value, partial)
-        Parameter.tied.fset(self, partial(_tied_value, value, self.unit) if wrap else value)
+
+class _Ties(_ConstraintsDict):
+    """The ties of a model as a fitter calls them: it puts their values among plain numbers."""
+
+    def __init__(self, model):
+        super().__init__(model, "tied")
+
+    def __getitem__(self, key):
+        tie = super().__getitem__(key)
+        return partial(_tied_value, tie, getattr(self._model, key)) if callable(tie) else tie
 
 
 class LinearlyTied(OpticParameter):
@@ -156,9 +166,11 @@ class LinearlyTied(OpticParameter):
         Parameter.tied.fset(self, value)
 
 
-def _tied_value(function, unit, model):
+def _tied_value(function, parameter, model):
     value = function(model)
-    return value if getattr(value, "unit", None) is None else to_unit(value, unit, "tied value")
+    if getattr(value, "unit", None) is None:
+        return value
+    return to_unit(value, parameter.unit, f"what {parameter.name} is tied to")
 
 
 def values_text(model):
@@ -213,6 +225,11 @@ class Chain(CompoundModel):
     def has_bounds(self):
         """Whether a free parameter has a bound; what is fixed needs none."""
         return any_free_bounds(self)
+
+    @property
+    def tied(self):
+        """Ties by the name of their parameter, in its unit."""
+        return _Ties(self)
 
     def __setattr__(self, attr, value):
         if attr in (self.__dict__.get("_param_names") or ()):
@@ -295,6 +312,11 @@ class SharedParameters(FittableModel):
     def has_bounds(self):
         """Whether a free parameter has a bound; what is fixed needs none."""
         return any_free_bounds(self)
+
+    @property
+    def tied(self):
+        """Ties by the name of their parameter, in its unit."""
+        return _Ties(self)
 
     def __setattr__(self, attr, value):
         if attr in self._param_names:

@@ -295,8 +295,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """
         Return the parameter values as canonical floats (radian, micrometre or 1), ``theta`` first.
 
-        Each has shape () or (n_wavelengths,). A parameter that was given another unit behind the
-        optic's back raises a ParameterError.
+        Each has shape () or (n_wavelengths,). A parameter that was given another unit without the
+        optic raises a ParameterError.
         """
         values = []
         for key in self.param_names:
@@ -466,7 +466,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
         """
-        Return ``wavelength`` and the Stokes parameters behind the optic.
+        Return ``wavelength`` and the Stokes parameters downstream of the optic.
 
         Without units wavelengths are in micrometre and parameters in their own units.
         """
@@ -501,10 +501,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     @property
     def inverse(self):
         """
-        What gives the light before the optic from the light behind it, at the present values.
+        What gives the light upstream of the optic from that downstream of it, at present values.
 
-        It raises NotImplementedError where no light can be told from what is left of it, and when
-        it is evaluated a ParameterError if that is so at a wavelength.
+        It raises NotImplementedError where the light cannot be recovered from what is left of
+        it, and when it is evaluated a ParameterError if that is so at a wavelength.
         """
         try:
             matrix = self.mueller()

@@ -203,7 +203,7 @@ class LightCurve(Curve):
     """
     What comes out of optics: an element of their Mueller matrix, or an observable of both beams.
 
-    All that light can do is of shape (k, n): k frames a datum, n inputs of the curve.
+    All that light can do is of shape (k, n): k frames per datum, n inputs of the curve.
     """
 
     def __init__(self, chain, optics, element, observable, against, wavelength, positions):

@@ -122,8 +122,8 @@ class HarmonicRotator(_Harmonic):
     r"""
     Rotator of the polarization by an angle that varies with the position of a stage.
 
-    :math:`T(\delta)` with :math:`\delta = a\cos nx + b\sin nx`. One in front of an
-    optic and its inverse (both parameters of opposite sign) behind it add
+    :math:`T(\delta)` with :math:`\delta = a\cos nx + b\sin nx`. One upstream of an
+    optic and its inverse (both parameters of opposite sign) downstream of it add
     :math:`\delta` to the orientation of that optic, the error of the encoder of
     its stage: n = 1 for a scale that is not centred, n = 2 for one that is not
     round. All three need the same ``mount``, with the same sign.
@@ -162,7 +162,7 @@ class DriftRotator(FrameOptic):
     Rotator of the polarization by an angle that grows through the run.
 
     :math:`T(r x)` with x from 0 in the first to 1 in the last frame: a source
-    or polarizer whose orientation drifts. As behind a `Rotator`, the angle of
+    or polarizer whose orientation drifts. As downstream of a `Rotator`, the angle of
     linear polarization is less by :math:`r x`.
 
     Parameters
@@ -488,7 +488,7 @@ class FluxGain(_BeamOptic, _Referenced):
 
 class StrayLight(_Referenced):
     r"""
-    Unpolarized light that is added in front of the beam splitter, whatever the source does.
+    Unpolarized light that is added upstream of the beam splitter, regardless of the source.
 
     :math:`I' = I\,(1 + b F_0/F)` with F the sum of both beams in the table
     (``mount="total_flux"``), so that a constant flux :math:`b F_0` is added to
@@ -533,7 +533,7 @@ class StrayLight(_Referenced):
 
 class PolarizedBackground(StrayLight):
     r"""
-    Polarized light that is added to that of the source, whatever the source does.
+    Polarized light that is added to that of the source, regardless of the source.
 
     .. math:: I' = I\,(1 + b F_0/F),\quad Q' = Q + q F_0/F\,I,\quad U' = U + u F_0/F\,I
 

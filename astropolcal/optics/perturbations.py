@@ -55,14 +55,14 @@ GENERATORS = {
 @dataclass(frozen=True)
 class Dependence:
     """
-    How a perturbation depends on the frame, by the text that says so.
+    How a perturbation depends on the frame, by a text.
 
     ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
     ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
     stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
     ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"dataset:NAME"``, in one
-    dataset only. With ``"/dataset:NAME"`` behind it, any of the others is in that dataset
+    dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset
     only.
     """
 
@@ -73,12 +73,12 @@ class Dependence:
             raise ParameterError(
                 f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
                 "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
-                "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME behind it"
+                "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME after it"
             )
 
     @property
     def parts(self):
-        """The words of the text between its colons, without a dataset behind it."""
+        """The words of the text between its colons, without a dataset after it."""
         return split_run(self.text)[0].split(":")
 
     @property
@@ -170,7 +170,7 @@ class Perturbation(_BeamOptic, FrameOptic):
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
         stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"dataset:NAME"``; each also with
-        ``"/dataset:NAME"`` behind it. The ``mount`` has to be what it follows.
+        ``"/dataset:NAME"`` after it. The ``mount`` has to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`

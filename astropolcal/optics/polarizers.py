@@ -348,7 +348,7 @@ class BeamGain(_BeamOptic):
     r"""
     Unequal gains of the two beams: :math:`1 + g` for the right, :math:`1 - g` for the left.
 
-    What is left of the flat field, or unequal transmission behind the beam
+    What is left of the flat field, or unequal transmission downstream of the beam
     splitter (Patat & Romaniello 2006, doi:10.1086/497581).
 
     Parameters

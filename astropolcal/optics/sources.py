@@ -18,7 +18,7 @@ class Light(Optic):
     .. math:: M = \begin{pmatrix}I&0&0&0\\Q&0&0&0\\U&0&0&0\\V&0&0&0\end{pmatrix}
 
     First in a chain it takes the place of the light that arrives: the chain then has the
-    wavelength as its only input. Behind ``Mapping((1,), n_inputs=5)`` of astropy, which picks
+    wavelength as its only input. Followed by ``Mapping((1,), n_inputs=5)`` of astropy, which picks
     the intensity, the chain is a model of one input and one output, which every fitter takes.
 
     Parameters
@@ -65,7 +65,7 @@ class Light(Optic):
 
 class PolarizedSource(Optic):
     r"""
-    Source of linearly polarized light, in the place of whatever light arrives.
+    Source of linearly polarized light, in the place of the light that arrives.
 
     .. math:: M = \begin{pmatrix}1&0&0&0\\q&0&0&0\\u&0&0&0\\0&0&0&0\end{pmatrix}
 

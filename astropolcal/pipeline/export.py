@@ -31,19 +31,19 @@ _COLUMNS = {
 # lines of at most 72 characters, as a card of FITS has
 _WORDS = """\
 Each Mueller matrix turns the incident Stokes vector (I, Q, U, V) into
-that behind the beam splitter; its first row, elements (0, j), gives the
+that downstream of the beam splitter; its first row, elements (0, j), gives the
 flux of the beam for incident Stokes parameter j.
 MUELLER columns have 4 x 4 numbers: the index that varies fastest, the
 first of TDIM and of arrays in IDL and Fortran, is the incident Stokes
 parameter j, the other one the outgoing i.
 COV columns have 16 x 16 numbers over the elements 4 i + j: errors of
 the calibration alone, to first order. Infinite: the data of the
-calibration leave the element open; NaN: they tell nothing of it."""
+calibration do not determine the element; NaN: they do not constrain it."""
 
 
 def mueller_table(calibration, header=None, *, positions=None, light="sky", wavelength=None):
     """
-    Return the system Mueller matrices of both beams, one row a frame and wavelength.
+    Return the system Mueller matrices of both beams, one row per frame and wavelength.
 
     Parameters
     ----------
@@ -196,7 +196,8 @@ def _plain(table):
     plain.meta["comments"] = [
         "right_ij, left_ij: element (i, j) of the Mueller matrix of the beam, from incident",
         "Stokes parameter j (0 to 3: I, Q, U, V) to outgoing i; _err: its standard error from",
-        "the calibration, inf where the calibration leaves it open, nan where it tells nothing",
+        "the calibration, inf where it does not determine the element, nan where it does not",
+        "constrain it",
     ]
     return plain
 

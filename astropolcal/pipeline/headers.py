@@ -29,12 +29,12 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
+from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
-from astropolcal.observations.pointings import offline
+from astropolcal.observations.pointings import offline, sky_angle
 from astropolcal.observations.reading import numeric_column
-from astropolcal.units import plain_number
 
 __all__ = []
 
@@ -46,7 +46,7 @@ _OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
 def describe(header, instrument=None, stated=()):
     """Return ``instrument``, ``stated`` (as the header says), ``mode`` and ``date`` (ISO, UTC).
 
-    What is not told is None; what the user has ``stated`` is not looked for.
+    What is not known is None; what the user has ``stated`` is not looked for.
     """
     if instrument is None:
         found = _recognized(header)
@@ -131,7 +131,7 @@ class FrameAngles:
 
     @property
     def frames(self):
-        """One row a frame."""
+        """One row per frame."""
         return self._table.copy()
 
     def _complete(self, column, values):
@@ -150,7 +150,10 @@ class FrameAngles:
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
         if column in _SKY:
-            return _sky(column, values)
+            try:
+                return [sky_angle(column, value) for value in values] * u.deg
+            except ValueError as error:
+                raise ObservationError(f"{column}: {one_line(error)}") from None
         keyword, layout = self._layout.keywords[column], self._layout
         # states of a modulator, cameras and such
         if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
@@ -181,22 +184,6 @@ class FrameAngles:
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"
             raise ObservationError(f"position of {column!r}: {lacking} in the header")
         return numeric_column(self._table, column, self.name, u.rad)
-
-
-def _sky(column, values):
-    from astropy.coordinates import Angle
-
-    try:
-        numbers = [plain_number(value) for value in values]
-        # plain numbers are degrees, also for the right ascension; sexagesimal ones are hours there
-        return numbers * u.deg
-    except (TypeError, ValueError):
-        pass
-    unit = u.hourangle if column == "right_ascension" else u.deg
-    try:
-        return u.Quantity([Angle(str(value), unit=unit).to(u.deg) for value in values])
-    except ValueError as error:
-        raise ObservationError(f"{column}: {' '.join(str(error).split())}") from None
 
 
 # ---- which of a calibration's chains the light of a frame went through ----
@@ -329,7 +316,7 @@ def _check_mode(held, label, mode, name, way):
     if folded(mode) != folded(held.mode):
         raise CalibrationFileError(
             f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
-            f"another name, {way} says so"
+            f"another name, state it by {way}"
         )
 
 
@@ -357,7 +344,7 @@ def _check_changes(changes, days, day, label, way):
             raise CalibrationFileError(
                 f"{label}: {words} between the data of the calibration "
                 f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
-                f"calibrate anew, or {way}"
+                f"calibrate again, or {way}"
             )
 
 

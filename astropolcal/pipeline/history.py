@@ -23,7 +23,9 @@ from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.library import Entry, Library
+from astropolcal.words import p_words
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
 
@@ -171,7 +173,7 @@ class Change:
     --------
     >>> from astropolcal.pipeline import Change
     >>> print(Change(["a", "b"], ["m3.diattenuation"], 30.0, 1, 4e-8))
-    m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p = 4e-08)
+    m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p < 1e-6)
     """
 
     calibrations: list
@@ -201,7 +203,7 @@ class Change:
         verdict = "changed" if self.p_value < 0.00135 else "no change seen"
         return (
             f"{what}: {verdict} {between} at {self.sigma:.1f} sigma (chi-square {self.chi2:.1f} "
-            f"of {self.dof}, p = {self.p_value:.1g})"
+            f"of {self.dof}, {p_words(self.p_value)})"
         )
 
 
@@ -267,7 +269,8 @@ def _check_independent(named):
 def _common(named, spaces, parameters):
     """Return the elements to compare, in the order of the first calibration."""
     grids = [calibration.wavelength.to_value("nm") for _, calibration in named]
-    same = all(g.shape == grids[0].shape and np.allclose(g, grids[0], rtol=1e-6) for g in grids)
+    first = grids[0]
+    same = all(g.shape == first.shape and np.allclose(g, first, SAME_WAVELENGTH) for g in grids)
     names = [n for n in spaces[0].names if all(n in space.names for space in spaces)]
     if parameters is not None:
         for key in parameters:
@@ -348,7 +351,7 @@ def changes(calibrations, parameters=None):
     Returns
     -------
     `~astropy.table.Table`
-        One row a pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
+        One row per pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
         ``sigma``, ``n_open``, ``left_out``.
 
     Raises
@@ -431,7 +434,7 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
         calibration, or all if nothing is). Optics that the old one lacks, such as a new star,
         are free as the instrument has them.
     chain : sequence of chains, optional
-        One a dataset, whose optics take the values of those of the same name; by default as the
+        One per dataset, whose optics take the values of those of the same name; by default as the
         instrument makes them, or the first of the calibration.
     positions : sequence of dict, optional
         As for ``calibrate``; by default as the instrument reads them.

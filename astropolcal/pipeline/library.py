@@ -325,7 +325,7 @@ class Library:
         Raises
         ------
         CalibrationFileError
-            If the library is no folder, the name is not that of a file in it, a file of the name
+            If the library is not a folder, the name is not that of a file in it, a file of the name
             exists, or the range overlaps with that of a calibration in it.
         """
         if self._folder is None:
@@ -573,7 +573,7 @@ def _looked_at(path, told):
 
 
 def _entry(path, record, state):
-    """Return the entry that a record tells of; None if it is of another state, or nonsense."""
+    """Return the entry that a record tells of; None if it is of another state, or not valid."""
     try:
         quality, held = record["quality"], Validity(**record["validity"])
         sound = [isinstance(quality[key], kind) for key, kind in _QUALITY.items()]

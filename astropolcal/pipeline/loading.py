@@ -94,7 +94,7 @@ class SystemMueller:
         """
         Covariance of the 16 elements of each matrix, row by row, shape (..., 16, 16).
 
-        Infinite for what the data leave open and NaN for what they tell nothing of, as
+        Infinite for what the data do not determine and NaN for what they do not constrain, as
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
@@ -239,7 +239,7 @@ class LoadedCalibration:
         Optional optics in the beam; needed if the calibration has several sets of them, and
         the headers do not tell which.
     stated : dict of str to str
-        What the user states of ``instrument``, ``mode`` and ``date``, whatever headers say.
+        What the user states of ``instrument``, ``mode`` and ``date``, regardless of the headers.
     max_age : `~astropy.units.Quantity`, optional
         As for `load`.
 
@@ -308,7 +308,7 @@ class LoadedCalibration:
         beam : {"right", "left"}
             The beam.
         light : {"sky", "internal"}
-            Where the light enters: above the telescope, in the frame of the sky; or in front of
+            Where the light enters: above the telescope, in the frame of the sky; or upstream of
             the half-wave plate, as from the internal source.
 
         Returns

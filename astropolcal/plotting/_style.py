@@ -143,14 +143,6 @@ def note(axes, text, **look):
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **look)
 
 
-def clusters(values, gap):
-    """Return the number of each value's cluster; clusters are more than ``gap`` apart."""
-    order = np.argsort(values, kind="stable")
-    number = np.empty(len(values), dtype=int)
-    number[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap)])
-    return number
-
-
 def degrees(angle):
     """Return an angle in degree as short text: ``11.25°``."""
     text = f"{angle:.2f}".rstrip("0").rstrip(".")

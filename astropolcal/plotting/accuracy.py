@@ -55,7 +55,7 @@ _DASHES = ("--", ":", "-.")
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
     """
-    Draw the accuracies of a calibration against wavelength, one panel a dataset.
+    Draw the accuracies of a calibration against wavelength, one panel per dataset.
 
     These are s_res, s_mean and s_cv, and s_standard for each standard of the dataset's
     source. Standards of other sources have panels of their own, with the s_cv that they
@@ -135,7 +135,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
     """Draw the accuracies of the datasets, then of what was not fitted, over the wavelength."""
     for axes, record in zip(panels, records, strict=False):
         name = f"{record.name}: " if len(panels) > 1 else ""
-        counts = f"n = {_span(record.accuracy['n'])} data a wavelength"
+        counts = f"n = {_span(record.accuracy['n'])} data per wavelength"
         axes.set_title(f"{name}{counts}, k = {np.max(record.accuracy['k'])} free parameters")
         lam = nanometres(record.accuracy["wavelength"])
         for key, (color, marker, _) in _CURVES.items():
@@ -153,7 +153,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
             look["label"] = _PREDICTED.format(entry["name"])
             draw_line(axes, entry["wavelength_nm"], entry["s_standard_percent"], **look)
     for axes, entry in zip(panels[len(records) :], others, strict=True):
-        axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
+        axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data per wavelength, predicted")
         look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
         draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
@@ -201,7 +201,7 @@ def _draw_side_by_side(axes, calibration, records, standards):
     names = [f"{name}\n{lam:.0f} nm" for name, lam in places]
     axes.set_xticks([*at, *after], names, rotation=35, ha="right", fontsize=9.5)
     n, k = (_span([i for r in records for i in r.accuracy[key]]) for key in "nk")
-    axes.set_title(f"n = {n} data a dataset, k = {k} free parameters")
+    axes.set_title(f"n = {n} data per dataset, k = {k} free parameters")
 
 
 def _span(n):

@@ -60,7 +60,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     Raises
     ------
     ParameterError
-        If these are no images, or there is no such wavelength.
+        If these are not images, or there is no such wavelength.
 
     Examples
     --------

@@ -53,7 +53,7 @@ def plot_polarimetric_efficiency(
     Lines against the derotator angle, at the ``shown`` wavelengths or six; a map of derotator angle
     and wavelength; for a chain from the sky a map of parallactic angle and altitude at this
     ``derotator`` angle: the least over the wavelengths. Without a derotator there are lines against
-    the parallactic angle, or against the wavelength behind an internal source.
+    the parallactic angle, or against the wavelength downstream of an internal source.
     """
     lam, moving = nanometres(wavelength), stages(chain)
     at = {"altitude": altitude, "parallactic": parallactic}
@@ -73,7 +73,7 @@ def plot_polarimetric_efficiency(
             axes[1].set_title("as on the left, all wavelengths")
             words = {"altitude": "altitude", "parallactic": "parallactic angle"}
             where = ", ".join(f"{words[key]} {_degree(angle)}" for key, angle in at.items())
-            axes[0].set_title(where or "behind the internal source")
+            axes[0].set_title(where or "downstream of the internal source")
         elif not maps:
             _without_derotator(axes[0], lam, asked, shown, "parallactic" in at)
         if maps:
@@ -208,9 +208,9 @@ def plot_comparison(members, *, title=None, figure=None):
     -------
     `~matplotlib.figure.Figure`
         Against the wavelength: retardance of half-wave plate and of derotator, diattenuation
-        of the path behind the telescope, and the range of the efficiency over the derotator
+        of the path downstream of the telescope, and the range of the efficiency over the derotator
         angles. Spectra are lines, filters are points on dotted lines. Bars are standard errors of
-        calibrations; where the data leave a value open, the bar goes through the whole panel.
+        calibrations; where the data do not determine a value, the bar goes through the whole panel.
 
     Examples
     --------
@@ -230,7 +230,7 @@ def plot_comparison(members, *, title=None, figure=None):
         ]
         _label_panels(axes)
         legend_outside(fig, handles, columns=min(4, len(labels)))
-        fig.suptitle(title or "Polarization optics behind the telescope")
+        fig.suptitle(title or "Polarization optics downstream of the telescope")
     return fig
 
 

@@ -78,7 +78,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     """
     Draw the gap by wavelength, before and after, with the noise floor.
 
-    One row a dataset, the difference of the beams at the left and the sum at
+    One row per dataset, the difference of the beams at the left and the sum at
     the right, less the lamp's drift and flicker; of the fits, not of left-out
     frames.
 
@@ -282,7 +282,7 @@ def plot_cause_map(diagnosis, *, figure=None):
 
     Rows are the places in the order in which the light meets them, columns the kinds of
     perturbation. A cell is the probability that a cause is there, summed over all its
-    dependences and over what cannot be told from it.
+    dependences and over what cannot be distinguished from it.
 
     Parameters
     ----------
@@ -349,8 +349,8 @@ _LEAST, _DARK = 0.01, 0.65
 _PLACES = {
     "detector": "detector",
     "spectrograph": "detector",
-    "in front of": "source",
-    "behind the derotator": "after:derotator",
+    "upstream of": "source",
+    "downstream of the derotator": "after:derotator",
     "half-wave plate": "in:hwp",
     "derotator": "in:derotator",
     "source": "source",
@@ -395,20 +395,19 @@ def _on_map(effect, cell):
 def _place_label(place):
     head, _, optic = place.partition(":")
     optic = {"hwp": "half-wave plate"}.get(optic, optic)
-    words = {"in": f"in the {optic}", "after": f"behind the {optic}"}
+    words = {"in": f"in the {optic}", "after": f"downstream of the {optic}"}
     return textwrap.fill(words.get(head, place), 16)
 
 
-def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
+def plot_effect_sizes(diagnosis, effect, *, figure=None):
     """
     Draw the fitted size of a cause, by its name, with its errors.
 
     One panel for what it depends on, if that is a cell that changes from frame to frame: the size
     at the middle wavelength with its 68 % band, and the frames as marks. One panel for each
     parameter that changes with the wavelength; crosses mark where the data do not tell the size.
-    ``content`` is what `~astropolcal.gap.report.to_dict` returned, if it is known already.
     """
-    sizes = _sizes_by_wavelength(diagnosis, effect, content)
+    sizes = _sizes_by_wavelength(diagnosis, effect)
     panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
@@ -426,14 +425,14 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     return figure
 
 
-def _sizes_by_wavelength(diagnosis, effect, content):
+def _sizes_by_wavelength(diagnosis, effect):
     names = [cause.name for cause in diagnosis.causes]
     if effect not in names:
-        raise ParameterError(f"effect = {effect!r} is no cause; these are: {', '.join(names)}")
-    if content is None:
+        raise ParameterError(f"effect = {effect!r} is not a cause; these are: {', '.join(names)}")
+    if diagnosis.content is None:
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
-        sizes = content["causes"][names.index(effect)]["size"]
+        sizes = diagnosis.content["causes"][names.index(effect)]["size"]
     return {name: size for name, size in sizes.items() if _varies(size["value"])}
 
 

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the data determine, what they leave open, and how parameters are correlated."""
+"""What the data determine, what they do not determine, and how parameters are correlated."""
 
 import textwrap
 from dataclasses import dataclass
@@ -394,7 +394,7 @@ def plot_correlations(calibration, *, figure=None):
 
     Parameters given per wavelength form a block, short wavelengths first;
     those common to all wavelengths are drawn wider. Rows and columns of
-    parameters without an error, because the data leave them open or because
+    parameters without an error, because the data do not determine them or because
     they sit at a bound, are hatched: there is no correlation to show.
 
     Parameters
@@ -484,5 +484,5 @@ def _explain_hatching(figure, matrix):
 
     without = int((~np.isfinite(np.diag(matrix))).sum())
     if without:
-        label = f"{without} of {len(matrix)} parameters: left open by the data, or at a bound"
+        label = f"{without} of {len(matrix)} parameters: not determined by the data, or at a bound"
         legend_outside(figure, [Patch(**_HATCHED, label=label)])

@@ -144,7 +144,7 @@ def _slope(leaf, key, lam):
 
 
 def _draw_stage(axes, calibration, leaf):
-    """Draw the retardances of the first stage that fitted one a wavelength."""
+    """Draw the retardances of the first stage that fitted one per wavelength."""
     lam = nanometres(calibration.wavelength)
     for stage in calibration.stages:
         value = stage["parameters"].get(f"{leaf.name}.retardance")
@@ -184,7 +184,7 @@ def _legend(figure, axes, calibration):
     handles = {label: _neutral(entries[label], label) for label in labels}
     free = len(calibration.identifiability.directions)
     if _ALONE in handles and free:
-        words = f"{_ALONE} (the data leave {counted(free, 'combination')} of parameters open)"
+        words = f"{_ALONE} (the data do not determine {counted(free, 'combination')} of parameters)"
         handles[_ALONE].set_label(words)
     return legend_outside(figure, list(handles.values()))
 
@@ -360,7 +360,7 @@ def plot_parameters(calibration, names=None, *, figure=None):
             near = did_you_mean(name, known)
             raise ParameterError(f"no parameter {name!r}; allowed are {', '.join(known)}{near}")
     if not names:
-        raise ChainError("no free parameter has one value a wavelength: nothing to draw")
+        raise ChainError("no free parameter has one value per wavelength: nothing to draw")
     optics = _optics(calibration)
 
     def draw(axes, name, look):
@@ -445,7 +445,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     Returns
     -------
     `~matplotlib.figure.Figure`
-        One column a mirror: above its diattenuation, below its retardance. What is held
+        One column per mirror: above its diattenuation, below its retardance. What is held
         is hollow; what follows a law is a line with its 1 sigma band. The metals are silver, gold
         and aluminium at 45 deg, with the indices of Rakić et al. (1998).
 
@@ -561,7 +561,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
         ``"optic.parameter"`` or ``"optic"``; by default all that are free in one of them.
     shown : int, optional
         How many wavelengths of a parameter given per wavelength, by default six spread over
-        the grid; they stand side by side so that their errors can be told apart.
+        the grid; they stand side by side so that their errors can be distinguished.
     title : str, optional
         Title of the figure.
     figure : `~matplotlib.figure.Figure`, optional
@@ -570,7 +570,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
     Returns
     -------
     `~matplotlib.figure.Figure`
-        One panel a parameter: values with errors, open symbols where a value was held; between
+        One panel per parameter: values with errors, open symbols where a value was held; between
         two calibrations how surely they differ, over all wavelengths. Of a parameter
         per wavelength the differences to its mean over the calibrations.
 

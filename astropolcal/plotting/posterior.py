@@ -131,7 +131,7 @@ def _labels(posterior, columns, samples):
     """
     Return axis labels, and what is taken off each parameter's values for legible ticks.
 
-    A width of 0.1 um about 1654 um would leave no room for ticks.
+    A width of 0.1 um about 1654 um would leave no space for ticks.
     """
     labels, shifts = [], []
     for i, column in enumerate(columns):
@@ -202,7 +202,7 @@ def _heading(posterior, marked):
 
 def plot_traces(posterior, parameters=None, *, figure=None):
     r"""
-    Draw the walkers against steps, and the autocorrelation, one row a parameter.
+    Draw the walkers against steps, and the autocorrelation, one row per parameter.
 
     Of a posterior that is thinned the autocorrelation is not known; instead
     of it the samples are counted, with their quantiles 0.16, 0.5 and 0.84.

@@ -8,7 +8,7 @@ import numpy as np
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.quality import clusters, is_star
 from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     BLUE,
@@ -17,7 +17,6 @@ from astropolcal.plotting._style import (
     MINUS,
     SIGMA,
     canvas,
-    clusters,
     color_bar,
     color_limit,
     degrees,
@@ -198,7 +197,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     """
     Draw observed and modelled differences against the derotator angle, or a star's altitude.
 
-    One pair of panels a wavelength: above the observed data and the model,
+    One pair of panels per wavelength: above the observed data and the model,
     evaluated between the data too; below their difference in percent. Stars are drawn
     against their altitude, by the commanded angle of the half-wave plate. Where
     another stage than the derotator moves within a series, the model is drawn
@@ -377,7 +376,7 @@ _HEADROOM = 1.05
 
 def plot_residuals(calibration, *, figure=None):
     """
-    Draw a map of the residuals: wavelength against datum, by derotator angle; one a dataset.
+    Draw a map of the residuals: wavelength against datum, by derotator angle; one per dataset.
 
     Above it stands the rms of each datum, at its right that of each wavelength. All maps have the
     same colours, or where the residuals differ much in size each its own. Masked data are grey.
@@ -422,7 +421,7 @@ def _scales(grids):
 
 
 def _draw_bars(figure, grids):
-    """Draw the residuals at one wavelength, a panel a dataset, all with the same scale."""
+    """Draw the residuals at one wavelength, a panel per dataset, all with the same scale."""
     figure = canvas(figure, 10.5, 2.2 + 1.4 * max(len(grids), 2))
     panels = figure.subplots(len(grids), 1, sharey=True, squeeze=False)[:, 0]
     below = None

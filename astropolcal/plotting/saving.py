@@ -55,7 +55,7 @@ def save_all(calibration, folder):
     list of `~pathlib.Path`
         The files: of ``double_differences.png`` (``double_differences_2.png``
         for the second dataset, and so on), ``residuals.png``,
-        ``accuracy.png``, ``targets.png``, ``mirrors.png``, ``star.png`` (one a star that
+        ``accuracy.png``, ``targets.png``, ``mirrors.png``, ``star.png`` (one per star that
         was checked), ``retardances.png``, ``efficiency.png``,
         ``correlations.png``, ``identifiability.png``,
         ``other_parameters.png``, ``traces.png`` and ``corner.png`` those that

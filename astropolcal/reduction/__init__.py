@@ -6,7 +6,14 @@ From FITS cubes to observations: headers, photometry of both beams, errors.
 one of tables that pyPolCal wrote.
 """
 
-from astropolcal.reduction.cubes import both_states, simulate_cubes, true_observations
+from astropolcal.reduction.cubes import (
+    CubeFiles,
+    DetectorModel,
+    ImageModel,
+    both_states,
+    simulate_cubes,
+    true_observations,
+)
 from astropolcal.reduction.run import Reduction, reduce_cubes, reduce_run
 from astropolcal.reduction.spectrum import (
     read_spectra,
@@ -17,6 +24,9 @@ from astropolcal.reduction.spectrum import (
 from astropolcal.reduction.tables import read_pypolcal
 
 __all__ = [
+    "CubeFiles",
+    "DetectorModel",
+    "ImageModel",
     "Reduction",
     "both_states",
     "read_pypolcal",

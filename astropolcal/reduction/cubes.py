@@ -8,10 +8,10 @@ field; both are seen through the field stop, of which the beam splitter makes
 two images.
 """
 
-import inspect
 import os
 import re
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import astropy.units as u
@@ -35,13 +35,185 @@ from astropolcal.observations.pointings import offline, tracked
 from astropolcal.reduction.images import Detector, Scene, choice, number, per_wavelength, pixels
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
 
-__all__ = ["both_states", "simulate_cubes", "true_observations"]
+__all__ = [
+    "CubeFiles",
+    "DetectorModel",
+    "ImageModel",
+    "both_states",
+    "simulate_cubes",
+    "true_observations",
+]
 
 _SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
-# what describes the image of a star
-_STAR = ("psf", "fwhm", "beta", "halo", "halo_fwhm", "margin")
 # share of the saturation that a default may fill: there is room for better seeing, uneven pixels
 _FILLED = 0.5
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """
+    How the light of simulated cubes falls on the detector.
+
+    Parameters
+    ----------
+    psf : {"moffat", "gaussian"}
+        Profile of a star's core.
+    fwhm : float, array_like or `~astropy.units.Quantity`
+        Full width of the core at half maximum; pixels, or an angle on the sky.
+    beta : float
+        Exponent of a Moffat core.
+    halo : float
+        Share of the light in the halo, a Moffat profile with wings as of seeing.
+    halo_fwhm : float or `~astropy.units.Quantity`
+        Full width of the halo at half maximum.
+    centre : (float, float), optional
+        Place of the star in the left beam, 0-based x and y; by default the
+        middle of the field.
+    motion : float or `~astropy.units.Quantity`
+        Standard deviation of the place from frame to frame, in x and in y.
+    seeing : float
+        Relative standard deviation of ``fwhm`` from frame to frame.
+    margin : float
+        How far the field stop lies outside the apertures of the layout, pixels; the only one
+        of these that matters for the internal source.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import ImageModel
+    >>> ImageModel(fwhm=4.0, halo=0.1).psf
+    'moffat'
+    """
+
+    psf: str = "moffat"
+    fwhm: object = 5.0
+    beta: float = 3.0
+    halo: float = 0.0
+    halo_fwhm: object = 30.0
+    centre: tuple | None = None
+    motion: object = 0.0
+    seeing: float = 0.0
+    margin: float = 6.0
+
+    def _scene(self, layout, source, n_wavelengths):
+        """Return what falls on the detector, of numbers that have been checked."""
+        return Scene(
+            layout,
+            source=source,
+            psf=choice("psf", self.psf, _PROFILES),
+            fwhm=pixels("fwhm", self.fwhm, layout, n_wavelengths),
+            beta=number("beta", self.beta, above=1.0),
+            halo=number("halo", self.halo, most=1.0),
+            halo_fwhm=pixels("halo_fwhm", self.halo_fwhm, layout, n_wavelengths),
+            margin=number("margin", self.margin),
+        )
+
+    def _places(self, rng, scene, layout, n_frames):
+        """Return the place of the star and the factor of its width, in each frame."""
+        centre = np.asarray(scene.centre if self.centre is None else self.centre, dtype=float)
+        if centre.shape != (2,) or not np.all(np.isfinite(centre)):
+            raise ParameterError(f"centre = {centre}; two numbers are needed, x and y")
+        motion = float(pixels("motion", self.motion, layout, 1, least=0.0)[0])
+        centres = centre + motion * rng.standard_normal((n_frames, 2))
+        # a star beside the image would leave dark cubes
+        scene.check_places(centres)
+        # log-normal: a width cannot become negative
+        return centres, np.exp(number("seeing", self.seeing) * rng.standard_normal(n_frames))
+
+
+@dataclass(frozen=True)
+class DetectorModel:
+    """
+    What the detector of simulated cubes does to the light.
+
+    Parameters
+    ----------
+    background : float or array_like
+        In adu per pixel, scalar or one value per wavelength.
+    gain, read_noise : float, optional
+        Electrons per adu, and electrons per pixel; by default as the layout's ``read_out`` says.
+    noise : bool
+        Whether to draw noise; the variances are given either way.
+    saturate : bool
+        Whether pixels are cut off at the layout's ``saturation``.
+    bad_pixels : float
+        Share of the pixels without a value: NaN, with zero inverse variance.
+    flat_error : float
+        Relative standard deviation of the pixels' response, the same in all frames.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import DetectorModel
+    >>> DetectorModel(bad_pixels=1e-3).noise
+    True
+    """
+
+    background: object = 0.0
+    gain: float | None = None
+    read_noise: float | None = None
+    noise: bool = True
+    saturate: bool = False
+    bad_pixels: float = 0.0
+    flat_error: float = 0.0
+
+    def _read_by(self, how, n_wavelengths):
+        """Return the detector as read out in one way, before which numbers given here go."""
+        gain = how.gain if self.gain is None else self.gain
+        noise = how.read_noise if self.read_noise is None else self.read_noise
+        return Detector(
+            gain=number("gain", gain, above=0.0),
+            read_noise=number("read_noise", noise),
+            background=per_wavelength("background", self.background, n_wavelengths)[:, None, None],
+            saturation=how.saturation if self.saturate else np.inf,
+            noise=self.noise,
+            excess_noise=how.excess_noise,
+        )
+
+    def _defects(self, rng, shape):
+        """Return the response of the pixels, and which of them have no value."""
+        spread = number("flat_error", self.flat_error, most=0.5)
+        share = number("bad_pixels", self.bad_pixels, most=0.9)
+        # negative responses do not exist; beyond 2 sigma at the most allowed spread
+        response = (1 + spread * rng.standard_normal(shape)).clip(0.0) if spread else 1.0
+        return response, rng.random(shape) < share
+
+
+@dataclass(frozen=True)
+class CubeFiles:
+    """
+    How the files of simulated cubes are named, and what their headers say.
+
+    Parameters
+    ----------
+    exposure_time : `~astropy.units.Quantity`
+        Of a frame; the frames follow each other without a gap.
+    start : str or `~astropy.time.Time`
+        Start of the first frame.
+    headers : dict, optional
+        More keywords and values for all headers.
+    raw : bool
+        Whether the columns that the layout looks up in raw headers are written
+        there only; else they stand in the cubes, and there are no raw headers.
+    first : int
+        Number of the first frame.
+    prefix : str, optional
+        What the names of the files begin with; by default as the layout says.
+    overwrite : bool
+        Whether files that exist are replaced.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import CubeFiles
+    >>> CubeFiles(first=17).raw
+    True
+    """
+
+    exposure_time: u.Quantity = 10 * u.s
+    start: object = "2025-10-05T08:00:00"
+    headers: dict | None = None
+    raw: bool = True
+    first: int = 1
+    prefix: str | None = None
+    overwrite: bool = False
 
 
 def simulate_cubes(
@@ -55,29 +227,9 @@ def simulate_cubes(
     stokes=(1.0, 0.0, 0.0, 0.0),
     flux=None,
     lamp=None,
-    psf="moffat",
-    fwhm=5.0,
-    beta=3.0,
-    halo=0.0,
-    halo_fwhm=30.0,
-    centre=None,
-    motion=0.0,
-    seeing=0.0,
-    margin=6.0,
-    background=0.0,
-    gain=None,
-    read_noise=None,
-    noise=True,
-    saturate=False,
-    bad_pixels=0.0,
-    flat_error=0.0,
-    exposure_time=10 * u.s,
-    start="2025-10-05T08:00:00",
-    headers=None,
-    raw=True,
-    first=1,
-    prefix=None,
-    overwrite=False,
+    image=None,
+    detector=None,
+    files=None,
     seed=None,
     progress=False,
 ):
@@ -97,10 +249,10 @@ def simulate_cubes(
     instrument : Instrument
         With a `~astropolcal.instruments.FileLayout`.
     frames : `~astropy.table.QTable`
-        One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
+        One row per frame: ``hwp`` as commanded, ``derotator`` and anything else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column
-        ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` the
-        arguments below; ``em_gain`` and ``read_mode`` of the first row tell how the detector is
+        ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` those of
+        ``files``; ``em_gain`` and ``read_mode`` of the first row tell how the detector is
         read out. All columns that the layout has a keyword for are written.
     wavelength : `~astropy.units.Quantity`, optional
         Of the slices; by default the instrument's.
@@ -109,58 +261,18 @@ def simulate_cubes(
     stokes : sequence of float
         Stokes vector of the light that enters the chain.
     flux : float or array_like
-        Flux that enters the chain, in adu; scalar or one value a wavelength. Of
+        Flux that enters the chain, in adu; scalar or one value per wavelength. Of
         the internal source, what enters through an area as large as an aperture of
         the layout. By default 1e7, or what lights the brightest pixel to half of the
         saturation where that is less.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
-    psf : {"moffat", "gaussian"}
-        Profile of a star's core.
-    fwhm : float, array_like or `~astropy.units.Quantity`
-        Full width of the core at half maximum; pixels, or an angle on the sky.
-    beta : float
-        Exponent of a Moffat core.
-    halo : float
-        Share of the light in the halo, a Moffat profile with wings as of seeing.
-    halo_fwhm : float or `~astropy.units.Quantity`
-        Full width of the halo at half maximum.
-    centre : (float, float), optional
-        Place of the star in the left beam, 0-based x and y; by default the
-        middle of the field.
-    motion : float or `~astropy.units.Quantity`
-        Standard deviation of the place from frame to frame, in x and in y.
-    seeing : float
-        Relative standard deviation of ``fwhm`` from frame to frame.
-    margin : float
-        How far the field stop lies outside the apertures of the layout, pixels.
-    background : float or array_like
-        In adu per pixel, scalar or one value a wavelength.
-    gain, read_noise : float, optional
-        Electrons per adu, and electrons per pixel; by default as the layout's ``read_out`` says.
-    noise : bool
-        Whether to draw noise; the variances are given either way.
-    saturate : bool
-        Whether pixels are cut off at the layout's ``saturation``.
-    bad_pixels : float
-        Share of the pixels without a value: NaN, with zero inverse variance.
-    flat_error : float
-        Relative standard deviation of the pixels' response, the same in all frames.
-    exposure_time : `~astropy.units.Quantity`
-        Of a frame; the frames follow each other without a gap.
-    start : str or `~astropy.time.Time`
-        Start of the first frame.
-    headers : dict, optional
-        More keywords and values for all headers.
-    raw : bool
-        Whether the columns that the layout looks up in raw headers are written
-        there only; else they stand in the cubes, and there are no raw headers.
-    first : int
-        Number of the first frame.
-    prefix : str, optional
-        What the names of the files begin with; by default as the layout says.
-    overwrite : bool
-        Whether files that exist are replaced.
+    image : ImageModel, optional
+        How the light falls on the detector; by default a Moffat core of 5 pixels.
+    detector : DetectorModel, optional
+        What the detector does to it; by default photon and read noise only.
+    files : CubeFiles, optional
+        Names of the files, times and more of their headers.
     seed : int, optional
         Seed of all that is random.
     progress : bool
@@ -200,48 +312,40 @@ def simulate_cubes(
     ...     fits.getdata(paths[0], 1).shape
     (22, 201, 201)
     """
+    image, detector = image or ImageModel(), detector or DetectorModel()
+    files = files or CubeFiles()
     instrument, wavelength, more = _of_mode(instrument, wavelength)
     # what is given goes before what the mode says
-    more |= headers or {}
+    more |= files.headers or {}
     layout = _layout(instrument)
     choice("source", source, _SOURCES)
-    choice("psf", psf, _PROFILES)
-    frames = _with_headers(frames, layout, source, exposure_time, start)
+    frames = _with_headers(frames, layout, source, files.exposure_time, files.start)
     n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
-    star = {"source": source, "psf": psf, "fwhm": fwhm, "beta": beta, "margin": margin}
-    star |= {"halo": halo, "halo_fwhm": halo_fwhm}
-    scene = _scene(layout, n_wavelengths, **star)
+    scene = image._scene(layout, source, n_wavelengths)
     how = _read_out(frames, layout)
-    limit = how.saturation if saturate else np.inf
-    level = per_wavelength("background", background, n_wavelengths)[:, None, None]
-    light = {"lamp": lamp, "stokes": stokes}
+    reading = detector._read_by(how, n_wavelengths)
+    light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
     if flux is None:
-        images = star | light | {"background": background}
-        flux = _usual_flux(chain, instrument, frames, wavelength=wavelength, **images)
-    beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, **light)
-    detector = _detector(how, gain, read_noise, background=level, saturation=limit, noise=noise)
+        looks = {"image": image, "background": detector.background}
+        flux = _usual_flux(chain, instrument, frames, **light, **looks)
+    beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
         np.random.default_rng, np.random.SeedSequence(seed).spawn(n_frames + 2)
     )
-    place = scene.centre if centre is None else centre
-    jitter = float(pixels("motion", motion, layout, 1, least=0.0)[0])
-    centres, widths = _variations(of_star, place, jitter, number("seeing", seeing), n_frames)
-    # before the first file: a star beside the image would leave dark cubes
-    scene.check_places(centres)
-    response, bad = _defects(of_pixels, layout, flat_error, bad_pixels)
-    # the layout may have nothing to look up in raw headers, and then there are none
-    raw = raw and bool(layout.raw_columns or not layout.beam_files)
-    names = file_names(Path(directory), layout, prefix, first, n_frames, raw, overwrite)
+    # all that may be refused is, before the first file
+    centres, widths = image._places(of_star, scene, layout, n_frames)
+    response, bad = detector._defects(of_pixels, layout.shape)
+    names = file_names(Path(directory), layout, files, n_frames)
     brightest = 0.0
     for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
-        light = scene.light(beams[:, i], centres[i], widths[i])
-        brightest = max(brightest, float((light + level).max()))
-        image, weight = detector.expose(light, response, seeds[i])
+        falling = scene.light(beams[:, i], centres[i], widths[i])
+        brightest = max(brightest, float((falling + reading.background).max()))
+        cube, weight = reading.expose(falling, response, seeds[i])
         # as extraction marks pixels without a value
-        image[bad], weight[bad] = np.nan, 0.0
-        write_cube(*names[i], image, weight, header_of(frames[i], layout) | more, layout)
-    if brightest > how.saturation and not saturate:
+        cube[bad], weight[bad] = np.nan, 0.0
+        write_cube(*names[i], cube, weight, header_of(frames[i], layout) | more, layout)
+    if brightest > how.saturation and not detector.saturate:
         _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
 
@@ -256,18 +360,16 @@ def _usual_flux(
     source="internal",
     stokes=(1.0, 0.0, 0.0, 0.0),
     lamp=None,
+    image=None,
     background=0.0,
-    **star,
 ):
-    """Return the flux of cubes for which none is given, at most so much; ``star``: of `_STAR`."""
+    """Return the flux of cubes for which none is given, at most so much."""
     instrument, wavelength, _ = _of_mode(instrument, wavelength)
     layout = _layout(instrument)
     n = _count(layout, wavelength)
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
-    usual = inspect.signature(simulate_cubes).parameters
-    star = {name: usual[name].default for name in _STAR} | star
-    share = _scene(layout, n, source=source, **star).peak()
-    light = _beam_fluxes(chain, wavelength, frames, source, flux=1.0, lamp=lamp, stokes=stokes)
+    share = (image or ImageModel())._scene(layout, source, n).peak()
+    light = _beam_fluxes(chain, frames, wavelength, source, flux=1.0, lamp=lamp, stokes=stokes)
     room = _FILLED * _read_out(frames, layout).saturation
     room = room - per_wavelength("background", background, n)
     if np.any(room <= 0):
@@ -279,30 +381,6 @@ def _usual_flux(
     # two digits, rounded down
     digit = 10.0 ** (np.floor(-np.log10(brightest)) - 1)
     return float(np.floor(1 / (brightest * digit)) * digit)
-
-
-def _scene(layout, n_wavelengths, *, source, psf, fwhm, beta, halo, halo_fwhm, margin):
-    """Return what falls on the detector, of numbers that have been checked."""
-    return Scene(
-        layout,
-        source=source,
-        psf=psf,
-        fwhm=pixels("fwhm", fwhm, layout, n_wavelengths),
-        beta=number("beta", beta, above=1.0),
-        halo=number("halo", halo, most=1.0),
-        halo_fwhm=pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
-        margin=number("margin", margin),
-    )
-
-
-def _detector(how, gain, read_noise, **settings):
-    """Return the detector that a read-out describes; numbers that are given go before it."""
-    return Detector(
-        gain=number("gain", how.gain if gain is None else gain, above=0.0),
-        read_noise=number("read_noise", how.read_noise if read_noise is None else read_noise),
-        excess_noise=how.excess_noise,
-        **settings,
-    )
 
 
 def true_observations(
@@ -405,7 +483,7 @@ def both_states(frames):
     Parameters
     ----------
     frames : `~astropy.table.QTable`
-        One row a frame.
+        One row per frame.
 
     Returns
     -------
@@ -468,7 +546,7 @@ def _tracked(frames, layout):
     return angle % (360 * u.deg)
 
 
-def _beam_fluxes(chain, wavelength, frames, source, *, flux, lamp, stokes):
+def _beam_fluxes(chain, frames, wavelength, source, *, flux, lamp, stokes):
     """Return what reaches the detector, (beam, frame, wavelength), the right beam first."""
     table = frames[sorted({"hwp", *stages(chain)} & set(frames.colnames))]
     if source == "star":
@@ -477,25 +555,6 @@ def _beam_fluxes(chain, wavelength, frames, source, *, flux, lamp, stokes):
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # (beam, frame, wavelength)
     return np.stack([fluxes.T * scale for fluxes in right_left])
-
-
-def _variations(rng, centre, motion, seeing, n_frames):
-    """Return the place of the star and the factor of its width, in each frame."""
-    centre = np.asarray(centre, dtype=float)
-    if centre.shape != (2,) or not np.all(np.isfinite(centre)):
-        raise ParameterError(f"centre = {centre}; two numbers are needed, x and y")
-    centres = centre + motion * rng.standard_normal((n_frames, 2))
-    # log-normal: a width cannot become negative
-    return centres, np.exp(seeing * rng.standard_normal(n_frames))
-
-
-def _defects(rng, layout, flat_error, bad_pixels):
-    """Return the response of the pixels, and which of them have no value."""
-    spread = number("flat_error", flat_error, most=0.5)
-    share = number("bad_pixels", bad_pixels, most=0.9)
-    # negative responses do not exist; beyond 2 sigma at the most allowed spread
-    response = (1 + spread * rng.standard_normal(layout.shape)).clip(0.0) if spread else 1.0
-    return response, rng.random(layout.shape) < share
 
 
 def _warn_of_saturation(brightest, how):
@@ -510,16 +569,18 @@ def _warn_of_saturation(brightest, how):
 # ---- files ---------------------------------------------------------------------------------------
 
 
-def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
+def file_names(directory, layout, files, n_frames):
     """Return the paths of cube and raw header of every frame."""
     if not os.path.isdir(directory.parent):
         raise ObservationError(f"{directory}: there is no folder {directory.parent}")
     if os.path.exists(directory) and not os.path.isdir(directory):
         raise ObservationError(f"{directory}: is a file, not a folder")
-    prefix = layout.prefix if prefix is None else prefix
+    # the layout may have nothing to look up in raw headers, and then there are none
+    raw = files.raw and bool(layout.raw_columns or not layout.beam_files)
+    prefix = layout.prefix if files.prefix is None else files.prefix
     # eight digits, as the frame numbers of the Subaru archive have
-    numbers = [f"{prefix}{first + i:08d}" for i in range(n_frames)]
-    if first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
+    numbers = [f"{prefix}{files.first + i:08d}" for i in range(n_frames)]
+    if files.first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
         raise ParameterError(
             f"{numbers[-1]}: the number of the frame must match {layout.frame_pattern}"
         )
@@ -533,7 +594,7 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
     # all names before the first file is written: a run is replaced whole or not at all
     for path in (path for group in every for path in group if path is not None):
         if os.path.exists(path):
-            check_new(path, overwrite, ObservationError)
+            check_new(path, files.overwrite, ObservationError)
     folder = directory / "raw" if raw else directory
     try:
         folder.mkdir(exist_ok=True, parents=True)

@@ -73,7 +73,7 @@ class Frame(FrameHeader):
 
 def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
     """
-    Read a cube and measure both beams; whatever is wrong with the file is in ``errors``.
+    Read a cube and measure both beams; everything that is wrong with the file is in ``errors``.
 
     ``raw`` are raw frames by number; options are those of `measure_internal` or `measure_stars`,
     and a wrong one raises.

@@ -28,14 +28,14 @@ from astropolcal.instruments.layout import (
     RANGES,
     TEXTS,
     convert,
-    in_calendar,
     look_up,
     stated,
+    time_of,
     unit_of,
 )
 from astropolcal.observations import pointing as sky_pointing
-from astropolcal.observations.pointings import location_of, offline
-from astropolcal.units import iso_date, plain_number
+from astropolcal.observations.pointings import location_of, sky_angle
+from astropolcal.units import iso_date
 
 __all__ = []
 
@@ -251,15 +251,13 @@ def _target(values, site):
         raise ObservationError("no site of the telescope to compute the pointing from")
     time = observation_time(values)
     try:
-        ra, dec, unit = values["right_ascension"], values["declination"], u.hourangle
-        with suppress(ValueError):
-            ra, unit = plain_number(ra), u.deg
-        coordinate = SkyCoord(ra, dec, unit=(unit, u.deg), frame=FK5(equinox="J2000"))
+        ra, dec = (sky_angle(key, values[key]) for key in ("right_ascension", "declination"))
+        SkyCoord(ra, dec, unit=u.deg)  # refuses what is beyond the poles
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
     except (ValueError, TypeError, u.UnitsError) as error:
         raise ObservationError(f"right ascension and declination: {one_line(error)}") from None
-    return coordinate.ra.deg, coordinate.dec.deg, time.mjd
+    return ra, dec, time.mjd
 
 
 def _pointings(targets, site):
@@ -275,16 +273,14 @@ def _pointings(targets, site):
 
 def observation_time(values):
     """Return the UTC time that ``mjd``, or ``date`` and ``time`` (perhaps in the former) state."""
+    mjd, date, clock = (values.get(key) for key in ("mjd", "date", "time"))
+    # a pointing needs the time of day too
+    lacking = "date" if date is None else "time" if clock is None and "T" not in str(date) else ""
+    if mjd is None and lacking:
+        raise ObservationError(f"no {lacking} to compute the time from")
     try:
-        if "mjd" in values:
-            return in_calendar(Time(values["mjd"], format="mjd", scale="utc"))
-        date = iso_date(values["date"])
-        date = date if "T" in date else iso_date(f"{date}T{values['time']}", "date and time")
-        with offline():
-            return in_calendar(Time(date, scale="utc"))
-    except KeyError as error:
-        raise ObservationError(f"no {error.args[0]} to compute the time from") from None
-    except (ValueError, ErfaError) as error:
+        return time_of(mjd, date, clock)
+    except (TypeError, ValueError, ErfaError) as error:
         raise ObservationError(f"time: {one_line(error)}") from None
 
 
@@ -307,7 +303,7 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     """
     Return what is wrong with commanded angles (degree, in the order of the frames), by index.
 
-    Angles that are no multiple of the layout's step do not fit. The frames are cut into blocks of
+    Angles that are not multiples of the layout's step do not fit. The frames are cut into blocks of
     one derotator angle; the angles that most blocks have are the sequence. A block may lack some of
     them, but an angle that occurs more often in a block than in the sequence does not fit.
     """

@@ -80,7 +80,7 @@ class Scene:
         return np.asarray(left) + self.offset, np.asarray(left)
 
     def peak(self):
-        """Return the largest share of a beam's light in a pixel, one value a wavelength or one."""
+        """Return the largest share of a beam's light in a pixel, one per wavelength or one."""
         if self.source != "star":
             return 1 / self.area
         # in the middle of a pixel it is the largest
@@ -207,9 +207,10 @@ _MAS_PER_DEG = 3.6e6
 
 
 def choice(name, value, allowed):
-    """Refuse a word that is not among those allowed."""
+    """Return a word, or refuse it if it is not among those allowed."""
     if value not in allowed:
         raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+    return value
 
 
 def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
@@ -223,7 +224,7 @@ def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
 
 
 def per_wavelength(name, value, n_wavelengths):
-    """Return numbers that are not negative, one a wavelength, shape (W,)."""
+    """Return numbers that are not negative, one per wavelength, shape (W,)."""
     value = np.asarray(value, dtype=float)
     if value.shape not in ((), (n_wavelengths,)) or not np.all(np.isfinite(value) & (value >= 0)):
         raise ParameterError(
@@ -233,7 +234,7 @@ def per_wavelength(name, value, n_wavelengths):
 
 
 def pixels(name, value, layout, n_wavelengths, least=0.5):
-    """Return a length on the detector in pixels, one a wavelength."""
+    """Return a length on the detector in pixels, one per wavelength."""
     # a plain number, and a Quantity without a unit, are pixels already
     if isinstance(value, u.Quantity) and value.unit is not u.dimensionless_unscaled:
         if value.unit.is_equivalent(u.pix):

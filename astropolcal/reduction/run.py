@@ -72,7 +72,7 @@ class Reduction:
 
     @property
     def table(self):
-        """One row a frame and wavelength; a cell that failed is masked and has a reason."""
+        """One row per frame and wavelength; a cell that failed is masked and has a reason."""
         return reduced_table(self.frames, self.instrument, self.meta)
 
     @property
@@ -220,7 +220,7 @@ def reduce_run(
         99 %; or pixels), ``annulus`` (width of the ring of the background, 5 pixels),
         ``aperture_correction`` (whether fluxes are scaled to all of the star's light, by a
         profile of its wings; or "growth", to what circles of ``max_radius`` have), ``companion``
-        (a second star brighter than this fraction of the first, 0.1, spoils a frame) and
+        (a second star brighter than this fraction of the first, 0.1, corrupts a frame) and
         ``max_masked`` (0.1).
 
     Returns

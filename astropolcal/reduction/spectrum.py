@@ -2,7 +2,7 @@
 """
 A reduced target as `specutils.Spectrum` objects, and back.
 
-The table of a target has one row a wavelength: ``wavelength``, ``intensity``,
+The table of a target has one row per wavelength: ``wavelength``, ``intensity``,
 ``q``, ``u`` and, if measured, ``v``, each with its standard deviation in a column
 that ends in ``_err``. ``covariance_qu``, systematic errors (``q_systematic``, ...)
 and ``mask`` (true where a row must not be used) are optional. The table that a
@@ -43,7 +43,7 @@ def spectra_from_table(table):
     dict of str to `~specutils.Spectrum`
         ``"I"``, ``"q"``, ``"u"`` and, if it is there, ``"v"``, on one spectral axis in
         the order of the wavelengths. ``meta`` is that of the table; ``covariance_qu``,
-        one value a wavelength, stands in that of ``q`` and ``u``, a systematic error
+        one value per wavelength, stands in that of ``q`` and ``u``, a systematic error
         as ``systematic`` in that of its spectrum.
 
     Raises

@@ -131,7 +131,7 @@ def read_pypolcal(files, meta=None, *, name=None):
     Parameters
     ----------
     files : path-like or sequence of path-like
-        One file a wavelength bin, or a folder of them.
+        One file per wavelength bin, or a folder of them.
     meta : dict, optional
         What the files do not say: ``instrument``, ``source``, ``date`` and so on; the
         instrument is SCExAO/CHARIS unless given.

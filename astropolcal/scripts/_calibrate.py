@@ -58,7 +58,7 @@ files FILE * Input  observation tables (ECSV)
     half-wave-plate cycles
 --weights {none,wavelength,errors} =none  equal weights (default), one over the residuals' scatter
     at each wavelength, or one over the tables' errors
---errors {scatter,white} =scatter  errors from how the residuals scatter and hang together
+--errors {scatter,white} =scatter  errors from how the residuals scatter and are correlated
     (default), or those of independent data with the noise of --weights
 @ fix free
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
@@ -205,7 +205,7 @@ def _check_standards(paths, standards, files, datasets):
             # a prediction of what was fitted proves nothing
             if standard.content_hash == dataset.content_hash:
                 raise AstropolcalError(
-                    f"--standard {path} is no independent standard: it is fitted as {file}"
+                    f"--standard {path} is not an independent standard: it is fitted as {file}"
                 )
 
 

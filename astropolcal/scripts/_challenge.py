@@ -151,7 +151,7 @@ def _workers(count):
 
 
 class _Progress:
-    """Says now and then how many challenges are done, and after how many seconds."""
+    """Reports from time to time how many challenges are done, and after how many seconds."""
 
     def __init__(self):
         self.started = self.said = time.monotonic()

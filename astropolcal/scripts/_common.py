@@ -8,14 +8,20 @@ import re
 import stat
 import sys
 import textwrap
+import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
-from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
-from astropolcal.files import atomic_path, check_kind, one_line, printable
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    InstrumentError,
+    ParameterError,
+)
+from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
@@ -160,7 +166,7 @@ def _state(path, place):
 
 
 def _reason(problem):
-    return getattr(problem, "strerror", None) or f"it is no name of a file ({problem})"
+    return getattr(problem, "strerror", None) or f"it is not the name of a file ({problem})"
 
 
 def _check_writable(path, place):
@@ -298,7 +304,7 @@ _SHARED = """
 --full  print everything; by default what fits a terminal of 80 columns and 24 lines
 --json FILE Output  write a summary for machines (- for stdout)
 --online  fetch new tables of the Earth's rotation; by default the network is not used
--q --quiet  print nothing but warnings and errors
+-q --quiet  print only warnings and errors
 --plots DIR Folder  save the figures in this folder
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
@@ -370,24 +376,9 @@ def wrapped(line, indent=0):
     )
 
 
-def plain(value):
-    """Return a value as JSON knows it: null for what is no finite number, text for the unknown."""
-    if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    return " ".join(str(value).split())
-
-
 def write_json(content, path):
     """Write a dictionary as JSON, atomically; ``-`` is the standard output."""
-    text = json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
+    text = json.dumps(plain(content, f"JSON of {path}"), indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
         return
@@ -475,7 +466,7 @@ def read_datasets(paths):
 
 
 def _check_table(path):
-    """Refuse a file of ours that is no observation table, and say which command wants it."""
+    """Refuse a file of this package that is not a table, and say which command needs it."""
     try:
         with open(path, "rb") as stream:
             start = stream.read(max(map(len, _NO_TABLES)))
@@ -517,6 +508,10 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
+        # zero is the same in all units
+        if parameter.unit and re.fullmatch(r"[-+.\deE\s]+", value) and float(value):
+            message = f"--fix {text}: no unit is given, {parameter.unit} is taken"
+            warnings.warn(message, AstropolcalWarning, stacklevel=2)
     for text in prior:
         name, _, value = text.partition("=")
         for parameter in _parameters(chains, name):

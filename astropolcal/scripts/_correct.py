@@ -69,9 +69,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
     zenith (default: 0)
 --mirrored  east is to the right of north
---open-directions SIGMA sigma =infinite  systematic errors along what the calibration leaves open:
-    infinite (default), ignore, or the standard deviation of the angle that each is named after, in
-    degrees
+--open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not
+    determine: infinite (default), ignore, or the standard deviation of the angle that each is
+    named after, in degrees
 --samples N int =0  systematic errors from N samples of the calibration (default: linearized)
 --seed N int  of the random numbers of --samples
 --spectrum OUT.ecsv Output  table of the star in an aperture
@@ -205,10 +205,10 @@ def _radius(arguments):
 
 def choose_calibration(arguments, files):
     """
-    Return the calibration of the frames, its chain and what is said of where it comes from.
+    Return the calibration of the frames, its chain and the statements on where it comes from.
 
     A file that says itself that it does not hold for the frames is refused like one in a library,
-    unless the user wants it for any date.
+    unless the user asks for it for any date.
     """
     from astropolcal import Calibration, instruments
     from astropolcal.converters.calibration import content_hash
@@ -233,7 +233,7 @@ def choose_calibration(arguments, files):
 
 
 def _check_validity(calibration, path, arguments, night):
-    """Refuse frames for which the calibration does not hold, unless the user wants it."""
+    """Refuse frames for which the calibration does not hold, unless the user asks for it."""
     from astropolcal.pipeline.headers import check_frames
 
     # --filter names the mode as the file does, whatever the headers call it

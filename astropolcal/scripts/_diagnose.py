@@ -57,7 +57,7 @@ files FILE * Input  observation tables (ECSV); before them may stand a calibrati
 @ derotator bounds m3 plate without free fix
 --effects all|NAME,NAME =all  which effects to try (default: all; help lists them)
 --changes  ask what changed between several runs of the same kind of source
---nested  choose the causes anew without each group of frames, and predict these: slow, and the one
+--nested  choose the causes again without each group of frames, and predict these: slow, and the one
     measure in which the choice has no part
 --report FILE.html Output  write a page with tables and figures
 --save CAL.asdf Output  calibrate with the effects that were found, and write the calibration
@@ -92,7 +92,7 @@ def run(arguments):
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
-    say(summary(diagnosis, content, written))
+    say(summary(diagnosis, written))
 
 
 class _Progress:
@@ -190,7 +190,7 @@ def _write(diagnosis, content, arguments, instrument):
 
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
-        write_html(diagnosis, arguments.report, content=content, **figures)
+        write_html(diagnosis, arguments.report, **figures)
         written.append(arguments.report)
     if arguments.save:
         from astropolcal.gap._numbers import with_causes
@@ -223,5 +223,5 @@ def _size_figures(diagnosis, content):
         if any(has_sizes(entry)):
             # the size of some depends on nothing
             with suppress(ParameterError):
-                found[entry["name"]] = plot_effect_sizes(diagnosis, entry["name"], content=content)
+                found[entry["name"]] = plot_effect_sizes(diagnosis, entry["name"])
     return found

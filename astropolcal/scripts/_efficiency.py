@@ -38,7 +38,7 @@ file CAL.asdf ? Input  calibration
 --wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
 --target RA,DEC  for the best derotator offset: position in degree
 --night START/END  times in UTC, with --target
---law MODE  what the derotator keeps still, such as field (default: pupil)
+--law MODE  what the derotator stabilizes, such as field (default: pupil)
 --date DATE  of the telescope's mirrors, where that matters
 -o --output FILE Output  save the figure (PNG, PDF, SVG); with --target that of the derotator
     offsets
@@ -89,7 +89,7 @@ def _chain(arguments):
 
 
 def _on_sky(instrument, chain, grid, arguments):
-    """Return the chain behind the telescope; as it is where no telescope is known."""
+    """Return the chain downstream of the telescope; as it is where no telescope is known."""
     if not instrument.has_telescope or "parallactic" in stages(chain):
         return chain
     known = {"wavelength": grid, "date": arguments.date}
@@ -124,7 +124,7 @@ def _pointing(arguments, chain):
 
 
 def _mode(arguments, instrument):
-    """Return what the derotator keeps still; the pupil, if it can and nothing is said."""
+    """Return what the derotator stabilizes; the pupil, if it can and nothing is stated."""
     modes = instrument.sky_law.modes
     if arguments.law is not None and modes and arguments.law not in modes:
         raise ParameterError(
@@ -152,7 +152,7 @@ def _rows(wanted, grid):
 
 
 def _best(arguments, instrument, chain, grid):
-    """Return the best derotator offset, and what is said of it."""
+    """Return the best derotator offset, and the statements on it."""
     from astropolcal.efficiency import best_derotator
 
     altitude, parallactic = _track(arguments, instrument)
@@ -238,7 +238,7 @@ def _draw(arguments, instrument, chain, grid, best=None):
 
 
 def _table_text(content):
-    turns, where = "derotator_deg" in content, "behind the internal source"
+    turns, where = "derotator_deg" in content, "downstream of the internal source"
     if "altitude_deg" in content:
         where = f"at altitude {content['altitude_deg']:g} deg, parallactic angle "
         where += f"{content['parallactic_deg']:g} deg"

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from astropolcal.exceptions import ObservationError
-from astropolcal.scripts._common import give, plain, printer, wrapped
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.files import one_line, plain
+from astropolcal.scripts._common import give, printer, wrapped
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
 DESCRIPTION = (
-    "Say what a calibration file, a folder of calibrations, an observation table, an image cube or "
-    "a corrected product holds; of a calibration also how good it is and for what it is valid. "
-    "Without a file, what this installation knows."
+    "Say what a calibration file, a folder of calibrations, an observation table, an\n"
+    "image cube or a corrected product holds; of a calibration also how good it is and\n"
+    "for what it is valid. Without a file, what this installation knows."
 )
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
@@ -34,6 +35,14 @@ _OBSERVED = {"flux_right", "flux_left", "single_difference", "single_sum"}
 _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitude")
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
+
+EXAMPLES = """\
+examples:
+  astropolcal info                     version, instruments and optics
+  astropolcal info cal.asdf --full     all of a calibration's summary
+  astropolcal info library/            the calibrations of a folder
+  astropolcal info run.ecsv            frames, wavelengths and angles of a table
+"""
 
 
 def run(arguments):
@@ -221,8 +230,14 @@ def _other_table(path, table):
 
 
 def _told(values):
-    """Return values as JSON has them; what is neither number, text nor a list is shown as text."""
-    return {str(k): plain(str(v) if isinstance(v, dict) else v) for k, v in values.items()}
+    """Return values as JSON has them; what it does not know, and what is nested, is text."""
+    told = {}
+    for key, value in values.items():
+        try:
+            told[str(key)] = one_line(value, None) if isinstance(value, dict) else plain(value)
+        except AstropolcalError:
+            told[str(key)] = one_line(value, None)
+    return told
 
 
 # ---- FITS files -----------------------------------------------------------------------------

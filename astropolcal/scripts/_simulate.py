@@ -32,8 +32,8 @@ examples:
       --parallactic 24,30 --derotator 97 --fix star.q=0.01
 """
 
-# of the light in an image
-_LOOKS = ("source", "psf", "fwhm", "halo", "background")
+# what of the options of --cubes tells of the image, the rest of the detector
+_IMAGE = ("psf", "fwhm", "halo", "motion", "seeing")
 _DEROTATOR = [45 + 12.5 * i for i in range(8)]
 
 #: Options of image cubes, which do nothing without ``--cubes``.
@@ -59,7 +59,8 @@ OPTIONS = f"""
     overwritten if it exists
 --instrument NAME =charis  default: charis
 --calibration CAL.asdf Input  take the chain from this file
---hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25)
+--hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25; of a star 0, 45,
+    22.5 and 67.5)
 --derotator DEG,DEG,... angles  derotator angles (default: 45 to 132.5 by 12.5)
 --source {{internal,star}} =internal  the internal source, or a star (default: %(default)s)
 --altitude DEG[,DEG] angles  altitude angle of a star in all frames, or in the first and last
@@ -154,8 +155,22 @@ def _flux(arguments, instrument, chain, wavelength, frames):
         return EXAMPLE["flux"]
     from astropolcal.reduction.cubes import _usual_flux
 
-    options = {name: getattr(arguments, name) for name in _LOOKS}
-    return _usual_flux(chain, instrument, frames, EXAMPLE["flux"], wavelength=wavelength, **options)
+    return _usual_flux(
+        chain,
+        instrument,
+        frames,
+        EXAMPLE["flux"],
+        wavelength=wavelength,
+        source=arguments.source,
+        image=_image(arguments),
+        background=arguments.background,
+    )
+
+
+def _image(arguments):
+    from astropolcal.reduction import ImageModel
+
+    return ImageModel(**{name: getattr(arguments, name) for name in _IMAGE})
 
 
 def _table(arguments, instrument, chain, wavelength, frames, meta):
@@ -177,18 +192,21 @@ def _table(arguments, instrument, chain, wavelength, frames, meta):
 
 
 def _write_cubes(arguments, instrument, chain, wavelength, frames):
-    from astropolcal.reduction.cubes import simulate_cubes
+    from astropolcal.reduction import DetectorModel, simulate_cubes
 
-    names = ("source", "flux", "seed", *_USUAL)
+    options = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
     return simulate_cubes(
         arguments.cubes,
         chain,
         instrument,
         frames,
         wavelength=wavelength,
-        noise=not arguments.no_noise,
+        source=arguments.source,
+        flux=arguments.flux,
+        image=_image(arguments),
+        detector=DetectorModel(noise=not arguments.no_noise, **options),
+        seed=arguments.seed,
         progress=not arguments.quiet,
-        **{name: getattr(arguments, name) for name in names},
     )
 
 

@@ -12,9 +12,9 @@ from astropolcal.words import counted, did_you_mean
 
 HELP = "list polarimetric standard stars and when they are observable"
 DESCRIPTION = (
-    "List the polarimetric standard stars of the catalogue. With a site and a night, those that "
-    "rise above the limit, the best for the diattenuation of the telescope first. With a name, all "
-    "that is known of that star."
+    "List the polarimetric standard stars of the catalogue. With a site and a night,\n"
+    "those that rise above the limit, the best for the diattenuation of the telescope\n"
+    "first. With a name, all that is known of that star."
 )
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
@@ -39,6 +39,13 @@ _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
 _LISTED = 20
+
+EXAMPLES = """\
+examples:
+  astropolcal standards --kind polarized --band H --magnitude 4,8
+  astropolcal standards --site subaru --night 2025-11-03 --plot night.png
+  astropolcal standards "HD 30675"
+"""
 
 
 def run(arguments):

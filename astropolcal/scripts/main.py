@@ -40,9 +40,26 @@ class _OneLineParser(argparse.ArgumentParser):
         for kind in (float, int):
             self.register("type", kind, partial(_number, kind))
 
+    def parse_known_args(self, args=None, namespace=None):
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            # here, where the command is known: argparse complains in the name of the whole program
+            hint = _did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return namespace, unknown
+
     def error(self, message):
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong:
+            message += _did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
         # argparse prints the usage in several lines before its complaint
         self.exit(2, f"astropolcal: error: {_one_line(message)} (see {self.prog} --help)\n")
+
+
+def _did_you_mean(text, known):
+    from astropolcal.words import did_you_mean
+
+    return did_you_mean(text, known)
 
 
 def _number(kind, text):

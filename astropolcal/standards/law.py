@@ -74,7 +74,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     The model returns the degree; `q`, `u` and `stokes` also use the angle.
     ``theta`` and ``rotation`` are fixed by default, because a fit to degrees
-    says nothing about them.
+    does not constrain them.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class SerkowskiLaw(Fittable1DModel):
     rotation : `~astropy.units.Quantity`
         Change of the angle with wavelength.
     **kwargs
-        Whatever an `astropy.modeling.Model` takes, such as ``name``.
+        What an `astropy.modeling.Model` takes, such as ``name``.
 
     Raises
     ------

@@ -340,7 +340,7 @@ def _line(x, offset, error):
 
 def assumed_polarization(star, wavelength):
     """
-    Return what a calibration assumes of a star: a row a wavelength, and the reasons in words.
+    Return what a calibration assumes of a star: a row per wavelength, and the reasons in words.
 
     Rows have degree (percent) and angle (deg) of polarization with the errors along and across it;
     of light without polarization there is no angle. None if the polarization is not known.

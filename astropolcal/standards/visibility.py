@@ -185,15 +185,15 @@ def telescope_information(
               R = \left|\frac1n \sum e^{2 i \psi}\right| ,
 
     so only the spread of the parallactic angle counts: a half turn of the double
-    angle is all that one can wish for, and a star that barely turns says
-    nothing.
+    angle is all that one can wish for, and a star that barely rotates does
+    not constrain it.
 
     Parameters
     ----------
     parallactic : `~astropy.units.Quantity`
         One angle per frame, shape (n,).
     altitude : `~astropy.units.Quantity`, optional
-        One a frame; needed with ``offset``.
+        One per frame; needed with ``offset``.
     frame_error : float
         Standard error of q and of u in one frame. The default of 1 gives errors
         in units of it.

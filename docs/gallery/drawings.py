@@ -112,10 +112,10 @@ def _faults():
     retarder = optics.LinearRetarder(retardance=3 * u.deg, theta=45 * u.deg, name="fault")
     return {
         "gains of the beams, 1 %": (optics.BeamGain(imbalance=0.01, name="fault"), {}),
-        "diattenuation behind\nthe derotator, 1 %": (behind, {"before": "wollaston"}),
+        "diattenuation after\nthe derotator, 1 %": (behind, {"before": "wollaston"}),
         "diattenuation of\nthe derotator, 1 %": (derotator, {"after": "derotator"}),
         "diattenuation of\nthe plate, 1 %": (plate, {"after": "hwp"}),
-        "retarder behind\nthe derotator, 3 deg": (retarder, {"before": "wollaston"}),
+        "retarder after\nthe derotator, 3 deg": (retarder, {"before": "wollaston"}),
     }
 
 

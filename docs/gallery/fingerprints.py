@@ -108,7 +108,7 @@ def bench_dichroic():
 
 @functools.cache
 def bench_bare():
-    """Return the same with nothing in front of the plate but the polarizer."""
+    """Return the same with nothing upstream of the plate but the polarizer."""
     chains = _bench_chains()
     chains[1] = remove_optic(chains[1], "fold_mirror")
     return _scene("a model without the fold mirror", chains, _FRAMES)
@@ -212,7 +212,7 @@ def fingerprint(name, make=bench):
     -------
     tuple
         The change that the effect makes, and what is left of it when the nominal parameters have
-        taken up what they can. An alternative without a size has the first only.
+        absorbed what they can. An alternative without a size has the first only.
     """
     return _changes(name, make)
 
@@ -283,7 +283,7 @@ def draw_rows(figure, rows, columns):
 
 
 def gallery(names, make=bench):
-    """Draw what is left of several effects, one a row, into a new figure of pyplot."""
+    """Draw what is left of several effects, one per row, into a new figure of pyplot."""
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(10, 0.9 * len(names) + 0.9), layout="constrained")

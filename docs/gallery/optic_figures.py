@@ -30,7 +30,7 @@ def _spread(values):
 
 
 def _coordinates(optic):
-    """Yield the label, the values and the Mueller matrices along whatever changes an optic."""
+    """Yield the label, the values and the Mueller matrices along what changes an optic."""
     if optic.stage in COORDINATES:
         largest = 2 * getattr(optic, "reference", 0.5)
         # the share of a constant light grows without end towards no flux
@@ -126,9 +126,9 @@ def _train(optic):
     if optic.splits_light:
         return [plate, one], "in the place of the beam splitter"
     if optic.depends_on_beam:
-        return [plate, splitter, one], "behind the beam splitter"
+        return [plate, splitter, one], "downstream of the beam splitter"
     if _is_source(optic):
-        return [one, plate, splitter], "in front of the half-wave plate"
+        return [one, plate, splitter], "upstream of the half-wave plate"
     return [plate, one, splitter], "between half-wave plate and beam splitter"
 
 

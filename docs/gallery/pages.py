@@ -214,10 +214,10 @@ def inserted_classes(name):
 
 def _law(basis, per_wavelength, grid):
     if basis is None:
-        return "one value a wavelength" if per_wavelength else "one number"
+        return "one value per wavelength" if per_wavelength else "one number"
     n, k = basis.shape
     if k >= n:
-        return "one value a wavelength"
+        return "one value per wavelength"
     if np.allclose(basis, law_basis(grid, k - 1)):
         return f"polynomial of degree {k - 1} in wavelength" if k > 1 else "one number"
     return f"{k} functions of wavelength" if k > 1 else "a function of wavelength, times a number"
@@ -298,7 +298,7 @@ def _caption(effect, words):
         "The change that the alternative makes, before anything is refitted"
         if effect.kind == "discrete"
         else "Above, the change for the size to expect, with the coefficients 1, -0.6 and 0.4 of "
-        "its law. Below, what is left of it when the free parameters of the model have taken up "
+        "its law. Below, what is left of it when the free parameters of the model have absorbed "
         "what they can: what a diagnosis can see"
     )
     return f"{what}. The scene is {words}. :ref:`effect-pictures` says how to read it."
@@ -361,7 +361,7 @@ def effect_row(name):
         parts.append(f"Law: {_law_of(effect)}")
         parts.append(f"Parameter{'s' if len(keys) > 1 else ''} {listed}: {sizes}")
     if effect.absorbed_by:
-        parts.append(f"Taken up by ``{effect.absorbed_by}``")
+        parts.append(f"Absorbed by ``{effect.absorbed_by}``")
     parts.append(f"Reference: {effect.reference}")
     text = textwrap.indent(textwrap.fill(". ".join(parts) + ".", 96), "    ")
     return f":doc:`{name} </generated/models/effects/{name}>`\n    {effect.title}.\n\n{text}\n"
@@ -373,7 +373,7 @@ def _law_of(effect):
         known = effect.degree and f"polynomial of degree {effect.degree} in wavelength"
         maker = None if type(effect).law is Effect.law else type(effect).law
     else:
-        known = "one value a wavelength" if effect.degree is None else None
+        known = "one value per wavelength" if effect.degree is None else None
         maker = effect.degree if callable(effect.degree) else None
     if "edit" in vars(type(effect)) and hasattr(effect, "is_open"):
         return "as in the chain"

@@ -3,16 +3,16 @@
 1. Calibrate the internal source
 ================================
 
-A lamp behind a polarizer, eight angles of the half-wave plate at each of eight derotator angles:
-from the table of fluxes to a calibration file. By default this is the simulated run that comes with
-the package.
+A lamp downstream of a polarizer, eight angles of the half-wave plate at each of eight derotator
+angles: from the table of fluxes to a calibration file. By default this is the simulated run that
+comes with the package.
 """
 
 # %%
 # The observations
 # ----------------
 #
-# A table holds the fluxes of both beams, one row a frame and wavelength, with the angles of the
+# A table holds the fluxes of both beams, one row per frame and wavelength, with the angles of the
 # stages. It is checked when it is read.
 
 import os
@@ -35,8 +35,8 @@ print(observations.summary())
 
 # %%
 # Frames whose half-wave plates stand 45 degrees apart make a pair. Each pair gives a normalized
-# double difference a wavelength, in which the gains of the beams and whatever stands still behind
-# the plate cancel to first order.
+# double difference per wavelength, in which the gains of the beams and the polarization of static
+# optics downstream of the plate cancel to first order.
 
 print(observations.pairs().shape[0], "pairs at", len(observations.wavelength), "wavelengths")
 
@@ -63,9 +63,10 @@ calibration = calibrate(chain, observations, instrument="charis")
 print(calibration.summary())
 
 # %%
-# The summary says what the data leave open. Two turns cannot be told from retardances of the
-# derotator; parameters that take part in them have no error, rather than a small and wrong one. The
-# page :doc:`/gauge` explains what that means on sky and how to close them.
+# The summary says what the data do not determine. Two rotations cannot be distinguished from
+# retardances of the derotator; parameters that take part in them have no error, rather than a small
+# and wrong one. The page :doc:`/gauge` explains what that means on sky and which observations
+# determine them.
 #
 # Look at it
 # ----------

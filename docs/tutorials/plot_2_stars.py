@@ -3,9 +3,9 @@
 2. Lamps and stars in one fit
 =============================
 
-A lamp knows nothing of the telescope. An unpolarized star shows what the tertiary mirror adds,
-and a lamp without polarizer what the fold mirror does. All three are fitted together here, so
-that the covariance of one calibration knows about all of them.
+The light of a lamp does not pass the telescope. An unpolarized star shows the polarization that the
+tertiary mirror adds, and a lamp without polarizer what the fold mirror does. All three are fitted
+together here, so that the covariance of one calibration knows about all of them.
 """
 
 # %%
@@ -77,8 +77,8 @@ for dataset in data:
 # Frames that cannot be used
 # --------------------------
 #
-# ``prepare`` masks frames of incomplete cycles and those taken while the lamp warmed up, and says
-# so.
+# ``prepare`` masks frames of incomplete cycles and those taken while the lamp warmed up, with a
+# warning.
 
 data = [charis.prepare(dataset) for dataset in data]
 for dataset in data:
@@ -103,9 +103,9 @@ print(calibration)
 # The mirrors
 # -----------
 #
-# Their diattenuations, beside those of bare metals at the same incidence. With one weight for all
-# data the noisier lamp would set the errors of the tertiary mirror; ``weights="wavelength"`` gives
-# each dataset and wavelength its own.
+# The figure compares their diattenuations with those of bare metals at the same incidence. With one
+# weight for all data the noisier lamp would set the errors of the tertiary mirror;
+# ``weights="wavelength"`` gives each dataset and wavelength its own.
 
 known = calibration.parameter_values()
 for name in ("fold_mirror.diattenuation", "m3.diattenuation"):
@@ -124,15 +124,15 @@ plot_double_differences(calibration, dataset=2, figure=figure)
 # What an observer gets
 # ---------------------
 #
-# What the calibration claims for targets of 30, 1 and 0.1 %, below the residuals of the three
-# datasets:
+# The figure shows the residuals of the three datasets and, below, the accuracies for targets of 30,
+# 1 and 0.1 %:
 
 figure = plt.figure(figsize=(8.5, 11))
 plot_target_accuracy(calibration, figure=figure)
 
 # %%
-# The star itself, cycle by cycle, inverted with the calibration. It is taken for unpolarized, so
-# what is left is the noise and the error of the model.
+# The star's polarization in each cycle follows from the calibration. The star is taken as
+# unpolarized, so the remainder is the noise and the error of the model.
 
 found = star_stokes(calibration, calibration.chains[2], data[2])
 print(star_accuracy(found)["wavelength", "s_q", "s_u"])

@@ -13,7 +13,7 @@ has an error in it that the model does not know, and the diagnosis is to find it
 #
 # The true instrument has beams of unequal gain and a half-wave plate that absorbs one polarization
 # more than the other. The model has neither. With a folder of tables, the real internal source is
-# diagnosed instead, and nobody knows the answer.
+# diagnosed instead, and the answer is not known.
 
 import os
 from pathlib import Path
@@ -61,9 +61,9 @@ else:
 # Ask
 # ---
 #
-# ``diagnose`` asks for every small error that an optic may have, its cells of place, kind and
-# dependence, and for the effects of the library that have a name. A few names are enough here, so
-# that the page builds quickly.
+# ``diagnose`` tests every small error that an optic may have, the cells of place, kind and
+# dependence, and the named effects of the library. A few names are enough here, so that the page
+# builds quickly.
 
 effects = [
     "beam_gain",
@@ -80,37 +80,37 @@ print(summary(diagnosis))
 # How to read it
 # --------------
 #
-# First comes what the model lacks, with its probability; then how large the gap is on frames that
-# were left out of the fit, in double and in single differences beside the noise; then what is
-# left.
+# The first lines state what the model lacks, with its probability. The next give the gap on frames
+# that were left out of the fit, in double and in single differences, and the noise; the last give
+# the remainder.
 
 causes = causes_table(diagnosis)
 print(causes["rank", "effect", "probability", "explained"])
 
 # %%
-# Where in the chain the causes are, and of which kind. What the data cannot tell apart shares the
-# probability.
+# The map shows where in the chain the causes are, and of which kind. Causes that the data cannot
+# distinguish share the probability.
 
 figure = plt.figure(figsize=(6.4, 4.6))
 plot_cause_map(diagnosis, figure=figure)
 
 # %%
-# The residuals frame by frame, before and after, with what the causes do. Unequal gains are the
-# same in all frames; what turns with the half-wave plate goes up and down.
+# The residuals of each frame, before and after, with the contribution of the causes. Unequal
+# gains are the same in all frames; an effect that turns with the half-wave plate alternates.
 
 figure = plt.figure(figsize=(9, 6.4))
 plot_gap_frames(diagnosis, figure=figure)
 
 # %%
-# The gap against wavelength, before and after the effects are in the model. Where the second line
-# meets the noise, nothing is missing that these data could show.
+# The gap against wavelength, before and after the effects are in the model. Where the second
+# line meets the noise, these data show no further cause.
 
 figure = plt.figure(figsize=(10, 8.2))
 plot_gap_spectrum(diagnosis, figure=figure)
 
 # %%
-# Maps of the residuals: wavelength against frame. Unequal gains are a constant, in all frames; what
-# turns with the half-wave plate makes stripes.
+# Maps of the residuals: wavelength against frame. Unequal gains are constant in all frames; an
+# effect that turns with the half-wave plate makes stripes.
 
 figure = plt.figure(figsize=(12, 7.9))
 plot_gap_maps(diagnosis, figure=figure)
@@ -119,8 +119,8 @@ plot_gap_maps(diagnosis, figure=figure)
 # And then
 # --------
 #
-# The improved chains are ordinary chains. They calibrate, go into files and correct science data;
-# the page :doc:`/diagnosis` says how, and what the limits of such a search are.
+# The improved chains are ordinary chains. They can be calibrated, written to files and used to
+# correct science data; the page :doc:`/diagnosis` describes this and the limits of the search.
 
 for chain in diagnosis.chains:
     print(" | ".join(optic.name for optic in chain))

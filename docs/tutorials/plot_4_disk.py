@@ -11,9 +11,10 @@ circular polarization. What a double difference makes of it, and what the calibr
 # The scene
 # ---------
 #
-# A ring of scattered light, polarized by up to 40 % across the direction to the star. The
-# instrument is the published one, with the telescope in front. With a folder of real tables it is
-# the one that they calibrate, and the telescope points where it pointed in a real night.
+# The scene is a ring of scattered light, polarized by up to 40 % across the direction to the star.
+# The instrument is the published one, with the telescope upstream of it. With a folder of real
+# tables it is the one that they calibrate, and the telescope points where it pointed in a real
+# night.
 
 import os
 from pathlib import Path
@@ -84,9 +85,9 @@ frames = ScienceFrames.from_arrays(
 # Three ways to reduce it
 # -----------------------
 #
-# ``mode="ip"`` takes the instrument for ideal but for the polarization that it adds to
-# unpolarized light: what a reduction without a calibration of the retardances does.
-# ``mode="stokes"`` inverts the whole chain.
+# ``mode="ip"`` takes the instrument as ideal except for the polarization that it adds to
+# unpolarized light, as a reduction without a calibration of the retardances does. ``mode="stokes"``
+# inverts the whole chain.
 
 full = correct(chain, frames)
 plain = correct(chain, frames, mode="ip")
@@ -101,8 +102,8 @@ for name, image in (("without crosstalk", plain), ("with the whole chain", full)
     print(f"{name}: {words} of the polarized light of the ring")
 
 # %%
-# The degree is not all that suffers. Turned polarization goes from :math:`Q_\phi` to
-# :math:`U_\phi`, where an observer looks for multiple scattering.
+# The degree of polarization is not the only error. Rotated polarization moves from
+# :math:`Q_\phi` to :math:`U_\phi`, where an observer looks for multiple scattering.
 
 figure, axes = plt.subplots(2, 3, figsize=(11, 7), layout="constrained", sharex=True, sharey=True)
 limit = truth.max()
@@ -127,8 +128,8 @@ figure = plt.figure(figsize=(12.5, 8.2))
 plot_images(full, figure=figure)
 
 # %%
-# How well the inversion is determined depends on the retardance of the derotator and so on
-# wavelength: the condition is 1.4 for an ideal instrument.
+# The condition of the inversion depends on the retardance of the derotator and so on wavelength.
+# It is 1.4 for an ideal instrument.
 
 figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
 axis.plot(wavelength.to_value(u.nm), full.condition, "o-", color="#0072B2")

@@ -3,10 +3,10 @@
 5. From FITS cubes to Stokes parameters
 =======================================
 
-The whole way: image cubes of a lamp become a table of fluxes and a calibration; cubes of a star
-become its Stokes parameters, with errors. The cubes are simulated, because no real ones come with
-the package; the steps are those for real ones. With a folder of real tables, these take the place
-of the reduced cubes.
+A complete reduction: image cubes of a lamp become a table of fluxes and a calibration; cubes of a
+star become its Stokes parameters, with errors. The cubes are simulated, because no real ones come
+with the package; the steps are those for real ones. With a folder of real tables, these take the
+place of the reduced cubes.
 """
 
 # %%
@@ -28,7 +28,7 @@ from astropolcal import Observations, calibrate, instruments
 from astropolcal.measurement import parameter_table
 from astropolcal.optics import PolarizedSource
 from astropolcal.plotting.reduction import plot_apertures
-from astropolcal.reduction import reduce_run, simulate_cubes
+from astropolcal.reduction import DetectorModel, ImageModel, reduce_run, simulate_cubes
 from astropolcal.simulation import half_wave_plate_cycles
 
 charis = instruments.get("charis")
@@ -40,7 +40,8 @@ folder = os.environ.get("ASTROPOLCAL_DATA")
 CYCLE = [0, 45, 22.5, 67.5] * u.deg
 frames = half_wave_plate_cycles(CYCLE, [50, 70, 95] * u.deg)
 place = Path(scratch.name) / "lamp"
-cubes = simulate_cubes(place, truth, charis, frames, flux=4e6, bad_pixels=1e-3, seed=2)
+bad = DetectorModel(bad_pixels=1e-3)
+cubes = simulate_cubes(place, truth, charis, frames, flux=4e6, detector=bad, seed=2)
 print(len(cubes), "cubes")
 
 # %%
@@ -60,9 +61,10 @@ plot_apertures(lamp, frames=[0, 1], wavelength=9, figure=figure)
 # Calibrate
 # ---------
 #
-# So few frames do not determine angles and efficiencies beside the thicknesses; these are held. A
-# real table has errors of the model in it, which its photon noise knows nothing of: there the
-# residuals give the weights, and the published thickness is what to compare with.
+# So few frames do not determine angles and efficiencies in addition to the thicknesses; these are
+# held. The residuals of a real table contain errors of the model, which its photon noise does not
+# include: there the residuals give the weights, and the result is compared with the published
+# thickness.
 
 if folder:
     path = next(Path(folder).rglob("dataset3_polarized*.ecsv"))
@@ -89,8 +91,8 @@ print(f"quartz: {quartz:.5f} +- {error:.5f}; {'published' if folder else 'simula
 # Cubes of a star
 # ---------------
 #
-# The star is polarized by 1 %. The telescope stands in front of the optics that were calibrated,
-# with the published law of its tertiary mirror, and the half-wave plate follows the sky.
+# The star is polarized by 1 %. The telescope is upstream of the calibrated optics, with the
+# published law of its tertiary mirror, and the half-wave plate follows the sky.
 
 
 def on_sky(chain, q, u):
@@ -111,10 +113,8 @@ cubes = simulate_cubes(
     frames,
     source="star",
     flux=2e6,
-    halo=0.1,
-    motion=1.0,
-    seeing=0.05,
-    background=2.0,
+    image=ImageModel(halo=0.1, motion=1.0, seeing=0.05),
+    detector=DetectorModel(background=2.0),
     seed=3,
 )
 star = reduce_run(cubes, charis, source="star", raw=place / "raw")
@@ -126,8 +126,8 @@ plot_apertures(star, frames=[0, 1], wavelength=9, figure=figure)
 # Its Stokes parameters
 # ---------------------
 #
-# With the calibrated instrument and the telescope held, q and u of the star are all that is free.
-# Of the real tables the unpolarized standard HD 293396 is taken, which should come out at zero.
+# With the calibrated instrument and the telescope held, only q and u of the star are free. With the
+# real tables the star is the unpolarized standard HD 293396, whose q and u should be zero.
 
 if folder:
     path = next(Path(folder).rglob("hd293396*.ecsv"))

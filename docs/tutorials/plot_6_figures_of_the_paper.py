@@ -115,8 +115,8 @@ axis.legend(frameon=False)
 # Retardances of half-wave plate and derotator
 # --------------------------------------------
 #
-# In the signs of this package; :ref:`mirror-branches` says which of them the paper has the other
-# way.
+# The retardances have the signs of this package; :ref:`mirror-branches` lists those with the
+# opposite sign in the paper.
 
 figure = plt.figure(figsize=(11.9, 8.2))
 plot_retardances(elliptical, figure=figure)
@@ -184,7 +184,8 @@ figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center
 # Accuracy for targets
 # --------------------
 #
-# The parts of the paper's accuracy, and what the calibration claims for targets of 30, 1 and 0.1 %.
+# The parts of the paper's accuracy, and the accuracies of the calibration for targets of 30, 1 and
+# 0.1 %.
 
 figure = plt.figure(figsize=(8.5, 11))
 plot_target_accuracy(calibration, figure=figure)

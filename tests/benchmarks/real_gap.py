@@ -247,7 +247,7 @@ def _together(cases):
 
 
 def _causes(cases):
-    yield ["Run", "Cause", "Probability", "Stability", "Explained", "Not to be told from it"]
+    yield ["Run", "Cause", "Probability", "Stability", "Explained", "Not distinguished from it"]
     for name in ("dataset 1", "dataset 3"):
         for cause in cases[name]["causes"]:
             # a name and the cell that it is are the same

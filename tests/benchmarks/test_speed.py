@@ -23,6 +23,7 @@ from timing import interleaved, report
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
+from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
 from astropolcal.pipeline import Library, library
@@ -153,7 +154,9 @@ def test_fitter_against_bare_scipy(measurement, capsys):
     Jacobian for its covariance, a fixed cost of a tenth of the fit that the
     bare call is given here too.
     """
-    start = search_branches(BinProblem(measurement), measurement.vector())[0]
+    start = search_branches(
+        BinProblem(measurement, first_weighting(measurement, None)), measurement.vector()
+    )[0]
     low, high = measurement.free.bounds()
 
     def stock():

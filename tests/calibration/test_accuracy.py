@@ -185,7 +185,7 @@ def test_groups_may_be_given(measurement):
 
 def test_impossible_groups_are_refused(measurement):
     for groups, message in [
-        (np.zeros(95), r"groups of shape \(95,\); allowed is \(96,\), one a datum"),
+        (np.zeros(95), r"groups of shape \(95,\); allowed is \(96,\), one per datum"),
         (np.arange(96).clip(0, 50), "group 0 has a single member; at least 2 data"),
     ]:
         with pytest.raises(FitError, match=message):

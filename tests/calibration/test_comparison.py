@@ -101,7 +101,7 @@ def test_what_cannot_be_compared():
     for members, error, words in [
         ([], ParameterError, "nothing to compare"),
         (["irdis", "irdis"], ParameterError, "irdis occurs twice; give labels"),
-        ({"x": 3}, ParameterError, "x: 3 is no calibration"),
+        ({"x": 3}, ParameterError, "x: 3 is not a calibration"),
         (["iridis"], InstrumentError, "unknown instrument 'iridis'.*did you mean 'irdis'"),
     ]:
         with pytest.raises(error, match=words):

@@ -193,5 +193,5 @@ def test_without_arviz_only_the_length_counts():
 
 def test_shapes_must_agree():
     for changes in [{"std": np.zeros(3)}, {"r_hat": np.zeros((2, 1))}]:
-        with pytest.raises(ParameterError, match="one value a parameter is allowed"):
+        with pytest.raises(ParameterError, match="one value per parameter is allowed"):
             _made([1.0, 2.0], **changes)

@@ -80,21 +80,23 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("which", ["full_rank", "open_gauge"])
-def test_analytic_errors_are_the_numeric_ones(request, case, which):
-    cal = request.getfixturevalue(which)
-    ready, function = CASES[case]
-    analytic, numeric = ready(cal), propagate(cal, function)
-    np.testing.assert_allclose(u.Quantity(analytic.value), u.Quantity(numeric.value), rtol=1e-12)
-    np.testing.assert_allclose(
-        u.Quantity(analytic.std).value, u.Quantity(numeric.std).value, rtol=1e-5, atol=1e-9
-    )
-    known = np.ravel(analytic.is_determined)
-    one, other = (d.covariance()[np.ix_(known, known)] for d in (analytic, numeric))
-    stds = np.ravel(u.Quantity(analytic.std).value)[known]
-    assert (np.abs(one - other) <= 1e-4 * np.outer(stds, stds)).all()
-    assert analytic.open_directions.keys() == numeric.open_directions.keys()
+def test_analytic_errors_are_the_numeric_ones(request):
+    for case in CASES:
+        for which in ["full_rank", "open_gauge"]:
+            cal = request.getfixturevalue(which)
+            ready, function = CASES[case]
+            analytic, numeric = ready(cal), propagate(cal, function)
+            np.testing.assert_allclose(
+                u.Quantity(analytic.value), u.Quantity(numeric.value), rtol=1e-12
+            )
+            np.testing.assert_allclose(
+                u.Quantity(analytic.std).value, u.Quantity(numeric.std).value, rtol=1e-5, atol=1e-9
+            )
+            known = np.ravel(analytic.is_determined)
+            one, other = (d.covariance()[np.ix_(known, known)] for d in (analytic, numeric))
+            stds = np.ravel(u.Quantity(analytic.std).value)[known]
+            assert (np.abs(one - other) <= 1e-4 * np.outer(stds, stds)).all()
+            assert analytic.open_directions.keys() == numeric.open_directions.keys()
 
 
 def test_derivatives_may_be_given(full_rank):

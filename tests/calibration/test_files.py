@@ -5,6 +5,7 @@ import dataclasses
 import io
 import os
 import stat
+from importlib.util import find_spec
 
 import asdf
 import astropy.units as u
@@ -337,9 +338,10 @@ def test_inconsistent_posterior_is_not_written(sampled, path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
+def test_changed_posterior_is_refused(sampled, path):
+    sampled.write(path)
+    content = path.read_bytes()
+    for old, new, message in [
         (b"    converged: true", b"    converged: false", "checksum"),
         (b"seed: 5", b"seed: 6", "checksum"),
         (b"seed: 5", b"seed: five", "invalid at .*posterior.seed"),
@@ -349,14 +351,11 @@ def test_inconsistent_posterior_is_not_written(sampled, path):
         (b"    thin: ", b"    thin: -", "invalid at .*posterior.thin"),
         (b"n_draws: ", b"n_draws: -", "invalid at .*n_draws"),
         (b"r_hat: !core/ndarray", b"r_hat: !core/quantity", "unknown kind"),
-    ],
-)
-def test_changed_posterior_is_refused(sampled, path, old, new, message):
-    if old.startswith(b"r_hat"):
-        # without it there is no such array in the file
-        pytest.importorskip("arviz_stats")
-    sampled.write(path)
-    assert_refused(path, replaced(path.read_bytes(), old, new), message)
+    ]:
+        if old.startswith(b"r_hat") and find_spec("arviz_stats") is None:
+            # without it there is no such array in the file
+            continue
+        assert_refused(path, replaced(content, old, new), message)
 
 
 def test_changed_sample_is_refused(sampled, path):
@@ -370,7 +369,10 @@ def test_changed_sample_is_refused(sampled, path):
 def test_inconsistent_posterior_with_a_right_checksum(sampled):
     for change, message in [
         ({"names": ["polarizer.theta", "hwp.w_sio2"]}, "posterior: chain of 2 names and 3 units"),
-        ({"names": ["polarizer.theta", "hwp.w_sio2", "x"]}, "posterior of 'x', which is no free"),
+        (
+            {"names": ["polarizer.theta", "hwp.w_sio2", "x"]},
+            "posterior of 'x', which is not a free",
+        ),
         ({"log_prob": np.zeros((2, 2))}, r"posterior: log_prob has shape \(2, 2\)"),
         ({"acceptance": np.zeros(2)}, r"posterior: acceptance has shape \(2,\)"),
         ({"convergence": {"times": np.full(3, np.inf)}}, "posterior: times must be finite"),
@@ -502,18 +504,18 @@ def test_observations_are_brought_back(calibration, content, path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("weights", [None, "wavelength", "errors", 0.003, [0.002, 0.003, 0.004]])
-def test_noise_of_the_fit_is_brought_back(path, weights):
-    from astropolcal.calibration.noise.weighting import weighting_of
+def test_noise_of_the_fit_is_brought_back(path):
+    for weights in [None, "wavelength", "errors", 0.003, [0.002, 0.003, 0.004]]:
+        from astropolcal.calibration.noise.weighting import weighting_of
 
-    night = make_nights()[0]
-    calibration = calibrate(make_chain(), night, weights=weights, cross_validate=False)
-    calibration.write(path)
-    again = Calibration.read(path).with_observations(night)
-    old, new = weighting_of(calibration), weighting_of(again)
-    assert new.choice == old.choice
-    # noise from residuals is found again, to the thousandth at which its rounds end
-    np.testing.assert_allclose(new.sigma, old.sigma, rtol=3e-3)
+        night = make_nights()[0]
+        calibration = calibrate(make_chain(), night, weights=weights, cross_validate=False)
+        calibration.write(path, overwrite=True)
+        again = Calibration.read(path).with_observations(night)
+        old, new = weighting_of(calibration), weighting_of(again)
+        assert new.choice == old.choice
+        # noise from residuals is found again, to the thousandth at which its rounds end
+        np.testing.assert_allclose(new.sigma, old.sigma, rtol=3e-3)
 
 
 @pytest.mark.slow

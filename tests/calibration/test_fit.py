@@ -346,28 +346,25 @@ def test_fitter_that_leaves_the_bounds_is_told_on(few):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("strategy", "search", "searches"),
-    [
+def test_when_branches_are_searched(few, monkeypatch):
+    for strategy, search, searches in [
         ("joint", None, True),
         ("joint", False, False),
         ("two-step", None, False),  # the paper's procedure goes downhill from its start
         ("two-step", True, True),
-    ],
-)
-def test_when_branches_are_searched(few, monkeypatch, strategy, search, searches):
-    from astropolcal.calibration.fit import calibrate as fit
+    ]:
+        from astropolcal.calibration.fit import calibrate as fit
 
-    calls = []
+        calls = []
 
-    def counted(*args):
-        calls.append(args)
-        return search_branches(*args)
+        def counted(*args, calls=calls):
+            calls.append(args)
+            return search_branches(*args)
 
-    chain, _, data = few
-    monkeypatch.setattr(fit, "search_branches", counted)
-    calibrate(chain, data, strategy=strategy, search=search, cross_validate=False)
-    assert bool(calls) == searches
+        chain, _, data = few
+        monkeypatch.setattr(fit, "search_branches", counted)
+        calibrate(chain, data, strategy=strategy, search=search, cross_validate=False)
+        assert bool(calls) == searches
 
 
 def test_fitter_that_breaks_is_a_fit_error(few):

@@ -169,7 +169,7 @@ def test_settling_does_not_leave_the_priors(observations):
     for gauge in ("minimal", None):
         cal = _fit(chain, observations, gauge=gauge)
         live = cal.measurement
-        problem = BinProblem(live, None, live.weighting.level)
+        problem = BinProblem(live, live.weighting)
         totals.append(problem.total(live.vector()))
     assert totals[0] == pytest.approx(totals[1], rel=1e-3)
 

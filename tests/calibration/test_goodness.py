@@ -18,6 +18,7 @@ from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import simulate
+from astropolcal.words import p_words
 
 LAM = [1.2, 1.6, 2.2] * u.um
 FAINT = {"flux": 1e6, "read_noise": 500.0}
@@ -304,8 +305,8 @@ def test_a_wrong_prior_is_found(make, chain):
         assert test.priors["p_value"] < 1e-6
         assert test.p_value < 1e-6
         assert (
-            f"(p = {test.p_value:.3g}); the data disagree with the priors "
-            f"(p = {test.priors['p_value']:.3g}); noise: "
+            f"({p_words(test.p_value)}); the data disagree with the priors "
+            f"({p_words(test.priors['p_value'])}); noise: "
         ) in test.words
     found = cal.fit["lack_of_fit"][0]["words"]
     assert "the data disagree with the priors" in found

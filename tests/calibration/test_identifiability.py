@@ -260,7 +260,7 @@ def test_words_say_rank_and_directions(make):
     finding, _ = finding_of(Measurement(truth, make.observe(truth, noise=False)))
     words = str(finding)
     assert words.startswith("The data determine 91 combinations of 93 free parameters.")
-    assert words.count("cannot be told from") == 2
+    assert words.count("cannot be distinguished from") == 2
 
 
 def test_more_parameters_than_data_is_no_obstacle():

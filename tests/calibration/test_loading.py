@@ -305,11 +305,9 @@ def test_dated_change(path):
     recoated = HEADER | {"MJD": 61060.0}
     loaded = load(path, recoated)
     assert loaded.system_mueller(recoated, light="internal").value.shape == (3, 4, 4)
-    with pytest.raises(
-        CalibrationFileError, match=r"frame 1, .*M3 was coated anew between.*2026-01"
-    ):
+    with pytest.raises(CalibrationFileError, match=r"frame 1, .*M3 was recoated between.*2026-01"):
         loaded.system_mueller([HEADER, recoated])
-    with pytest.raises(CalibrationFileError, match=r"the frame.* M3 was coated anew"):
+    with pytest.raises(CalibrationFileError, match=r"the frame.* M3 was recoated"):
         load(path, date="2026-03-01").system_mueller(positions=POSITIONS)
     # the caller may know better
     stated = load(path, recoated, date="2025-11-09")

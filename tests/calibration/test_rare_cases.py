@@ -218,7 +218,7 @@ def test_equal_weights_settle_as_none(make, data):
         for name in ("calibration_polarizer.theta", "hwp.theta"):
             moved[measurement.free.by_name[name].start] += np.deg2rad(0.5)
         measurement.stand_at(moved)
-        found.append((settled(BinProblem(measurement), weighting, origin)[0], measurement.vector()))
+        found.append((settled(BinProblem(measurement, weighting), origin)[0], measurement.vector()))
     assert found[0][0] == found[1][0]
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
 

@@ -181,7 +181,10 @@ def calibration():
 
 def test_the_report_says_all_of_it(calibration):
     text = " ".join(calibration.summary(full=True).split())
-    assert "calibration_polarizer.theta by +1 deg cannot be told from hwp.theta by +1 deg" in text
+    assert (
+        "calibration_polarizer.theta by +1 deg cannot be distinguished from hwp.theta by +1 deg"
+        in text
+    )
     assert "on sky the AoLP changes by up to 1 deg" in text
     assert "separate harmonic 2 badly" in text
     assert "mirror solution: derotator" in text

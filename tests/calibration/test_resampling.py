@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from astropolcal.calibration import Calibration, bootstrap, calibrate
+from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty import standard_errors
 from astropolcal.calibration.uncertainty.covariance import Covariance
-from astropolcal.calibration.uncertainty.refits import Refit, Resampled
+from astropolcal.calibration.uncertainty.refits import Resampled
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Normal
 from astropolcal.observations import Observations
@@ -78,7 +79,7 @@ def test_mean_of_the_samples_is_the_calibration(white):
 
 def test_every_datum_once_is_the_calibration(white):
     """The refit itself: with all counts one it stays where it is."""
-    refit = Refit(white)
+    refit = problem_of(white)
     vector, chi2, arrived = refit.fit(refit.solution, np.ones(white.measurement.n_data))
     assert arrived
     factors = white.measurement.free.factors()
@@ -89,7 +90,7 @@ def test_every_datum_once_is_the_calibration(white):
 
 def test_a_datum_that_counts_twice_is_two_data(white, make):
     """Counts of two everywhere leave the solution and double chi-square."""
-    refit = Refit(white)
+    refit = problem_of(white)
     vector, chi2, _ = refit.fit(refit.solution, np.full(white.measurement.n_data, 2.0))
     moved = np.abs(vector - refit.solution) / white.measurement.free.factors()
     assert (moved < 1e-2 * white.covariance.stds).all()
@@ -102,7 +103,7 @@ def test_derivative_of_the_refit(make):
     truth["hwp"].theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
     data = make.observe(truth, make.frames(), LAM, seed=1)
     cal = calibrate(truth, data, weights="errors", search=False, cross_validate=False)
-    refit = Refit(cal)
+    refit = problem_of(cal)
     jacobian = refit.jacobian(refit.solution, refit.weights)
     assert jacobian.shape == (cal.measurement.n_data + 1, cal.measurement.free.size)
     for i in range(cal.measurement.free.size):

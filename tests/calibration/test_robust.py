@@ -7,7 +7,7 @@ import pytest
 
 from astropolcal.calibration import Calibration, bootstrap, calibrate
 from astropolcal.calibration.noise.scatter import Scatter, leave_out_groups
-from astropolcal.calibration.noise.weighting import around, weighting_of
+from astropolcal.calibration.noise.weighting import Problem, weighting_of
 from astropolcal.calibration.uncertainty import derived_retardance, standard_errors
 from astropolcal.calibration.uncertainty.refits import robust_covariance
 from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
@@ -217,7 +217,7 @@ def test_groups_make_standard_errors_robust(few):
 def test_bad_choices_are_refused(few):
     for options, message in [
         ({"groups": "night"}, "block = 'night'; allowed are derotator, pair"),
-        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one a datum"),
+        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one per datum"),
         ({"groups": np.zeros(96)}, "1 groups; a robust covariance needs 3"),
         ({"correction": "none"}, "correction = 'none'; allowed are leverage, number"),
     ]:
@@ -260,7 +260,7 @@ def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, 
         data = charis_data(name)
         cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
         model, weighting = cal.measurement, weighting_of(cal)
-        whitened = around(model, weighting)
+        whitened = Problem(model, weighting).around()
         (part,) = Scatter(model, weighting, whitened).parts
         applied = part.applied(np.eye(model.n_data))
         middle = sum(s * matrix for s, matrix in zip(part.shares, applied, strict=True))

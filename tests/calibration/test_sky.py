@@ -161,7 +161,7 @@ def test_what_is_said_grows_as_the_polarization_becomes_faint(alone):
 def test_a_file_of_before_knows_one_degree_of_polarization():
     for turn, gain, words in [
         ((0, 0), (0, 0), "on sky nothing changes"),
-        ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, whatever"),
+        ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, regardless"),
         ((0.004, -0.004), (-300, 1), "less than 0.01 deg and the DoLP by up to 300 % of"),
     ]:
         sky = {"aolp_deg": list(turn), "dolp_percent": list(gain)}
@@ -217,7 +217,9 @@ def test_hand_of_the_instrument_matters_behind_a_mirror_that_retards():
     # one optic in two disguises
     assert not shows_on_sky(same["sky"])
     assert "WARNING" not in same["words"]
-    assert other["words"].startswith("behind the telescope: all retardances with the other sign")
+    assert other["words"].startswith(
+        "downstream of the telescope: all retardances with the other sign"
+    )
     assert (
         "only bounds or models exclude them; WARNING: if the other one is true, on sky"
         in other["words"]
@@ -269,7 +271,7 @@ def test_a_branch_within_the_bounds_is_followed_on_sky():
     chain["derotator"].retardance.bounds = (None, None)
     branches = branches_of((chain, data))[1]
     (both,) = (b for b in branches if b["words"].startswith("hwp, derotator: all retardances"))
-    assert "behind the telescope" not in " ".join(b["words"] for b in branches)
+    assert "downstream of the telescope" not in " ".join(b["words"] for b in branches)
     assert shows_on_sky(both["sky"])
 
 

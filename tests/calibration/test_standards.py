@@ -157,9 +157,11 @@ def test_a_calibration_from_a_file_predicts_the_same(tmp_path, calibrated, chain
 
 
 def test_fitted_data_are_no_standard(calibrated, chain, observations):
-    with pytest.raises(FitError, match=r"lamp is no independent standard: .* fitted to it as lamp"):
+    with pytest.raises(
+        FitError, match=r"lamp is not an independent standard: .* fitted to it as lamp"
+    ):
         standard_accuracy(calibrated, chain, observations)
-    with pytest.raises(FitError, match="no independent standard"):
+    with pytest.raises(FitError, match="not an independent standard"):
         refuse_fitted(calibrated, observations)
 
 

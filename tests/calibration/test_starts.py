@@ -9,14 +9,19 @@ from scipy.optimize import least_squares
 from astropolcal import optics
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
+from astropolcal.calibration.noise.weighting import Weighting
 from astropolcal.measurement import Measurement, Normal
 
 N_BINS = 22
 
 
+def _level(measurement, noise):
+    return Weighting(None, np.full(measurement.n_data, noise))
+
+
 def problem_of(start, data):
     measurement = Measurement(start, data)
-    return BinProblem(measurement, 1 / measurement.sigma)
+    return BinProblem(measurement, Weighting("given", measurement.sigma))
 
 
 def anywhere(make, kind, seed):
@@ -161,7 +166,7 @@ def test_bins_with_fewer_data_are_padded(make):
     mask = np.zeros((data.n_frames, N_BINS), dtype=bool)
     mask[:16, 4] = True
     problem = problem_of(truth, data.with_mask(mask, "test"))
-    residuals = problem.residuals(problem.measurement.vector())
+    residuals = problem.of_bins(problem.measurement.vector())
     assert residuals.shape == (N_BINS, 32)
     assert np.count_nonzero(residuals[4]) == 24
     assert np.count_nonzero(residuals[5]) == 32
@@ -270,14 +275,14 @@ def test_costs_with_priors_add_up_to_the_whole(make):
     start, _, data = with_prior(make, Normal(95 * u.deg, 5 * u.deg))
     start["calibration_polarizer"].theta.prior = Normal(88 * u.deg, 0.5 * u.deg)
     live = Measurement(start, data)
-    problem = BinProblem(live, None, 0.01)
+    problem = BinProblem(live, _level(live, 0.01))
     vector = live.vector()
     data_part = np.sum(live.residuals(vector) ** 2)
     prior_part = 1e-4 * live.free.prior_residuals(vector) ** 2
     assert problem.has_priors
     assert problem.total(vector) == pytest.approx(0.5 * (data_part + prior_part.sum()))
     assert problem.costs(vector).sum() == pytest.approx(0.5 * (data_part + prior_part[1:].sum()))
-    assert BinProblem(live, None, 0.0).total(vector) == pytest.approx(0.5 * data_part)
+    assert BinProblem(live, _level(live, np.nan)).total(vector) == pytest.approx(0.5 * data_part)
 
 
 def test_polish_with_priors_reaches_the_minimum_of_both(make):
@@ -285,7 +290,7 @@ def test_polish_with_priors_reaches_the_minimum_of_both(make):
     start, _, data = with_prior(make, Normal(60 * u.deg, 0.2 * u.deg))
     start["derotator"].retardance = np.full(N_BINS, 90.0) * u.deg
     live = Measurement(start, data)
-    problem = BinProblem(live, None, 0.02)
+    problem = BinProblem(live, _level(live, 0.02))
     vector, costs = problem.polish(live.vector(), iterations=60, still_gaining=1 - 1e-12)
 
     def residuals(values, element):

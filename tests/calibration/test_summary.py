@@ -1,21 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Every line of a summary from numbers made up for it, and the same numbers for machines."""
 
-import json
 from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
+from astropolcal.calibration import calibrate
 from astropolcal.calibration.result.summary import (
     _accuracy_lines,
     _bound_lines,
     _global_lines,
     _goodness_lines,
     _heading,
-    _plain,
     _rows,
     _standard_lines,
     _target_row,
@@ -307,9 +307,9 @@ def _with_directions(directions, near_null=()):
 def test_what_is_open_on_sky_is_said_of_the_worst_first():
     cal = _with_directions(
         [
-            _direction("a.b by +1 deg cannot be told from c.d by +1 deg; on sky", 0.5),
-            _direction("e.f by +1 deg cannot be told from g.h by +1 deg; on sky", -2.0),
-            _direction("i.j by +1 deg cannot be told from g.h by +1 deg; on sky", 0.001),
+            _direction("a.b by +1 deg cannot be distinguished from c.d by +1 deg; on sky", 0.5),
+            _direction("e.f by +1 deg cannot be distinguished from g.h by +1 deg; on sky", -2.0),
+            _direction("i.j by +1 deg cannot be distinguished from g.h by +1 deg; on sky", 0.001),
             _direction("k.l changes no datum: it cannot be determined"),
         ],
         [_direction("m.n is uncertain by 7 deg at the noise of this fit; on sky", 0.3, 0.02)],
@@ -321,17 +321,21 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         ("badly determined", 0.3),
     ]
     assert open_lines(cal) == [
-        "  infinite by what the data leave open: e.f by +1 deg: on sky the AoLP changes by up to 2 "
-        "deg and the DoLP by less than 0.01 % of itself, whatever the DoLP; a.b by +1 deg: "
+        "  infinite, because the data do not determine: e.f by +1 deg: "
+        "on sky the AoLP changes by up to 2 "
+        "deg and the DoLP by less than 0.01 % of itself, regardless of the DoLP; a.b by +1 deg: "
         "on sky the AoLP changes by up to 0.5 deg and the DoLP by less than 0.01 % of "
-        "itself, whatever the DoLP",
-        "  large by what is badly determined: m.n is uncertain by 7 deg: on sky the AoLP changes "
-        "by up to 0.3 deg and the DoLP by up to 0.02 % of itself, whatever the DoLP",
+        "itself, regardless of the DoLP",
+        "  large, because of badly determined directions: m.n is uncertain by 7 deg: "
+        "on sky the AoLP changes by up to 0.3 deg and the DoLP by up to 0.02 % of itself, "
+        "regardless of the DoLP",
     ]
 
 
 def test_many_open_directions_are_counted():
-    cal = _with_directions(_direction(f"a.b{i} by +1 deg cannot be told", 1.0) for i in range(5))
+    cal = _with_directions(
+        _direction(f"a.b{i} by +1 deg cannot be distinguished", 1.0) for i in range(5)
+    )
     assert open_lines(cal)[0].endswith("; and 2 more, see below")
     assert open_lines(_with_directions([])) == []
 
@@ -399,22 +403,21 @@ def test_a_star_beside_its_catalogue():
     assert second.split() == ["1600.0", "-", "-", "-", "-"]
 
 
-# --- for machines ---------------------------------------------------------------------------------
+# --- all at once ----------------------------------------------------------------------------------
 
 
-def test_what_json_knows():
-    for value, expected in [
-        (np.float64(1.5), 1.5),
-        (np.int32(3), 3),
-        (np.bool_(True), True),
-        (np.nan, None),
-        (np.inf, None),
-        (np.array([[1.0, np.nan]]), [[1.0, None]]),
-        ((1, "a", None), [1, "a", None]),
-        (2 * u.deg, {"value": 2.0, "unit": "deg"}),
-        ([1, 2] * u.mm, {"value": [1.0, 2.0], "unit": "mm"}),
-        ({"a": {"b": np.array([1])}}, {"a": {"b": [1]}}),
-    ]:
-        found = _plain(value)
-        assert found == expected
-        assert json.loads(json.dumps(found, allow_nan=False)) == expected
+def test_what_was_fitted_is_only_shown(make, monkeypatch, tmp_path):
+    """No fit, however often and in which form a calibration is written."""
+    lam = [1200, 1600, 2200] * u.nm
+    chain = make.chain(wavelength=lam)
+    cal = calibrate(chain, make.observe(chain, wavelength=lam), search=False)
+
+    def fit(*args, **kwargs):
+        raise AssertionError("a serializer fits")
+
+    monkeypatch.setattr("scipy.optimize.least_squares", fit)
+    monkeypatch.setattr(TRFLSQFitter, "__call__", fit)
+    for _ in range(2):
+        assert cal.summary(full=True)
+        assert cal.to_dict()["verdict"]
+        cal.write(tmp_path / "cal.asdf", overwrite=True)

@@ -447,7 +447,7 @@ def test_standards_that_the_calibration_remembers_are_the_default(make, chain, m
 
 
 def test_standard_that_was_fitted_is_refused(measurement, calibrated):
-    with pytest.raises(FitError, match="simulated is no independent standard"):
+    with pytest.raises(FitError, match="simulated is not an independent standard"):
         four_accuracies(calibrated, measurement.datasets[0].observations)
 
 

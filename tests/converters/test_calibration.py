@@ -166,25 +166,22 @@ def test_everything_else_is(node):
 # ---- what is refused in spite of a right checksum ------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("key", "place", "words"),
-    [
+def test_entries_of_one_name(node):
+    for key, place, words in [
         ("ties", 0, "'derotator.theta' is given twice"),
         ("stages", None, "is given twice in a list of parameters"),
         ("directions", None, "is given twice in a list of parameters"),
         ("priors", 0, "prior of 'derotator.retardance' is given twice"),
-    ],
-)
-def test_entries_of_one_name(node, key, place, words):
-    node = copy.deepcopy(node)
-    if key == "directions":
-        entry = {"words": "x", "parameters": [{"name": "a", "value": 1.0}] * 2}
-        node["identifiability"]["directions"].append(entry)
-    elif key == "stages":
-        node["stages"][0]["parameters"].append(node["stages"][0]["parameters"][0])
-    else:
-        node[key].append(node[key][place])
-    refused(node, words)
+    ]:
+        spoiled = copy.deepcopy(node)
+        if key == "directions":
+            entry = {"words": "x", "parameters": [{"name": "a", "value": 1.0}] * 2}
+            spoiled["identifiability"]["directions"].append(entry)
+        elif key == "stages":
+            spoiled["stages"][0]["parameters"].append(spoiled["stages"][0]["parameters"][0])
+        else:
+            spoiled[key].append(spoiled[key][place])
+        refused(spoiled, words)
 
 
 def test_two_columns_of_one_name(node):
@@ -200,12 +197,12 @@ def test_a_value_with_something_else(node):
     refused(node, "a value with 'factor', which means nothing here")
 
 
-@pytest.mark.parametrize("unit", ["1e-3 um", "-1e308", "2", "0.5 deg"])
-def test_units_with_a_factor(node, unit):
+def test_units_with_a_factor(node):
     """They would be read as something else than is written next time."""
-    node = copy.deepcopy(node)
-    node["stages"][0]["parameters"][0]["unit"] = unit
-    refused(node, "a unit without a factor is needed")
+    for unit in ["1e-3 um", "-1e308", "2", "0.5 deg"]:
+        spoiled = copy.deepcopy(node)
+        spoiled["stages"][0]["parameters"][0]["unit"] = unit
+        refused(spoiled, "a unit without a factor is needed")
 
 
 def test_wavelengths_that_are_none(node):
@@ -281,15 +278,17 @@ def spoiled_accuracy(name, values):
     return spoil
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
+def test_parts_that_do_not_belong_together(cal):
+    for spoil, words in [
         (lambda c: c.chains.append(c.chains[0]), "2 chains but 1 datasets"),
-        (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is no free"),
-        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is no list of reasons"),
-        (lambda c: c.fit.update(masked=["x"]), "fit.masked is no list of reasons"),
+        (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is not a free"),
+        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is not a list of reasons"),
+        (lambda c: c.fit.update(masked=["x"]), "fit.masked is not a list of reasons"),
         (lambda c: c.fit.update(outliers={"a": 1}), "fit.outliers is a dict, not a list"),
-        (lambda c: c.fit.update(outliers=[{"frames": [1]}]), "lacks what a pair of frames is told"),
+        (
+            lambda c: c.fit.update(outliers=[{"frames": [1]}]),
+            "lacks what a pair of frames is described",
+        ),
         (
             lambda c: c.fit.update(
                 outliers=[
@@ -297,19 +296,18 @@ def spoiled_accuracy(name, values):
                     | {"brightness": 1}
                 ]
             ),
-            "fit.outliers lacks what a pair of frames is told by",
+            "fit.outliers lacks what a pair of frames is described by",
         ),
-        (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is no list of numbers"),
-        (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is no list of numbers"),
-        (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is no fraction"),
+        (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is not a list of numbers"),
+        (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is not a list of numbers"),
+        (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is not a fraction"),
         (spoiled_accuracy("wavelength", [1, 2] * u.deg), "must be positive lengths"),
         (spoiled_accuracy("wavelength", [1, -2] * u.um), "must be positive lengths"),
-    ],
-)
-def test_parts_that_do_not_belong_together(cal, spoil, words):
-    spoil(cal)
-    with pytest.raises(CalibrationFileError, match=words):
-        check_calibration(cal)
+    ]:
+        spoiled = copy.deepcopy(cal)
+        spoil(spoiled)
+        with pytest.raises(CalibrationFileError, match=words):
+            check_calibration(spoiled)
 
 
 @pytest.mark.parametrize("part", ["covariance", "identifiability"])

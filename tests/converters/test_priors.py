@@ -109,8 +109,8 @@ def test_nodes_that_are_refused():
         ([NODE | {"args": [1, 2, 3, 4]}], "prior of hwp.theta: "),
         ([NODE | {"kwds": {"mean": 1}}], "prior of hwp.theta: "),
         ([NODE | {"args": [0], "kwds": {"scale": "x"}}], "prior of hwp.theta: "),
-        ([NODE | {"args": [0, -1]}], r"norm of \[0, -1\] and {} is no distribution"),
-        ([NODE | {"args": [0, float("nan")]}], "is no distribution"),
+        ([NODE | {"args": [0, -1]}], r"norm of \[0, -1\] and {} is not a distribution"),
+        ([NODE | {"args": [0, float("nan")]}], "is not a distribution"),
         ([NODE | {"args": [[0, 1], 1]}], "prior of hwp.theta: "),
     ]:
         with pytest.raises(CalibrationFileError, match=words):

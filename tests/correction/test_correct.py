@@ -319,7 +319,7 @@ def test_frames_must_say_when_and_how_they_were_taken(calibration, star, charis)
         (known | {"mode": None}, r"frame 0: its mode is not known.*mode='broadband JHK'"),
         (known | {"date": ["2025-10-09"] * 15 + ["2025-09-09"]}, "frame 15 was taken 2025-09-09"),
         (known | {"mode": "J"}, "frame 0 is in mode 'J'"),
-        (known | {"date": "2026-03-01"}, "M3 was coated anew between"),
+        (known | {"date": "2026-03-01"}, "M3 was recoated between"),
     ):
         with pytest.raises(CalibrationFileError, match=words):
             correct(dated, frames(**settings))
@@ -454,7 +454,7 @@ def test_open_calibrations_warn(open_calibration, star, charis):
         star.right, star.left, charis.wavelength, star.positions, **known
     )
     with pytest.warns(
-        AstropolcalWarning, match="leaves open how Q and U turn.*--prior.*--open-directions"
+        AstropolcalWarning, match="does not determine how Q and U turn.*--prior.*--open-directions"
     ):
         found = correct(open_calibration, frames)
     assert np.isinf(found.fractional_errors("systematic")["q"]).all()

@@ -144,28 +144,28 @@ def test_windows_of_both_beams(cubes):
     assert np.nanmax(variances) == np.nanmin(variances) == 0.25
 
 
-@pytest.mark.parametrize("kind", ["scaled", "compressed", "gzipped", "float32", "primary"])
-def test_all_kinds_of_files(cubes, tmp_path, kind):
-    values, _ = cubes
-    cube = np.rint(values[0] * 100)
-    path, extension = tmp_path / "one.fits", 1
-    hdus = [fits.PrimaryHDU(), fits.ImageHDU(cube)]
-    if kind == "scaled":
-        hdus[1] = fits.ImageHDU(cube.astype("i4"))
-        hdus[1].scale("int16", bzero=32768)
-    elif kind == "compressed":
-        hdus[1] = fits.CompImageHDU(cube.astype("i4"))
-    elif kind == "gzipped":
-        path = tmp_path / "one.fits.gz"
-    elif kind == "float32":
-        hdus[1] = fits.ImageHDU(cube.astype("f4"))
-    else:
-        hdus, extension = [fits.PrimaryHDU(cube)], 0
-    fits.HDUList(hdus).writeto(path)
-    source = CubeFiles([path], CENTRES, 5, extension=extension)
-    found = source.fluxes(0, slice(0, 1), slice(2, 3))
-    np.testing.assert_array_equal(found[0, 0], cube[2, 8:13, 18:23])
-    assert not source.has_variances
+def test_all_kinds_of_files(cubes, tmp_path):
+    for kind in ["scaled", "compressed", "gzipped", "float32", "primary"]:
+        values, _ = cubes
+        cube = np.rint(values[0] * 100)
+        path, extension = tmp_path / "one.fits", 1
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(cube)]
+        if kind == "scaled":
+            hdus[1] = fits.ImageHDU(cube.astype("i4"))
+            hdus[1].scale("int16", bzero=32768)
+        elif kind == "compressed":
+            hdus[1] = fits.CompImageHDU(cube.astype("i4"))
+        elif kind == "gzipped":
+            path = tmp_path / "one.fits.gz"
+        elif kind == "float32":
+            hdus[1] = fits.ImageHDU(cube.astype("f4"))
+        else:
+            hdus, extension = [fits.PrimaryHDU(cube)], 0
+        fits.HDUList(hdus).writeto(path, overwrite=True)
+        source = CubeFiles([path], CENTRES, 5, extension=extension)
+        found = source.fluxes(0, slice(0, 1), slice(2, 3))
+        np.testing.assert_array_equal(found[0, 0], cube[2, 8:13, 18:23])
+        assert not source.has_variances
 
 
 def test_a_file_that_shrinks_is_named(cubes):

@@ -843,7 +843,7 @@ class Described(Reader):
         return describe_fits(path)
 
     def check(self, found, path):
-        from astropolcal.scripts._common import plain
+        from astropolcal.files import plain
 
         lines, content = found
         assert content["file"] == str(path)

@@ -223,11 +223,11 @@ def test_damaged_files_get_one_clear_line(folder, tmp_path):
     with pytest.raises(GapError, match="holds no answer to any of the 2 cases"):
         score_cases(folder, tmp_path)
     (tmp_path / "case000.json").write_text("{")
-    with pytest.raises(GapError, match=r"case000\.json: is no answer"):
+    with pytest.raises(GapError, match=r"case000\.json: is not an answer"):
         score_cases(folder, tmp_path)
     for content in ("[]", '{"case000": {}}', "\0", '{"case000": {"kind": 1, "faults": [3]}}'):
         (tmp_path / "key.json").write_text(content)
-        with pytest.raises(GapError, match="is no key of challenges"):
+        with pytest.raises(GapError, match="is not a key of challenges"):
             score_cases(tmp_path, tmp_path)
     with pytest.raises(GapError, match="no such file"):
         score_cases(tmp_path / "none", tmp_path)
@@ -354,7 +354,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, monkeypatch):
     odd = record(1) | {"claims": [[2.0, True]]}
     for line in ("no json", "[]", json.dumps(odd), json.dumps(record(1) | {"result": "so so"})):
         path.write_text(f"{first}\n{line}\n")
-        with pytest.raises(GapError, match="is no checkpoint"):
+        with pytest.raises(GapError, match="is not a checkpoint"):
             run_challenge(1, 1, checkpoint=path)
 
 

@@ -234,8 +234,8 @@ def test_a_modulator_is_no_derotator():
 def test_words_name_the_plate_where_there_is_no_derotator():
     chain = plate() | WOLLASTON
     (one,) = adapted([get_effect("static_diattenuator")], [chain])
-    assert one.title == "diattenuator that stands still behind the half-wave plate"
-    assert one.place == "relay behind the half-wave plate"
+    assert one.title == "diattenuator that is static downstream of the half-wave plate"
+    assert one.place == "relay downstream of the half-wave plate"
     with_it = plate() | turned() | WOLLASTON
     (same,) = adapted([get_effect("static_diattenuator")], [with_it])
     assert same is get_effect("static_diattenuator")

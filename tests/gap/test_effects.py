@@ -701,7 +701,7 @@ def test_effects_of_ones_own():
 def test_registration():
     before = dict(EFFECTS)
     for one in (tinted(title=""), tinted(category="magic"), tinted(name="beam_gain"), dict):
-        with pytest.raises(GapError, match=r"lacks|kind|registered|is no Effect"):
+        with pytest.raises(GapError, match=r"lacks|kind|registered|is not an Effect"):
             register_effect(one)
     assert before == EFFECTS
     try:

@@ -9,9 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from astropolcal.calibration import calibrate
+from astropolcal.calibration.noise import estimates
 from astropolcal.exceptions import FitError
 from astropolcal.gap import channels
+from astropolcal.gap._numbers import Doubles
+from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
+from astropolcal.observations import Observations
 
 W, F = 11, 60
 ANGLES = {
@@ -35,25 +40,25 @@ def draws(sigma, seed=1):
 
 def test_stated_errors_are_kept_where_the_data_do_not_contradict():
     for factor in [0.2, 1.0]:
-        found = channels.noise(channel(1e-6), draws(factor * 1e-3), ANGLES)
+        found = estimates.frame_noise(channel(1e-6), draws(factor * 1e-3), ANGLES)
         np.testing.assert_allclose(found, 1e-3, rtol=0.15)
         assert found.min() >= 1e-3 * (1 - 1e-12)
 
 
 def test_larger_noise_than_stated_is_what_the_data_say():
     for factor in [3.0, 20.0]:
-        found = channels.noise(channel(1e-6), draws(factor * 1e-3), ANGLES)
+        found = estimates.frame_noise(channel(1e-6), draws(factor * 1e-3), ANGLES)
         np.testing.assert_allclose(found, factor * 1e-3, rtol=0.15)
 
 
 def test_errors_keep_their_proportions():
     stated = np.linspace(1, 2, F)
-    found = channels.noise(channel((1e-3 * stated) ** 2), draws(1e-2 * stated), ANGLES)
+    found = estimates.frame_noise(channel((1e-3 * stated) ** 2), draws(1e-2 * stated), ANGLES)
     np.testing.assert_allclose(found[0] / found[0, 0, 0], np.broadcast_to(stated, (W, F)))
 
 
 def test_without_stated_errors_the_data_tell_them():
-    found = channels.noise(channel(np.nan), draws(0.02), ANGLES)
+    found = estimates.frame_noise(channel(np.nan), draws(0.02), ANGLES)
     assert found.shape == (2, W, F)
     np.testing.assert_allclose(found, 0.02, rtol=0.15)
 
@@ -62,26 +67,26 @@ def test_a_datum_without_error_gets_the_usual_one():
     variance = np.full((2, W, F), 4e-6)
     variance[:, 2, 5] = np.nan
     variance[:, 3, 6] = 0.0
-    found = channels.noise(channel(variance), draws(2e-3), ANGLES)
+    found = estimates.frame_noise(channel(variance), draws(2e-3), ANGLES)
     assert found[0, 2, 5] == found[0, 3, 6] == np.median(found[0])
 
 
 def test_no_error_and_no_scatter_is_an_error():
     with pytest.raises(FitError, match="no errors in the table, and the residuals tell no noise"):
-        channels.noise(channel(np.nan), np.zeros((2, W, F)), ANGLES)
+        estimates.frame_noise(channel(np.nan), np.zeros((2, W, F)), ANGLES)
 
 
 def test_what_optics_do_is_no_noise():
     """A harmonic of both stages, sharp in wavelength, does not raise the noise."""
     wave = np.cos(4 * ANGLES["hwp"] + 2 * ANGLES["derotator"])
     sharp = 0.05 * (np.arange(W) == 4)[:, None] * wave
-    found = channels.noise(channel(1e-6), draws(1e-3) + sharp, ANGLES)
+    found = estimates.frame_noise(channel(1e-6), draws(1e-3) + sharp, ANGLES)
     np.testing.assert_allclose(found, 1e-3, rtol=0.15)
 
 
 def test_what_is_smooth_in_wavelength_is_no_noise():
     smooth = 0.05 * np.linspace(-1, 1, W)[:, None] * np.random.default_rng(3).normal(size=F)
-    found = channels.noise(channel(1e-6), draws(1e-3) + smooth, ANGLES)
+    found = estimates.frame_noise(channel(1e-6), draws(1e-3) + smooth, ANGLES)
     np.testing.assert_allclose(found, 1e-3, rtol=0.15)
 
 
@@ -91,27 +96,27 @@ def test_what_is_smooth_in_wavelength_is_no_noise():
 def test_roughness_is_the_standard_deviation_of_white_noise():
     values = np.random.default_rng(2).normal(size=(W, 3000))
     valid = np.ones(values.shape, dtype=bool)
-    found = channels._roughness(values, valid, np.zeros((3000, 0)))
+    found = estimates._roughness(values, valid, np.zeros((3000, 0)))
     assert found == pytest.approx(1.0, abs=0.02)
 
 
 def test_few_wavelengths_tell_no_roughness():
     four = np.ones((4, 9), dtype=bool)
-    assert np.isnan(channels._roughness(np.ones((4, 9)), four, np.zeros((9, 0))))
+    assert np.isnan(estimates._roughness(np.ones((4, 9)), four, np.zeros((9, 0))))
     none = np.zeros((W, 9), dtype=bool)
-    assert np.isnan(channels._roughness(np.ones((W, 9)), none, np.zeros((9, 0))))
+    assert np.isnan(estimates._roughness(np.ones((W, 9)), none, np.zeros((9, 0))))
 
 
 def test_masked_neighbours_are_left_out():
     values, valid = np.zeros((W, F)), np.ones((W, F), dtype=bool)
     values[5] = 1e6
     valid[5] = False
-    assert channels._roughness(values, valid, np.zeros((F, 0))) == 0
+    assert estimates._roughness(values, valid, np.zeros((F, 0))) == 0
 
 
 def test_roughness_of_equal_errors_is_their_size():
     valid = np.ones((W, F), dtype=bool)
-    assert channels._roughness_of(np.full((W, F), 0.3), valid) == pytest.approx(0.3)
+    assert estimates._roughness_of(np.full((W, F), 0.3), valid) == pytest.approx(0.3)
 
 
 # ---- harmonics of the stages ---------------------------------------------------------------
@@ -119,7 +124,7 @@ def test_roughness_of_equal_errors_is_their_size():
 
 def test_turning_holds_all_harmonics_of_two_and_four():
     valid = np.ones((W, F), dtype=bool)
-    basis = channels._turning(ANGLES, valid)
+    basis = estimates._turning(ANGLES, valid)
     plate, turn = ANGLES["hwp"], ANGLES["derotator"]
     for wave in (1 + 0 * plate, np.sin(4 * plate), np.cos(2 * turn), np.sin(2 * plate + 4 * turn)):
         np.testing.assert_allclose(basis @ (basis.T @ wave), wave, atol=1e-8)
@@ -130,7 +135,7 @@ def test_turning_holds_all_harmonics_of_two_and_four():
 def test_frames_with_a_masked_wavelength_are_not_asked():
     valid = np.ones((W, F), dtype=bool)
     valid[0, 7] = False
-    assert np.all(np.abs(channels._turning(ANGLES, valid)[7]) < 1e-12)
+    assert np.all(np.abs(estimates._turning(ANGLES, valid)[7]) < 1e-12)
 
 
 def test_a_wavelength_that_is_masked_through_the_run_hides_no_optics():
@@ -140,13 +145,30 @@ def test_a_wavelength_that_is_masked_through_the_run_hides_no_optics():
     valid = np.ones((W, F), dtype=bool)
     valid[8] = False
     residual = np.where(valid, draws(1e-3) + sharp, 0.0)
-    found = channels.noise(channel(1e-6, valid), residual, ANGLES)
+    found = estimates.frame_noise(channel(1e-6, valid), residual, ANGLES)
     np.testing.assert_allclose(found, 1e-3, rtol=0.15)
 
 
 def test_harmonics_that_would_take_most_frames_are_not_taken_out():
     few = dict(zip(ANGLES, np.random.default_rng(1).uniform(0, np.pi, (2, 12)), strict=True))
-    assert channels._turning(few, np.ones((W, 12), dtype=bool)).shape == (12, 0)
+    assert estimates._turning(few, np.ones((W, 12), dtype=bool)).shape == (12, 0)
+
+
+def test_a_calibration_and_its_diagnosis_compare_with_the_same_noise():
+    """Also where it is larger than the table states, and in other words: as many times the gap."""
+    for factor in [1.0, 0.2]:
+        table = data.observed().to_table()
+        for beam in ("flux_right_err", "flux_left_err"):
+            table[beam] = factor * table[beam]
+        observations = Observations.from_table(table, name="lamp")
+        cal = calibrate(data.chain(), observations, cross_validate=False)
+        model = nominal_model(cal.chains, [observations], calibration=cal)
+        *_, told = cal.fit["lack_of_fit"]
+        assert told["noise"] == "roughness"
+        noise = Doubles(model).noise_percent
+        assert told["noise_percent"] == pytest.approx(noise, rel=1e-6), factor
+        rms = 100 * np.sqrt(np.sum(cal.residuals**2) / (cal.residuals.size - len(cal.covariance)))
+        assert told["times_noise"] * noise == pytest.approx(rms, rel=0.15), factor
 
 
 def test_settings_that_saturate_the_sums():
@@ -173,7 +195,7 @@ def test_settings_hold_the_plate_but_not_the_derotator_alone():
 @given(st.lists(st.integers(0, 1), min_size=4, max_size=8))
 def test_a_modulator_doubles_the_waves_where_both_states_were_taken(state):
     wave = np.ones(len(state))
-    found = channels._by_state([wave], {"flc_state": np.array(state, float)})
+    found = estimates.by_state([wave], {"flc_state": np.array(state, float)})
     if len(set(state)) == 1:
         assert len(found) == 1
     else:

@@ -51,10 +51,11 @@ def page(tmp_path_factory):
     content = to_dict(diagnosis)
     # whether there is something to tell apart depends on the noise
     content["next_observations"] = [NEXT | {"gain": 9.0}]
+    diagnosis.content = content
     path = tmp_path_factory.mktemp("page") / "gap.html"
     figures, sizes = _figures(diagnosis), _size_figures(diagnosis, content)
     assert len(figures) == 4
-    write_html(diagnosis, path, figures=figures, size_figures=sizes, content=content)
+    write_html(diagnosis, path, figures=figures, size_figures=sizes)
     return path
 
 

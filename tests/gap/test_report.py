@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.fitting import TRFLSQFitter
 from gap_data import WAVELENGTH, chain, frames, observed, with_effect
 from matplotlib.figure import Figure
 
@@ -22,6 +23,7 @@ from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.report import MAP, _about_frames, causes_table, summary, to_dict, write_html
 from astropolcal.simulation import simulate
 
@@ -160,6 +162,26 @@ def test_double_differences_are_those_of_calibrate(found, content):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_what_was_worked_out_is_only_shown(found, content, tmp_path, monkeypatch):
+    """No fit, however often and in which form a diagnosis is written."""
+
+    def fit(*args, **kwargs):
+        raise AssertionError("a serializer fits")
+
+    monkeypatch.setattr("scipy.optimize.least_squares", fit)
+    monkeypatch.setattr(TRFLSQFitter, "__call__", fit)
+    monkeypatch.setattr(GapProblem, "fit", fit)
+    for _ in range(2):
+        told = to_dict(found)
+        assert told == content
+        # what a user does with it is not remembered
+        told["causes"].clear()
+        assert summary(found)
+        write_html(found, tmp_path / "gap.html")
+
+
+@pytest.mark.slow
 def test_sizes_are_those_of_the_simulation(content):
     (cause,) = content["causes"]
     (entry,) = cause["size"].values()
@@ -206,10 +228,11 @@ def test_significance_is_counted_from_where_an_effect_is_absent(found):
 
 
 def test_frames_to_distrust_are_in_the_first_sentence(found):
-    content = to_dict(replace(found, frames=[Fault()]))
+    faulty = replace(found, frames=[Fault()])
+    content = to_dict(faulty)
     assert Fault().words in content["sentences"][0]
     assert content["frames"][0]["frame"] == 29
-    assert summary(found, content).replace("\n", " ").startswith(content["sentences"][0])
+    assert summary(faulty).replace("\n", " ").startswith(content["sentences"][0])
 
 
 def test_an_alternative_has_no_size_and_the_nominal_model_no_prediction(found):
@@ -242,7 +265,7 @@ def test_table(found, nothing):
 
 @pytest.mark.slow
 def test_the_first_lines_are_the_summary(found, content):
-    lines = summary(found, content, ["gap.html"]).splitlines()
+    lines = summary(found, ["gap.html"]).splitlines()
     assert max(map(len, lines)) <= 80
     words = " ".join(" ".join(lines[:24]).split())
     for sentence in content["sentences"]:
@@ -324,7 +347,7 @@ def test_page_of_every_verdict(found, nothing, unknown, tmp_path):
 @pytest.mark.slow
 def test_page_that_cannot_be_written(found, content, tmp_path):
     with pytest.raises(GapError, match="cannot be written"):
-        write_html(found, tmp_path / "nowhere" / "gap.html", content=content)
+        write_html(found, tmp_path / "nowhere" / "gap.html")
 
 
 # ---- frames that calibrate would mask -----------------------------------------------------------

@@ -79,7 +79,7 @@ def test_a_change_is_found_with_its_run_cell_and_size():
     assert size["unit"] == "deg"
     np.testing.assert_allclose(np.deg2rad(sign * np.array(size["value"])), 0.05, atol=0.01)
     assert first["brought_by"] == []
-    told = "the retardance at 45 deg to the axes behind the derotator changed by 2."
+    told = "the retardance at 45 deg to the axes downstream of the derotator changed by 2."
     assert first["words"].startswith(f'Between "{JULY}" and "{OCTOBER}" {told}')
     assert first["words"] in content["sentences"]
     json.dumps(content)
@@ -128,7 +128,8 @@ def test_one_of_three_runs_differs():
         "dependence": "dataset:c",
     }
     assert (
-        'In "c" the retardance at 45 deg to the axes behind the derotator differs' in one["words"]
+        'In "c" the retardance at 45 deg to the axes downstream of the derotator differs'
+        in one["words"]
     )
 
 
@@ -234,7 +235,7 @@ def test_words_of_a_change_that_is_doubtful():
     assert words[:4] == ["A."] * 4
     assert words[4] == "2 smaller changes are listed below."
     assert "need not be the true ones" in words[5]
-    assert words[6].startswith("6 of the changes are at or behind what only one run has")
+    assert words[6].startswith("6 of the changes are at or downstream of what only one run has")
 
 
 def test_a_single_run_has_no_changes():
@@ -269,7 +270,7 @@ def test_runs_of_different_instruments():
 
 
 def test_changes_need_cells():
-    with pytest.raises(GapError, match="told by cells"):
+    with pytest.raises(GapError, match="found by cells"):
         diagnose(data.chain(), pair(), changes=True, cells=False)
 
 

@@ -91,7 +91,7 @@ def test_numbers_have_the_digits_that_count():
         assert _words.percent(value) == words
     for value, words in ((0.3, "0.3"), (2e-6, "2e-06"), (1e-7, "< 1e-6"), (0.0, "< 1e-6")):
         assert _words.p(value) == words
-        assert (_words.doubt(value) == "beyond doubt") == (value < 1e-6)
+        assert _words.doubt(value) in (f"(p {words})", f"(p = {words})")
     for value, words in ((0.0, "0 %"), (0.0049, "< 1 %"), (1.0, "100 %"), (None, "-")):
         assert _words.short_share(value) == words
     assert _words.change(1.234, None) == "1.2 -> -"
@@ -190,13 +190,15 @@ def test_the_same_kind_at_several_places_is_told_once():
     one = entry(cell("source"), share=0.3, aliases=aliases)
     title = _words.title(one)
     assert title.count("diattenuation") == 1
-    assert "at the source, behind the half-wave plate or behind the derotator" in title
+    assert (
+        "at the source, downstream of the half-wave plate or downstream of the derotator" in title
+    )
     assert _words.own_share(one) == pytest.approx(0.88)
     (other,) = _words.others(one, {})
     assert other.endswith("(11 %)")
     # a place that is much less probable is another answer
     aliases[1]["probability"] = 0.01
-    assert "behind the derotator" not in _words.title(one)
+    assert "downstream of the derotator" not in _words.title(one)
 
 
 def test_long_groups_are_told_shortly():
@@ -252,11 +254,11 @@ def test_every_verdict_has_its_sentence():
         ({"verdict": "unexplained", "causes": []}, "none of the 12 causes that were tried"),
         ({"verdict": "unexplained", "causes": []}, "60 % of the gap follows a pattern."),
         ({"verdict": "unexplained"} | left, "20 % of what is left follows a pattern."),
-        (left, "What is left, 30 % of the gap, is more than noise beyond doubt: 20 % of it"),
+        (left, "What is left, 30 % of the gap, is more than noise (p < 1e-6): 20 % of it"),
         ({}, "What is left is noise (p = 0.4)."),
         ({"cross_validated": False}, "the frames of the fit"),
         ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),
-        ({"gap_p_value": 0.0}, "The gap is real beyond doubt."),
+        ({"gap_p_value": 0.0}, "The gap is real (p < 1e-6)."),
     ):
         assert words in " ".join(content(**changes)["sentences"])
 

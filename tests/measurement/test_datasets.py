@@ -215,7 +215,7 @@ def test_numbers_that_differ_are_told(chain, observations):
 
 def test_wavelength_off_the_grid_names_the_nearest(chain, observations):
     with pytest.raises(
-        ObservationError, match=r"1600\.000 nm is not on the grid.*nearest 1610\.000"
+        ObservationError, match=r"1600\.000 nm, are none .* of the parameters.*nearest 1610\.000"
     ):
         Measurement(chain, observations, wavelength=[1.2, 1.61, 2.2] * u.um)
 

@@ -15,7 +15,6 @@ from astropolcal.observations.observables import (
 )
 
 N_BINS, N_DATA = 3, 5
-EVERY = pytest.mark.parametrize("observable", OBSERVABLES.values(), ids=OBSERVABLES)
 fluxes = arrays(float, (2, N_BINS, N_DATA), elements=st.floats(1.0, 1e6))
 gains = st.floats(0.1, 10.0)
 
@@ -109,50 +108,50 @@ def test_all_double_differences_agree_for_a_steady_source_and_equal_beams(p, flu
         assert value[0, 0] == pytest.approx(p, abs=1e-12)
 
 
-@EVERY
-def test_exchanging_the_beams_changes_the_sign(observable):
-    right, left = random_beams(observable.frames_per_datum)
-    value = observable.evaluate(right, left)
-    np.testing.assert_allclose(observable.evaluate(left, right), -value, atol=1e-14)
+def test_exchanging_the_beams_changes_the_sign():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum)
+        value = observable.evaluate(right, left)
+        np.testing.assert_allclose(observable.evaluate(left, right), -value, atol=1e-14)
 
 
-@EVERY
-def test_values_lie_between_minus_one_and_one(observable):
-    right, left = random_beams(observable.frames_per_datum)
-    assert np.abs(observable.evaluate(right, left)).max() < 1
+def test_values_lie_between_minus_one_and_one():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum)
+        assert np.abs(observable.evaluate(right, left)).max() < 1
 
 
-@EVERY
-def test_derivative_agrees_with_central_differences(observable):
-    right, left = random_beams(observable.frames_per_datum, seed=1)
-    analytic = observable.derivative(right, left)
-    step = 1e-3
-    for beam in (0, 1):
-        assert analytic[beam].shape == right.shape
-        for frame in range(observable.frames_per_datum):
-            up, down = np.array([right, left]), np.array([right, left])
-            up[beam, frame] += step
-            down[beam, frame] -= step
-            numeric = (observable.evaluate(*up) - observable.evaluate(*down)) / (2 * step)
-            np.testing.assert_allclose(analytic[beam][frame], numeric, rtol=1e-6, atol=1e-11)
+def test_derivative_agrees_with_central_differences():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum, seed=1)
+        analytic = observable.derivative(right, left)
+        step = 1e-3
+        for beam in (0, 1):
+            assert analytic[beam].shape == right.shape
+            for frame in range(observable.frames_per_datum):
+                up, down = np.array([right, left]), np.array([right, left])
+                up[beam, frame] += step
+                down[beam, frame] -= step
+                numeric = (observable.evaluate(*up) - observable.evaluate(*down)) / (2 * step)
+                np.testing.assert_allclose(analytic[beam][frame], numeric, rtol=1e-6, atol=1e-11)
 
 
-@EVERY
-def test_evaluate_leaves_its_input_alone(observable):
-    right, left = random_beams(observable.frames_per_datum)
-    before = right.copy(), left.copy()
-    observable.evaluate(right, left)
-    observable.derivative(right, left)
-    np.testing.assert_array_equal((right, left), before)
+def test_evaluate_leaves_its_input_alone():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum)
+        before = right.copy(), left.copy()
+        observable.evaluate(right, left)
+        observable.derivative(right, left)
+        np.testing.assert_array_equal((right, left), before)
 
 
-@EVERY
-def test_masked_fluxes_stay_nan_without_a_warning(observable):
-    right, left = random_beams(observable.frames_per_datum)
-    right[0, 1, 2] = left[0, 1, 2] = np.nan
-    value = observable.evaluate(right, left)
-    assert np.argwhere(np.isnan(value)).tolist() == [[1, 2]]
-    assert np.isnan(observable.derivative(right, left)[0][0, 1, 2])
+def test_masked_fluxes_stay_nan_without_a_warning():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum)
+        right[0, 1, 2] = left[0, 1, 2] = np.nan
+        value = observable.evaluate(right, left)
+        assert np.argwhere(np.isnan(value)).tolist() == [[1, 2]]
+        assert np.isnan(observable.derivative(right, left)[0][0, 1, 2])
 
 
 def correlated_noise(var_right, var_left, cov, rng, n):
@@ -162,43 +161,43 @@ def correlated_noise(var_right, var_left, cov, rng, n):
     return np.sqrt(var_right) * first, slope * first + np.sqrt(var_left - slope**2) * second
 
 
-@EVERY
-def test_variance_agrees_with_monte_carlo(observable):
-    rng = np.random.default_rng(20251005)
-    right, left = random_beams(observable.frames_per_datum, seed=2)
-    var_right, var_left = 0.01 * right, 0.02 * left
-    cov = 0.6 * np.sqrt(var_right * var_left)
-    n = 20000
-    noise_right, noise_left = correlated_noise(var_right, var_left, cov, rng, n)
-    # frames first, then draws as further bins
-    shape = (observable.frames_per_datum, n * N_BINS, N_DATA)
-    draws = observable.evaluate(
-        np.moveaxis(right + noise_right, 0, 1).reshape(shape),
-        np.moveaxis(left + noise_left, 0, 1).reshape(shape),
-    ).reshape(n, N_BINS, N_DATA)
-    expected = observable.variance(right, left, var_right, var_left, cov)
-    # the scatter of a variance from n draws is sqrt(2 / n) = 1 per cent
-    np.testing.assert_allclose(draws.var(axis=0), expected, rtol=0.05)
-    # ... and the covariance of the beams matters that much
-    without = observable.variance(right, left, var_right, var_left, 0.0)
-    assert np.abs(without / expected - 1).max() > 0.2
+def test_variance_agrees_with_monte_carlo():
+    for observable in OBSERVABLES.values():
+        rng = np.random.default_rng(20251005)
+        right, left = random_beams(observable.frames_per_datum, seed=2)
+        var_right, var_left = 0.01 * right, 0.02 * left
+        cov = 0.6 * np.sqrt(var_right * var_left)
+        n = 20000
+        noise_right, noise_left = correlated_noise(var_right, var_left, cov, rng, n)
+        # frames first, then draws as further bins
+        shape = (observable.frames_per_datum, n * N_BINS, N_DATA)
+        draws = observable.evaluate(
+            np.moveaxis(right + noise_right, 0, 1).reshape(shape),
+            np.moveaxis(left + noise_left, 0, 1).reshape(shape),
+        ).reshape(n, N_BINS, N_DATA)
+        expected = observable.variance(right, left, var_right, var_left, cov)
+        # the scatter of a variance from n draws is sqrt(2 / n) = 1 per cent
+        np.testing.assert_allclose(draws.var(axis=0), expected, rtol=0.05)
+        # ... and the covariance of the beams matters that much
+        without = observable.variance(right, left, var_right, var_left, 0.0)
+        assert np.abs(without / expected - 1).max() > 0.2
 
 
-@EVERY
-def test_unknown_variances_give_unknown_errors(observable):
-    right, left = random_beams(observable.frames_per_datum)
-    unknown = np.full_like(right, np.nan)
-    assert np.isnan(observable.variance(right, left, unknown, unknown, unknown)).all()
+def test_unknown_variances_give_unknown_errors():
+    for observable in OBSERVABLES.values():
+        right, left = random_beams(observable.frames_per_datum)
+        unknown = np.full_like(right, np.nan)
+        assert np.isnan(observable.variance(right, left, unknown, unknown, unknown)).all()
 
 
-@EVERY
-def test_covariance_without_shared_frames_is_the_variance(observable):
-    k = observable.frames_per_datum
-    right, left = random_beams(k)
-    frames = np.arange(k * N_DATA).reshape(N_DATA, k)
-    covariance = observable.frame_covariance(right, left, right, left, 0.1 * right, frames)
-    variance = observable.variance(right, left, right, left, 0.1 * right)
-    np.testing.assert_allclose(covariance, np.eye(N_DATA) * variance[:, :, None], atol=1e-15)
+def test_covariance_without_shared_frames_is_the_variance():
+    for observable in OBSERVABLES.values():
+        k = observable.frames_per_datum
+        right, left = random_beams(k)
+        frames = np.arange(k * N_DATA).reshape(N_DATA, k)
+        covariance = observable.frame_covariance(right, left, right, left, 0.1 * right, frames)
+        variance = observable.variance(right, left, right, left, 0.1 * right)
+        np.testing.assert_allclose(covariance, np.eye(N_DATA) * variance[:, :, None], atol=1e-15)
 
 
 @pytest.mark.slow
@@ -246,12 +245,12 @@ def test_covariance_refuses_frames_of_the_wrong_shape():
         )
 
 
-@EVERY
-def test_every_observable_is_described(observable):
-    assert isinstance(observable, Observable)
-    assert OBSERVABLES[observable.name] is observable
-    assert observable.frames_per_datum in (1, 2, 4)
-    assert observable.description in repr(observable)
+def test_every_observable_is_described():
+    for observable in OBSERVABLES.values():
+        assert isinstance(observable, Observable)
+        assert OBSERVABLES[observable.name] is observable
+        assert observable.frames_per_datum in (1, 2, 4)
+        assert observable.description in repr(observable)
 
 
 def test_the_default_comes_first():

@@ -12,6 +12,7 @@ from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations
 from astropolcal.observations.quality import (
     brightness,
+    clusters,
     cycle_numbers,
     is_star,
     mask_incomplete_cycles,
@@ -184,3 +185,15 @@ def test_simulated_runs_of_others_keep_all_frames(shared_data):
     folders = sorted((shared_data / "gap-cases").glob("case*"))[::4]
     for path in (p for folder in folders for p in folder.glob("*.ecsv")):
         assert mask_unstable_lamp(Observations.read(path)).mask.sum() == 0, path
+
+
+def test_clusters():
+    for values, gap, numbers in [
+        ([45.0, 60.0, 45.2, 90.0], 0.5, [0, 1, 0, 2]),
+        ([3.0, 1.0, 2.0], 0.5, [2, 0, 1]),
+        # a chain of small steps is one cluster
+        ([0.0, 0.4, 0.8, 1.2], 0.5, [0, 0, 0, 0]),
+        ([0.0, 0.5], 0.5, [0, 0]),
+        ([7.0], 1.0, [0]),
+    ]:
+        assert clusters(np.array(values), gap).tolist() == numbers, (values, gap, numbers)

@@ -289,7 +289,7 @@ def test_coordinates_are_not_numbers(table):
 
 def test_columns_with_more_than_one_value_a_row(table):
     table["flux_right"] = np.ones((len(table), 2)) * u.adu
-    refuse(table, r"column flux_right has shape \(12, 2\), one value a row is allowed")
+    refuse(table, r"column flux_right has shape \(12, 2\), one value per row is allowed")
 
 
 def test_half_of_the_errors(table):
@@ -369,7 +369,7 @@ def test_wavelengths_are_positive(table):
 def test_a_cell_given_twice(table):
     table["frame"][7] = 1
     table["hwp"][7] = 22.5 * u.deg
-    refuse(table, "row 8: frame = 1, bin = 1 is given already in row 5; one row a frame and bin")
+    refuse(table, "row 8: frame = 1, bin = 1 is given already in row 5; one row per frame and bin")
 
 
 def test_a_bin_with_two_wavelengths(table):
@@ -402,12 +402,14 @@ def test_columns_of_frames_are_constant():
     for name in ["hwp", "derotator"]:
         table = example_table()
         table[name][4] += 1 * u.deg
-        refuse(table, rf"row 5: {name} = .* deg in frame 1, but .* deg in row 4; one value a frame")
+        refuse(
+            table, rf"row 5: {name} = .* deg in frame 1, but .* deg in row 4; one value per frame"
+        )
 
 
 def test_other_columns_of_frames_are_constant(table):
     table["file"] = [f"cube{i}" for i in range(len(table))]
-    refuse(table, "row 2: file = cube1 in frame 0, but cube0 in row 1; one value a frame")
+    refuse(table, "row 2: file = cube1 in frame 0, but cube0 in row 1; one value per frame")
 
 
 def test_coordinates_of_frames(tmp_path, table):

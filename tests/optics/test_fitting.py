@@ -219,3 +219,13 @@ def test_a_notebook_shows_a_table():
     assert page.startswith("<p>first | second | third | fourth | Mapping</p>")
     for text in ("Diattenuator", "diattenuation=0.3", "theta=51. deg"):
         assert text in page
+
+
+def test_documentation_finds_what_a_parameter_is():
+    from inspect import getdoc, getmembers, isdatadescriptor
+
+    found = dict(getmembers(optics.LinearRetarder, isdatadescriptor))
+    assert getdoc(found["retardance"]) == "phase between the two axes"
+    assert "installed orientation" in getdoc(found["theta"])
+    with pytest.raises(AttributeError, match="theta cannot be deleted"):
+        del optics.LinearRetarder().theta

@@ -135,7 +135,7 @@ def test_standard_of_another_source_has_its_own_panel(elliptical):
     figure = plot_accuracy(replace(elliptical, fit=elliptical.fit | {"standards": [star]}))
     first, second = figure.axes
     assert list(lines(first)) == ["s_res", "s_mean", "s_cv"]
-    assert "star: n = 12 data a wavelength, predicted" in second.get_title()
+    assert "star: n = 12 data per wavelength, predicted" in second.get_title()
     drawn = {line.get_label().split(" ")[0].rstrip(":"): line for line in second.lines}
     assert list(drawn) == ["s_standard", "s_cv"]
     np.testing.assert_allclose(drawn["s_cv"].get_ydata(), 0.1)

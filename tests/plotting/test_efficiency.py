@@ -59,7 +59,7 @@ def test_internal_chain_has_no_map_of_pointings():
     figure = plot_polarimetric_efficiency(CHARIS.published(), CHARIS.wavelength, figure=Figure())
     # two panels and a colour bar
     assert len(figure.axes) == 3
-    assert figure.axes[0].get_title() == "behind the internal source"
+    assert figure.axes[0].get_title() == "downstream of the internal source"
 
 
 def test_few_filters_are_rows_of_their_own():

@@ -150,7 +150,7 @@ def cause(what, probability=1.0, aliases=(), share=1.0):
 def diagnosis(*causes, verdict="located"):
     chain = instruments.get("charis").chain(derotator="linear")
     nominal = SimpleNamespace(chains=[chain])
-    return SimpleNamespace(causes=list(causes), verdict=verdict, nominal=nominal)
+    return SimpleNamespace(causes=list(causes), verdict=verdict, nominal=nominal, content=None)
 
 
 # ---- the map -------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def test_verdict_as_a_title():
 
 
 def sized(sizes, parameters, factor=1.0):
-    """A diagnosis with one cause of these sizes, and the content of its report."""
+    """A diagnosis with one cause of these sizes, as its report has them."""
     problem = SimpleNamespace(
         wavelength=NM / 1000,
         free=SimpleNamespace(by_name={name: SimpleNamespace(factor=factor) for name in sizes}),
@@ -223,7 +223,8 @@ def sized(sizes, parameters, factor=1.0):
     found = diagnosis(cause("beam_gain"))
     model = SimpleNamespace(problem=problem, added={"beam_gain": parameters}, chains=[])
     found.nominal = found.improved = model
-    return found, {"causes": [{"size": sizes}]}
+    found.content = {"causes": [{"size": sizes}]}
+    return found
 
 
 def size(value, std, unit="deg", limit=1.0):
@@ -235,8 +236,8 @@ def test_a_panel_for_each_size_that_depends_on_the_wavelength():
     sizes = {name: size([1.0, 2.0, 3.0], [0.01, 0.02, 0.03]) for name in names[:2]}
     sizes["gap_one.same"] = size([1.0] * 3, [0.01] * 3)
     sizes["gap_one.common"] = {"value": 1.0, "std": 0.1, "unit": "", "limit": 1.0}
-    found, content = sized(sizes, [EffectParameter(name, 1, 1) for name in names])
-    figure = plot_effect_sizes(found, "beam_gain", content=content)
+    found = sized(sizes, [EffectParameter(name, 1, 1) for name in names])
+    figure = plot_effect_sizes(found, "beam_gain")
     assert [a.get_ylabel() for a in figure.axes] == ["horizontal (deg)", "horizontal rate (deg)"]
     for axes in figure.axes:
         line, _, (bars,) = axes.containers[0].lines
@@ -258,15 +259,15 @@ def test_the_line_is_where_the_effect_is_absent():
     ):
         parameter = EffectParameter(name, 1, 1, neutral=neutral)
         sizes = {name: size([1.0, 1.0, 1.1], [0.01] * 3, unit)}
-        found, content = sized(sizes, [parameter], factor)
-        (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
+        found = sized(sizes, [parameter], factor)
+        (axes,) = plot_effect_sizes(found, "beam_gain").axes
         np.testing.assert_allclose(axes.lines[0].get_ydata(), line)
 
 
 def test_wavelengths_without_a_size_are_crosses_at_the_foot():
     sizes = {"gap_one.horizontal": size([1.0, 2.0, 3.0], [0.01, 0.2, None])}
-    found, content = sized(sizes, [EffectParameter("gap_one.horizontal", 1, 1)])
-    (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
+    found = sized(sizes, [EffectParameter("gap_one.horizontal", 1, 1)])
+    (axes,) = plot_effect_sizes(found, "beam_gain").axes
     (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
     np.testing.assert_allclose(crosses.get_xdata(), NM[1:])
     # in shares of the height of the panel
@@ -275,10 +276,13 @@ def test_wavelengths_without_a_size_are_crosses_at_the_foot():
 
 
 def test_what_has_no_size_is_refused():
-    found, content = sized({}, [])
-    for name, words in (("other", "is no cause; these are: beam_gain"), ("beam_gain", "anything")):
+    found = sized({}, [])
+    for name, words in (
+        ("other", "is not a cause; these are: beam_gain"),
+        ("beam_gain", "anything"),
+    ):
         with pytest.raises(ParameterError, match=words):
-            plot_effect_sizes(found, name, content=content)
+            plot_effect_sizes(found, name)
 
 
 def test_a_cell_is_drawn_over_what_it_depends_on():
@@ -295,7 +299,7 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
         own = cause(cell)
         own.effect = CellEffect(cell, 0)
         improved = model.with_effect(own.effect)
-        found = SimpleNamespace(nominal=model, improved=improved, causes=[own])
+        found = SimpleNamespace(nominal=model, improved=improved, causes=[own], content=None)
         (axes,) = plot_effect_sizes(found, own.name).axes
         assert axes.get_xlabel() == label
         assert "deg" in axes.get_ylabel()

@@ -319,7 +319,7 @@ def test_undetermined_rows_are_hatched(undetermined):
     assert figure.axes[0].patch.get_hatch()
     (legend,) = figure.legends
     text = legend.get_texts()[0].get_text()
-    assert text.startswith(f"{without.sum()} of {without.size} parameters: left open")
+    assert text.startswith(f"{without.sum()} of {without.size} parameters: not determined")
 
 
 def test_small_matrices_have_numbers():

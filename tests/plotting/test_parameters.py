@@ -387,7 +387,7 @@ def test_legend_says_how_much_is_open():
         texts = [text.get_text() for text in legend.get_texts()]
         # in the order of certainty, each once, and in no panel's colour
         assert texts[0] == parameters._DETERMINED
-        assert texts[1] == f"{parameters._ALONE} (the data leave {words} open)"
+        assert texts[1] == f"{parameters._ALONE} (the data do not determine {words})"
         assert {handle.get_color() for handle in legend.legend_handles} == {"#000000"}
 
 

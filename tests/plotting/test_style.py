@@ -134,18 +134,6 @@ def test_angles_are_short():
         assert _style.degrees(angle) == text, (angle, text)
 
 
-def test_clusters():
-    for values, gap, numbers in [
-        ([45.0, 60.0, 45.2, 90.0], 0.5, [0, 1, 0, 2]),
-        ([3.0, 1.0, 2.0], 0.5, [2, 0, 1]),
-        # a chain of small steps is one cluster
-        ([0.0, 0.4, 0.8, 1.2], 0.5, [0, 0, 0, 0]),
-        ([0.0, 0.5], 0.5, [0, 0]),
-        ([7.0], 1.0, [0]),
-    ]:
-        assert _style.clusters(np.array(values), gap).tolist() == numbers, (values, gap, numbers)
-
-
 # ---- arrays --------------------------------------------------------------------------------
 
 

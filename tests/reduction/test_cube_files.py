@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropolcal import instruments
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction.cubes import file_names, header_of, write_cube
+from astropolcal.reduction.cubes import CubeFiles, file_names, header_of, write_cube
 from astropolcal.reduction.headers import read_header
 
 CHARIS = instruments.get("charis").files
@@ -22,8 +22,8 @@ TWO = FileLayout({"hwp": "HWP", "camera": "CAM"}, (1, 4, 8), cube_extension=0,
                  beam_files=("cam1", "cam2"), prefix="v_")  # fmt: skip
 
 
-def names(folder, layout=CHARIS, *, prefix=None, first=1, n_frames=2, raw=True, overwrite=False):
-    return file_names(folder, layout, prefix, first, n_frames, raw, overwrite)
+def names(folder, layout=CHARIS, *, n_frames=2, **options):
+    return file_names(folder, layout, CubeFiles(**options), n_frames)
 
 
 def relative(found, folder):

@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Simulated cubes: what is in the images and headers, and what comes back out of them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import astropy.units as u
 import numpy as np
@@ -24,7 +24,14 @@ from astropolcal.exceptions import (
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction import images as _images
-from astropolcal.reduction.cubes import _usual_flux, simulate_cubes, true_observations
+from astropolcal.reduction.cubes import (
+    CubeFiles,
+    DetectorModel,
+    ImageModel,
+    _usual_flux,
+    simulate_cubes,
+    true_observations,
+)
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.25, 1.65, 2.15] * u.um
@@ -98,17 +105,27 @@ def sky_frames(n_cycles=1):
     return frames
 
 
+def parted(options):
+    """Options of `simulate_cubes`, those of its models and files given by their names alone."""
+    options = dict(options)
+    for name, kind in (("image", ImageModel), ("detector", DetectorModel), ("files", CubeFiles)):
+        own = {f.name for f in fields(kind)} & set(options)
+        options[name] = kind(**{key: options.pop(key) for key in own})
+    return options
+
+
 def write(folder, frames=None, **options):
     frames = half_wave_plate_cycles(PLATE) if frames is None else frames
     options = {"flux": 1e6, "seed": 3} | options
-    return simulate_cubes(folder, SMALL.chain(), SMALL, frames, **options)
+    return simulate_cubes(folder, SMALL.chain(), SMALL, frames, **parted(options))
 
 
 def write_star(folder, **options):
     options = {"source": "star", "flux": 1e5, "seed": 3, "psf": "gaussian", "fwhm": 4.0} | options
     frames = options.pop("frames", None)
     frames = sky_frames() if frames is None else frames
-    return simulate_cubes(folder, options.pop("chain", sky_chain()), SMALL, frames, **options)
+    chain = options.pop("chain", sky_chain())
+    return simulate_cubes(folder, chain, SMALL, frames, **parted(options))
 
 
 def image(path):
@@ -329,7 +346,8 @@ def test_extinguished_beam_is_dark_not_an_error(tmp_path):
         | optics.WollastonPrism(name="wollaston", efficiency=1.0)
     )
     frames = half_wave_plate_cycles([0, 45] * u.deg)
-    paths = simulate_cubes(tmp_path, ideal, SMALL, frames, noise=False, flux=1e6)
+    quiet = DetectorModel(noise=False)
+    paths = simulate_cubes(tmp_path, ideal, SMALL, frames, detector=quiet, flux=1e6)
     at = {"left": (slice(None), 30, 24), "right": (slice(None), 33, 62)}
     for path, dark, bright in zip(paths, ("left", "right"), ("right", "left"), strict=True):
         assert image(path)[at[dark]].max() < 1e-6
@@ -495,7 +513,7 @@ def test_internal_source_comes_back_unbiased(tmp_path):
     # 1056 fluxes: the mean of their pulls is known to 0.03
     frames = half_wave_plate_cycles(PLATE, np.arange(50, 110, 10) * u.deg)
     paths = simulate_cubes(tmp_path, charis.published(), charis, frames, flux=4e6,
-                           bad_pixels=1e-3, seed=7)  # fmt: skip
+                           detector=DetectorModel(bad_pixels=1e-3), seed=7)  # fmt: skip
     observations = reduced(paths, charis, source="internal")
     true = true_observations(charis.published(), charis, frames, flux=4e6)
     bias, mean, width = agreement(observations, true)
@@ -511,8 +529,9 @@ def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     q, u_ = 0.008, -0.006
     charis, chain, frames = on_sky(4, q, u_)
     paths = simulate_cubes(
-        tmp_path, chain, charis, frames, source="star", psf="gaussian", fwhm=4.0, flux=5e5,
-        motion=1.0, seeing=0.05, background=5.0, seed=8,
+        tmp_path, chain, charis, frames, source="star", flux=5e5, seed=8,
+        image=ImageModel(psf="gaussian", fwhm=4.0, motion=1.0, seeing=0.05),
+        detector=DetectorModel(background=5.0),
     )  # fmt: skip
     observations = reduced(paths, charis, source="star")
     true = true_observations(chain, charis, frames, source="star", flux=5e5)
@@ -529,8 +548,9 @@ def test_aperture_correction_recovers_the_wings_and_the_polarization(tmp_path):
     q, u_ = 0.008, -0.006
     charis, chain, frames = on_sky(2, q, u_)
     paths = simulate_cubes(
-        tmp_path, chain, charis, frames, source="star", fwhm=np.linspace(4, 6, 22), beta=2.5,
-        halo=0.05, flux=5e5, motion=1.0, seeing=0.05, background=5.0, seed=8,
+        tmp_path, chain, charis, frames, source="star", flux=5e5, seed=8,
+        image=ImageModel(fwhm=np.linspace(4, 6, 22), beta=2.5, halo=0.05, motion=1.0, seeing=0.05),
+        detector=DetectorModel(background=5.0),
     )  # fmt: skip
     true = true_observations(chain, charis, frames, source="star", flux=5e5)
     plain = agreement(reduced(paths, charis, source="star"), true)[0]
@@ -550,8 +570,9 @@ def test_polarization_survives_wings_outside_the_aperture(tmp_path):
     charis, chain, frames = on_sky(2, q, u_)
     lamp = np.random.default_rng(3).uniform(0.7, 1.0, len(frames))
     paths = simulate_cubes(
-        tmp_path, chain, charis, frames, source="star", fwhm=np.linspace(4, 6, 22), halo=0.2,
-        flux=5e5, motion=1.0, seeing=0.1, bad_pixels=1e-3, lamp=lamp, seed=9,
+        tmp_path, chain, charis, frames, source="star", flux=5e5, lamp=lamp, seed=9,
+        image=ImageModel(fwhm=np.linspace(4, 6, 22), halo=0.2, motion=1.0, seeing=0.1),
+        detector=DetectorModel(bad_pixels=1e-3),
     )  # fmt: skip
     _polarization_agrees(chain, reduced(paths, charis, source="star"), charis, q, u_)
 

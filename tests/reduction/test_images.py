@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.cubes import ImageModel, simulate_cubes
 from astropolcal.reduction.images import Detector, Scene, gaussian, moffat, rectangle
 from astropolcal.simulation import half_wave_plate_cycles
 
@@ -150,7 +150,7 @@ def test_star_beside_the_image_leaves_no_files(tmp_path):
     with pytest.raises(ParameterError, match="the star in the right beam is at"):
         simulate_cubes(
             tmp_path, charis.on_sky(charis.published()), charis, frames, source="star",
-            centre=(190.0, 85.0),
+            image=ImageModel(centre=(190.0, 85.0)),
         )  # fmt: skip
     assert list(tmp_path.iterdir()) == []
 

@@ -169,6 +169,14 @@ def test_bad_arguments_get_one_line_and_status_two(capsys, tmp_path, monkeypatch
         assert list(tmp_path.iterdir()) == [], (arguments, complaint)
 
 
+@pytest.mark.filterwarnings("always:--fix")
+def test_value_without_a_unit_says_which_it_took(small, capsys):
+    for value, warns in (("0", False), ("0.1deg", False), ("0.1", True)):
+        assert main(["calibrate", str(small), "-q", "--fix", f"hwp.theta={value}"]) == 0
+        said = f"--fix hwp.theta={value}: no unit is given, deg is taken" in capsys.readouterr().err
+        assert said == warns, value
+
+
 def _spoil(table, how):
     if how == "empty":
         return table[:0]

@@ -96,7 +96,7 @@ def test_bad_places_for_files(tmp_path, locked):
         ("locked/x.json", "locked/x.json: no permission to write to .*locked; name a folder that"),
         ("to_locked.json", "to_locked.json: no permission to write to .*locked"),
         ("n" * 256, "nnn: cannot be written: File name too long"),
-        ("a\0b", "cannot be written: it is no name of a file .embedded null byte"),
+        ("a\0b", "cannot be written: it is not the name of a file .embedded null byte"),
     ]:
         with pytest.raises(AstropolcalError, match=words):
             check(Output(tmp_path / "good.json"), Output(tmp_path / place))
@@ -119,7 +119,7 @@ def test_bad_places_for_folders(tmp_path, locked):
         ("locked/figures", "locked/figures: no permission to write to .*locked; name a folder"),
         ("locked/figures/all", "locked/figures/all: no permission"),
         ("new/" + "n" * 256, "nnn: cannot be written: File name too long"),
-        ("new/a\0b", "cannot be written: it is no name of a file"),
+        ("new/a\0b", "cannot be written: it is not the name of a file"),
     ]:
         (tmp_path / "note.txt").write_text("")
         with pytest.raises(AstropolcalError, match=words):
@@ -133,7 +133,7 @@ def test_what_cannot_be_an_input(tmp_path):
         ("pipe", "pipe: is a pipe; a regular file is needed"),
         ("/dev/zero", "/dev/zero: is a device; a regular file is needed"),
         ("n" * 256, "nnn: cannot be read: File name too long"),
-        ("a\0b", "cannot be read: it is no name of a file"),
+        ("a\0b", "cannot be read: it is not the name of a file"),
     ):
         with pytest.raises(AstropolcalError, match=words):
             check(files=[Input(tmp_path), Input(tmp_path / place)])
@@ -229,7 +229,7 @@ def test_json_has_null_for_what_is_no_finite_number(capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["1"] == [[1.5, None]]
     assert told["b"] == [2.0, None]
-    # text for what JSON does not know
+    # text for a path, in one line
     assert told["c"] == "x y"
     assert told["d"] == [True, 3, None, "é"]
 

@@ -19,7 +19,12 @@ from astropolcal.correction import correcting as engine
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.pipeline.library import Library
 from astropolcal.reduction import science
-from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.cubes import (
+    CubeFiles,
+    DetectorModel,
+    ImageModel,
+    simulate_cubes,
+)
 from astropolcal.reduction.headers import FrameHeader
 from astropolcal.reduction.science import configured, read_night, survey_frames
 from astropolcal.scripts import _correct
@@ -64,10 +69,9 @@ def night(tmp_path_factory):
         source="star",
         stokes=(1, Q, U, 0),
         flux=2e6,
-        noise=False,
-        psf="gaussian",
-        headers={"OBJECT": "HD 1"},
-        raw=False,
+        image=ImageModel(psf="gaussian"),
+        detector=DetectorModel(noise=False),
+        files=CubeFiles(headers={"OBJECT": "HD 1"}, raw=False),
     )
     return folder
 
@@ -558,7 +562,7 @@ def test_frames_that_do_not_say_enough(frames_with, tmp_path):
 
 def test_calibration_that_is_old(frames_with):
     early, late = frames_with({"MJD": 60990.0}, {"MJD": 61313.5})
-    with pytest.raises(AstropolcalError, match=r"M3 was coated anew between .*--any-date"):
+    with pytest.raises(AstropolcalError, match=r"M3 was recoated between .*--any-date"):
         chosen(OLD, [early, late], optics_in=["nbs"])
     with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
         chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)

@@ -95,7 +95,7 @@ def test_json_has_the_table_whatever_is_printed(capsys):
 def test_instrument_without_telescope_is_seen_behind_its_source(capsys, monkeypatch):
     monkeypatch.setattr(type(instruments.get("charis")), "has_telescope", False)
     run("--derotator", 90)
-    assert "of charis behind the internal source" in capsys.readouterr().out
+    assert "of charis downstream of the internal source" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from astropolcal.converters.calibration import content_hash
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.observations import example_table
 from astropolcal.pipeline.library import Library
-from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.cubes import CubeFiles, simulate_cubes
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
 
@@ -138,8 +138,8 @@ def cubes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cubes")
     charis = instruments.get("charis")
     frames = half_wave_plate_cycles(hwp=[22.5] * u.deg, derotator=60 * u.deg)
-    headers = {"INSTRUME": "CHARIS", "OBJECT": "HD 1"}
-    simulate_cubes(folder, charis.published(), charis, frames, seed=1, headers=headers, raw=False)
+    files = CubeFiles(headers={"INSTRUME": "CHARIS", "OBJECT": "HD 1"}, raw=False)
+    simulate_cubes(folder, charis.published(), charis, frames, seed=1, files=files)
     simulate_cubes(folder / "plain", charis.published(), charis, frames, seed=1)
     return folder
 

@@ -104,7 +104,11 @@ def test_a_reader_that_has_gone_is_no_error(running, tmp_path, monkeypatch):
 def test_options_that_cannot_be_understood(capsys):
     for argv, words in [
         ([], "the following arguments are required: COMMAND (see astropolcal --help)"),
-        (["calibrat"], "invalid choice: 'calibrat'"),
+        (["calibrat"], "; did you mean 'calibrate'? (see astropolcal --help)"),
+        (
+            ["calibrate", "--derotater", "linear"],
+            "--derotater; did you mean '--derotator'? (see astropolcal calibrate --help)",
+        ),
         (["reduce", "x.fits"], "required: -o/--output (see astropolcal reduce --help)"),
         (["correct", "--size", "wide"], "argument --size: invalid int value: 'wide'"),
         (["correct", "--size", "2_1"], "argument --size: invalid int value: '2_1'"),
@@ -272,6 +276,11 @@ def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
 # ---- quiet -------------------------------------------------------------------------------
 
 
+def test_every_help_has_examples():
+    for name, command in COMMANDS.items():
+        assert f"examples:\n  astropolcal {name}" in command.format_help(), name
+
+
 def test_commands_that_do_something_can_be_quiet():
     assert set(QUIET) == set(COMMANDS)
 
@@ -280,7 +289,7 @@ def test_quiet_means_the_same_everywhere():
     for command in QUIET:
         action = COMMANDS[command]._option_string_actions["--quiet"]
         assert action is COMMANDS[command]._option_string_actions["-q"], command
-        assert action.help == "print nothing but warnings and errors", command
+        assert action.help == "print only warnings and errors", command
 
 
 @pytest.fixture(scope="module")
@@ -356,7 +365,7 @@ def test_one_frame_is_no_frames(desk, capsys):
 @pytest.mark.slow
 def test_summary_has_no_negative_zero(desk, capsys):
     """Misalignments that are held at zero, and those that the data pull just below it."""
-    held = "--fix hwp.theta=-1e-9 --fix derotator.theta=0"
+    held = "--fix hwp.theta=-1e-9deg --fix derotator.theta=0"
     assert call(desk, f"calibrate run.ecsv --full --derotator linear {held}") == 0
     out = capsys.readouterr().out
     assert "24 frames x 22 wavelengths" in out

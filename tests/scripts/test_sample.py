@@ -301,7 +301,7 @@ def test_checkpoint_is_not_overwritten(calibration, table, tmp_path, capsys):
     checkpoint.write_bytes(b"precious")
     argv = (calibration, table, *RUN, "--checkpoint", checkpoint)
     assert "run.h5: exists already; --resume goes on" in fails(capsys, *argv)
-    assert "run.h5: is no checkpoint" in fails(capsys, *argv, "--resume")
+    assert "run.h5: is not a checkpoint" in fails(capsys, *argv, "--resume")
     assert checkpoint.read_bytes() == b"precious"
 
 

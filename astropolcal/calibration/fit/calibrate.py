@@ -34,13 +34,17 @@ from astropolcal.calibration.fit.strategies import (
 )
 from astropolcal.calibration.identifiability.analysis import complete, finding_of
 from astropolcal.calibration.identifiability.sky import view_of_measurement
-from astropolcal.calibration.noise.estimates import noise_from_errors, noise_from_null_channel
+from astropolcal.calibration.noise.estimates import (
+    noise_from_errors,
+    noise_from_null_channel,
+    noise_from_roughness,
+)
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
     ROUNDS,
+    Problem,
     Weighting,
-    around,
     describe,
     first_weighting,
     noise_of,
@@ -117,8 +121,8 @@ def calibrate(
         as the errors of real tables are rarely complete). ``"wavelength"``: one
         level for each wavelength of each dataset, from the residuals, with the
         fit repeated until both agree. ``"errors"``: the errors of the tables.
-        Or the noise itself, its standard deviation as one value, one a
-        wavelength or one a datum.
+        Or the noise itself, its standard deviation as one value, one
+        per wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
     positions : sequence of dict, optional
@@ -131,7 +135,7 @@ def calibrate(
         it the fit goes downhill from the chain's own values. By default the
         joint strategy searches, and the two-step one, like the paper, does not.
     gauge : {"minimal", None}
-        Which solution to take where the data leave a choice: that with the
+        Which solution to take where several are equal: that with the
         least change of the parameters common to all wavelengths, or wherever
         the fit happens to end. The choice is recorded in ``settings``.
     loss : {"linear", "huber", "cauchy", "bisquare"}
@@ -144,7 +148,7 @@ def calibrate(
     instrument : str, optional
         Name to record.
     errors : {"scatter", "white"}
-        Errors of the parameters: from how the residuals scatter and hang together at wavelengths,
+        Errors of the parameters: from how the residuals scatter and are correlated at wavelengths,
         pairs of frames and settings of each dataset; or those of independent data whose noise is
         that of ``weights``.
     cross_validate : bool
@@ -242,22 +246,16 @@ def _fixed(chain, fix):
 def _settled(measurement, weighting, origin, gauge):
     """Choose the gauge where there is a choice; return what is open, noise and linear problem."""
     if gauge == "minimal":
-        problem = BinProblem(measurement, weighting.weight, _level(weighting))
-        chosen, whitened = settled(problem, weighting, origin)
+        chosen, whitened = settled(BinProblem(measurement, weighting), origin)
     else:
-        whitened = around(measurement, weighting)
+        whitened = Problem(measurement, weighting).around()
         chosen = open_parameters(measurement.free, whitened)
     if len(whitened.data.null):
         hold_silent(measurement, origin)
     measurement.weighting = weighting.updated(measurement, whitened)
     if measurement.weighting.weight is not None and weighting.from_residuals:
-        whitened = around(measurement, measurement.weighting)
+        whitened = Problem(measurement, measurement.weighting).around()
     return chosen, measurement.weighting, whitened
-
-
-def _level(weighting):
-    """Return the noise against which priors weigh; one that is not known leaves them out."""
-    return weighting.level if weighting.is_known else 0.0
 
 
 def _check(measurement):
@@ -358,8 +356,7 @@ def _joint(measurement, weighting, fitter, search, prepare):
         if not search or not left:
             break
         small, noise = _thinned(measurement, weighting)
-        problem = BinProblem(small, noise.weight, _level(noise))
-        better, moved = search_branches(problem, small.vector(), origin)
+        better, moved = search_branches(BinProblem(small, noise), small.vector(), origin)
         if not moved.any():
             break
         measurement.stand_at(better)
@@ -376,13 +373,12 @@ def _thinned(measurement, weighting):
 
 def _first_search(measurement, weighting, origin):
     """Return the best branches; where no noise is known yet, first without the priors."""
-    problem = BinProblem(measurement, weighting.weight, _level(weighting))
+    problem = BinProblem(measurement, weighting)
     found = search_branches(problem, origin)[0]
     if weighting.is_known or not problem.has_priors:
         return found
     measurement.stand_at(found)
-    weighting = weighting.started(measurement)
-    problem = BinProblem(measurement, weighting.weight, weighting.level)
+    problem = BinProblem(measurement, weighting.started(measurement))
     return search_branches(problem, origin)[0]
 
 
@@ -482,27 +478,35 @@ def _errors(measurement, whitened, how):
 
 
 def _lack_of_fit(calibration):
-    """Hold the residuals against the noise that the table states, and that the data show."""
+    """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
     live = calibration.measurement
-    smooth = {"null_model": "smooth"}
-    for method, options in ((noise_from_errors, {}), (noise_from_null_channel, smooth)):
+    for method in (noise_from_errors, _noise_of_frames):
         try:
-            noise = method(live, **options)
+            noise = method(live)
             test = lack_of_fit(live, calibration, noise)
         except AstropolcalError:
-            continue  # no errors in the table, or no pairs: nothing to hold against
+            continue  # no errors in the table, or too few frames: nothing to hold against
         # unknown where no degree of freedom is left
         ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(
             {
                 "noise": noise.method,
+                "noise_percent": 100 * float(np.sqrt(np.mean(noise.sigma_of_data**2))),
                 "times_noise": float(np.sqrt(ratio)),
                 "p_value": float(test.p_value),
                 "words": test.words,
             }
         )
     return found
+
+
+def _noise_of_frames(measurement):
+    """Return the noise that a diagnosis compares with; of few wavelengths that of the null."""
+    try:
+        return noise_from_roughness(measurement)
+    except FitError:
+        return noise_from_null_channel(measurement, null_model="smooth")
 
 
 def _outliers(calibration):

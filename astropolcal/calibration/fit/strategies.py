@@ -11,10 +11,10 @@ Steps, each of which holds what the steps before have found. Two-step: the polar
 as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
 from the polarized source to the unpolarized one and to the star.
 
-Gauge: where the data leave directions open, every point along them fits equally well, and where a
-fit ends is an accident of its start. The *minimal* gauge takes the solution whose parameters common
-to all wavelengths (the misalignments) have moved least from where they started. A user names
-another gauge by holding parameters (``fix=``) or by a prior.
+Gauge: where the data do not determine all directions, every point along them fits equally well, and
+where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
+parameters common to all wavelengths (the misalignments) have moved least from where they started. A
+user names another gauge by holding parameters (``fix=``) or by a prior.
 """
 
 from itertools import groupby
@@ -24,7 +24,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.scatter import kind_of_source
-from astropolcal.calibration.noise.weighting import around
+from astropolcal.calibration.noise.weighting import Problem
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
@@ -39,15 +39,15 @@ _STILL_GAINING = 0.999
 _STUCK = 1.0
 
 
-class BinProblem:
+class BinProblem(Problem):
     """The fit of the parameters given per wavelength, all bins at once.
 
-    ``noise`` is that of a datum of weight one, against which priors weigh; zero leaves them out.
+    As long as no noise is known against which they could weigh, priors are left out.
     """
 
-    def __init__(self, measurement, weights=None, noise=1.0):
-        self.measurement = measurement
-        self.weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights)
+    def __init__(self, measurement, weighting):
+        super().__init__(measurement, weighting)
+        self.noise = self.noise if weighting.is_known else 0.0
         self.n_bins = len(measurement.wavelength)
         # with a single bin every parameter belongs to it
         self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
@@ -55,9 +55,7 @@ class BinProblem:
         starts = np.array([slot.start for slot in self.slots], dtype=int)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
         self.elements = starts[:, None] + np.arange(self.n_bins)
-        low, high = measurement.free.bounds()
-        self._low, self._high = low[self.elements], high[self.elements]
-        self._noise = noise
+        self._low, self._high = self._low[self.elements], self._high[self.elements]
         rows = {slot.name: row for row, slot in enumerate(self.slots)}
         tight = [(slot, prior) for slot, prior in measurement.free.priors if not prior.is_flat]
         self._priors = [(rows[slot.name], prior) for slot, prior in tight if slot.name in rows]
@@ -68,7 +66,7 @@ class BinProblem:
         """Whether priors that are not flat enter the costs of the bins."""
         return bool(self._priors)
 
-    def residuals(self, vector):
+    def of_bins(self, vector):
         """Return weighted residuals by bin, zero where a bin has fewer data."""
         # all bins at once: a prediction costs as much for one bin as for all
         residual = (self.measurement.predict(vector) - self.measurement.observed) * self.weights
@@ -76,29 +74,29 @@ class BinProblem:
 
     def costs(self, vector):
         """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
-        costs = 0.5 * np.sum(self.residuals(vector) ** 2, axis=1)
+        costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
         for row, prior in self._priors:
-            costs += 0.5 * (self._noise * prior.residual(vector[self.elements[row]])) ** 2
+            costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs
 
     def total(self, vector):
         """Return half the sum of squares of all data and priors."""
         common = [prior.residual(vector[slot.slice]) for slot, prior in self._common]
-        return self.costs(vector).sum() + 0.5 * self._noise**2 * sum(np.sum(r**2) for r in common)
+        return self.costs(vector).sum() + 0.5 * self.noise**2 * sum(np.sum(r**2) for r in common)
 
     def _normal_equations(self, vector):
         jacobian = self.measurement.jacobian(vector) * self.weights
         # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
         blocks *= self._present[:, None, :]
-        residual = self.residuals(vector)
+        residual = self.of_bins(vector)
         normal = blocks @ np.swapaxes(blocks, 1, 2)
         gradient = np.einsum("bsd,bd->bs", blocks, residual)
         for row, prior in self._priors:
             value = vector[self.elements[row]]
-            slope = self._noise * prior.slope(value)
+            slope = self.noise * prior.slope(value)
             normal[:, row, row] += slope**2
-            gradient[:, row] += slope * self._noise * prior.residual(value)
+            gradient[:, row] += slope * self.noise * prior.residual(value)
         return normal, gradient
 
     def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
@@ -331,7 +329,7 @@ def copy_fitted(origin, target):
 
 
 def _worst(outcomes):
-    """Return the first step that did not arrive, which spoils those behind it, or the last."""
+    """Return the first step that did not converge, which makes the next useless, or the last."""
     return next((o for o in outcomes if not o["converged"]), outcomes[-1])
 
 
@@ -381,22 +379,20 @@ _SETTLED = 1e-4
 _LONGEST = 2.0
 # the solution is left alone if a move spoils it by more than this share
 _SPOILT = 1e-3
-# a parameter is open if it moves by more than this share along an open direction
-_OPEN = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
 
 
-def settled(problem, weighting, origin):
+def settled(problem, origin):
     """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
 
-    ``origin`` is where the fit started. Returns the parameters that were left open, and the linear
-    problem around the new solution.
+    ``origin`` is where the fit started. Returns the parameters that were not determined, and the
+    linear problem around the new solution.
     """
     measurement = problem.measurement
     vector = measurement.vector()
     scale, leaders = physical_scale(measurement.free), _leaders(measurement.free)
-    whitened = around(measurement, weighting, vector)
+    whitened = problem.around(vector)
     for _ in range(_ROUNDS):
         null = whitened.together.null
         if not len(null):
@@ -409,15 +405,15 @@ def settled(problem, weighting, origin):
         if moved is None:
             break
         vector = moved
-        whitened = around(measurement, weighting, vector)
+        whitened = problem.around(vector)
     measurement.stand_at(vector)
     return open_parameters(measurement.free, whitened), whitened
 
 
 def open_parameters(free, whitened):
-    """Return the parameters common to all wavelengths that data and priors leave open."""
-    null = whitened.together.null
-    moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
+    """Return the parameters common to all wavelengths that data and priors do not determine."""
+    known = whitened.together.determined
+    moving = [slot for slot in free.slots if not known[slot.slice].all()]
     return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
 
 
@@ -455,7 +451,7 @@ def _step(null, leaders, scale, moved):
 
 
 def _move(problem, vector, step):
-    """Take the step and let the bins follow; None where that spoils the solution."""
+    """Take the step and let the bins follow; None where that corrupts the solution."""
     low, high = problem.measurement.free.bounds()
     before = problem.total(vector)
     trial = np.clip(vector + step, low, high)
@@ -469,7 +465,7 @@ def _move(problem, vector, step):
 def describe_gauge(gauge, chosen, free, held):
     """Say which of the equivalent solutions a calibration reports, and why.
 
-    ``chosen`` are parameters that the data leave open, ``held`` those that the user holds.
+    ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
     """
     if gauge not in GAUGES:
         raise FitError(f"gauge = {gauge!r}; allowed are 'minimal' and None")

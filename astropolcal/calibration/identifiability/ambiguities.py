@@ -4,7 +4,7 @@ What other values give the same data, and what data would tell them apart.
 
 Discrete mirror solutions: each candidate is tried on the measurement and counts only if it predicts
 the same data and stays within the bounds. What the bounds, or the model of an optic, exclude may be
-the truth all the same: it is told where it matters on sky.
+the truth all the same: it is reported where it matters on sky.
 
 Harmonics of the half-wave plate: a perfect plate puts the polarization into harmonic 4 of its
 angle, an imperfect one also into 2, and a wedge or dust into 1. Angles from 0 to 78.75 deg cover
@@ -155,14 +155,14 @@ def mirror_branches(measurement, vector, view):
 
 
 def _other_instrument(measurement, vector, view):
-    """Return the other hand of all behind the telescope, if it matters and no datum tells it."""
+    """Return the other handedness downstream of the telescope, if it matters and no datum tells."""
     if view is None or view.telescope == LEFT_OUT or _knows_hand(measurement, vector):
         return []
     telescope, instrument = split_chain(view.chain)
     # V -> -V in front of everything behind it: the fluxes are of I alone, and have no hand
     turned = MuellerElement.from_matrix(np.diag([1.0, 1.0, 1.0, -1.0]), name="other_hand")
     sky = consequences_of(view, join([*telescope, turned, *instrument]))
-    words = f"behind the telescope: {_SAME_DATA}, only bounds or models exclude them"
+    words = f"downstream of the telescope: {_SAME_DATA}, only bounds or models exclude them"
     return [{"words": words, "sky": sky}] if matters(sky) else []
 
 
@@ -241,7 +241,7 @@ def _other_turn(retardance):
 
 
 def _other_hand(retardance):
-    """Change the sign of V before and behind."""
+    """Change the sign of V before and after it."""
     # V -> -V is a reflection of the Poincare sphere: it turns round rotations about axes in the
     # equator (linear retardance), and leaves those about the axis of V
     return retardance * np.array([-1.0, -1.0, 1.0])[: len(retardance), None]

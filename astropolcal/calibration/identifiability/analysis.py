@@ -19,7 +19,6 @@ from astropolcal.calibration.identifiability.ambiguities import (
 )
 from astropolcal.calibration.identifiability.linearized import (
     Whitened,
-    decompose,
     first_of_each_kind,
     led,
     near_null_directions,
@@ -64,7 +63,7 @@ class Identifiability:
         For each null direction its ``words``, the ``parameters`` that move, and
         what it does to the ``sky``: changes of AoLP and DoLP of ``targets``.
     sampling : list of str
-        Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
+        Harmonics that the half-wave-plate angles cannot separate, and what stars do not determine
         of the telescope.
     mirrors : list of str
         Discrete mirror solutions within the bounds; and the other hand of the whole instrument,
@@ -116,14 +115,6 @@ class Identifiability:
         lines += [f"  - {words}" for words in self.sampling]
         lines += [f"  - mirror solution: {words}" for words in self.mirrors]
         return "\n".join(lines)
-
-
-def null_space(free, jacobian):
-    """Return orthonormal directions in which no datum changes, (n_free - rank, n_free).
-
-    In steps of a degree, micrometre or percent; ``jacobian`` is whitened, (n_free, n_data).
-    """
-    return decompose((jacobian * physical_scale(free)[:, None]).T).null
 
 
 def finding_of(free, whitened):
@@ -228,7 +219,7 @@ def _settled_by_a_star(finding, view):
     ]
     if not leads:
         return []
-    return [f"{', '.join(leads)}: {star_words(view.site)} settles what that does on sky"]
+    return [f"{', '.join(leads)}: {star_words(view.site)} determines the angle on sky"]
 
 
 def physical_scale(free):
@@ -241,7 +232,7 @@ def physical_scale(free):
 
 
 def telescope_words(finding, measurement):
-    """Say which parameters of the mirrors upstream of the half-wave plate the stars leave open."""
+    """Say which parameters of mirrors upstream of the half-wave plate stars do not determine."""
     open_names = {
         name
         for direction in (*finding.directions, *finding.near_null)

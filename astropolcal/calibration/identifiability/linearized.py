@@ -8,12 +8,13 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.sky import sky_words
+from astropolcal.files import plain
 from astropolcal.units import canonical_factor
 
 __all__ = []
 
 # singular values below this share of the largest count as zero
-_RANK_TOLERANCE = 1e-9
+RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
 # a parameter that moves by less than this share along an open direction stands still
@@ -34,7 +35,7 @@ class Directions(NamedTuple):
 
     @property
     def determined(self):
-        """Whether each column stands still along all open directions."""
+        """Whether each column is static along all open directions."""
         return (np.abs(self.null) < STILL).all(axis=0)
 
     @property
@@ -51,8 +52,24 @@ def decompose(rows):
     _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
     singular = np.pad(singular, (0, n_columns - singular.size))
     # without data the largest singular value is zero too: nothing is determined then
-    threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
+    threshold = max(RANK * singular.max(initial=0.0), _NOTHING)
     return Directions(singular, right, int(np.sum(singular > threshold)))
+
+
+def orthonormal(columns, keep=RANK):
+    """
+    Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
+    """
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns[:, norm > 0] / norm[norm > 0]
+    if not columns.shape[1]:
+        return np.zeros((len(columns), 0))
+    # a calibration is read where there is no scipy
+    from scipy.linalg import qr
+
+    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
+    size = np.abs(np.diag(triangle))
+    return basis[:, : len(size)][:, size > keep * size[0]]
 
 
 class Whitened:
@@ -159,7 +176,7 @@ _EQUAL = 1e-6
 def ranked(values, equal=None):
     """Return the indices of values, largest first; equal ones keep their order.
 
-    Which of two that are equal up to rounding comes out larger hangs on the processor.
+    Which of two that are equal up to rounding comes out larger depends on the processor.
     """
     values = np.asarray(values, dtype=float)
     if equal is None:
@@ -250,7 +267,7 @@ def _open_words(free, moved, lead):
         with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
         known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
         return f"{lead} changes no datum: it cannot be determined {known}"
-    return f"{lead} by +{step[1]:g}{step[2]} cannot be told from {', '.join(others)}"
+    return f"{lead} by +{step[1]:g}{step[2]} cannot be distinguished from {', '.join(others)}"
 
 
 def first_of_each_kind(directions):
@@ -287,14 +304,6 @@ def _change(free, name, value):
 def _signed(value, digits):
     """Return a number with its sign; zero has none."""
     return f"{value:+.{digits}g}" if value else "0"
-
-
-def plain(moved):
-    """Return changes by parameter as floats and lists."""
-    return {
-        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
-        for name, value in moved.items()
-    }
 
 
 # ---- near-null directions -----------------------------------------------------------------

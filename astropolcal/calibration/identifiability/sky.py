@@ -276,7 +276,7 @@ def sky_words(sky):
     turned, gained = (f"up to {size}" if size[0].isdigit() else size for size in (turn, gain))
     words = f"on sky the AoLP changes by {turned} deg and the DoLP by {gained} % of itself"
     if all(one[1:] == (turn, gain) for one in each):
-        return f"{words}, whatever the DoLP"
+        return f"{words}, regardless of the DoLP"
     others = (f"{dolp}: {turn} deg, {gain} %" for dolp, turn, gain in fainter)
     return "; ".join([f"{words} for a source of {dolp}", *others])
 

@@ -6,6 +6,7 @@ from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
+    noise_from_roughness,
 )
 from astropolcal.calibration.noise.weighting import outlying_data
 
@@ -14,5 +15,6 @@ __all__ = [
     "noise_from_errors",
     "noise_from_null_channel",
     "noise_from_replicates",
+    "noise_from_roughness",
     "outlying_data",
 ]

@@ -8,16 +8,26 @@ difference cancels, is there for every table that has no repeated data.
 """
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
+from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
+from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.units import angle_to_rad
 
-__all__ = ["NoiseEstimate", "noise_from_errors", "noise_from_null_channel", "noise_from_replicates"]
+__all__ = [
+    "NoiseEstimate",
+    "noise_from_errors",
+    "noise_from_null_channel",
+    "noise_from_replicates",
+    "noise_from_roughness",
+]
 
 
 @dataclass(frozen=True)
@@ -36,7 +46,7 @@ class NoiseEstimate:
         NaN where it could not be estimated.
     dof : `~numpy.ndarray`
         Degrees of freedom of ``sigma``, infinite where it is known.
-    method : {"errors", "replicates", "null channel"}
+    method : {"errors", "replicates", "null channel", "roughness"}
         Where it comes from.
     words : str
         What it includes and what it does not.
@@ -68,7 +78,7 @@ class NoiseEstimate:
 
     @property
     def table(self):
-        """One row a dataset and wavelength, a `~astropy.table.QTable`."""
+        """One row per dataset and wavelength, a `~astropy.table.QTable`."""
         columns = {"dataset": self.dataset, "wavelength": self.wavelength}
         meta = {"method": self.method, "words": self.words}
         return QTable(columns | {"sigma": self.sigma, "dof": self.dof}, meta=meta)
@@ -148,27 +158,26 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     True
     """
     if gain is None:
-        sigma, words = measurement.sigma, "the errors stated in the table, and nothing else"
+        sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
         sigma = _photon_sigma(measurement, _number("gain", gain, 0, False), read_noise)
-        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons a beam"
+        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons per beam"
     bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
         raise FitError(
             f"{bad.sum()} of {bad.size} data have no error; give gain= or estimate the noise from "
             "replicates or the null channel"
         )
+    words = f"{words}: not flicker, nor what moves between frames"
+    return _of_data(measurement, sigma.copy(), np.inf, "errors", words)
+
+
+def _of_data(measurement, sigma, dof, method, words):
+    """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
     rms = [np.sqrt(np.mean(sigma[row] ** 2)) if row.size else np.nan for row in rows]
-    return NoiseEstimate(
-        numbers,
-        wavelength,
-        100 * np.array(rms) * u.percent,
-        np.full(len(rows), np.inf),
-        "errors",
-        f"{words}: not flicker, nor what moves between frames",
-        sigma.copy(),
-    )
+    percent, dof = 100 * np.array(rms) * u.percent, np.broadcast_to(dof, len(rows))
+    return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
 
 
 def _number(name, value, low, closed):
@@ -312,8 +321,6 @@ _NULL_MODELS = ("constant", "smooth")
 # far below the steps of a run, which in CHARIS's are 12.5 deg of derotator and 11.25 deg of plate
 _SAME_DEROTATOR = np.deg2rad(0.5)
 _SAME_PLATE = np.deg2rad(0.3)
-# what does not vary beyond this share is no column of its own
-_RANK = 1e-9
 
 
 def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
@@ -325,7 +332,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
     the null has next to none, while independent noise of the frames is the same
     in both. Taken away from z are what the chain predicts of it (a plate that is not
-    exactly half a wave, with a retarder behind it, leaves some signal there),
+    exactly half a wave, with a retarder downstream of it, leaves some signal there),
     a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
     :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
     :math:`\sqrt2` times the scatter of what is left.
@@ -345,7 +352,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     -------
     NoiseEstimate
         An upper limit: besides photon and read noise and flicker that changes
-        the ratio of the beams it includes whatever else makes the null change
+        the ratio of the beams it includes anything else makes the null change
         with the plate and is not in the chain, such as diattenuation. For strongly
         polarized light that exceeds the noise; the smooth null model takes
         away most of it. A change of the source's brightness cancels in x.
@@ -371,9 +378,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     """
     if null_model not in _NULL_MODELS:
         raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
-    alone = [p.observations.name for p in measurement.datasets if p.observations.single_beam]
-    if alone:
-        raise FitError(f"{alone[0]}: the null channel needs two beams a frame, it has one")
+    _need_two_beams(measurement, "the null channel")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
     squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -391,10 +396,17 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     ]
     sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
     words = (
-        f"scatter of the null channel about the chain's and a {null_model} null, an upper limit: "
-        "photon and read noise, flicker, and what the chain leaves out of the null"
+        f"scatter of the null channel about the chain's null and a {null_model} term, an upper "
+        "limit; it includes photon and read noise, flicker, and a null that the chain lacks"
     )
     return noise_of_cells(measurement, sigma, dof, "null channel", words)
+
+
+def _need_two_beams(measurement, what):
+    for part in measurement.datasets:
+        if part.observations.single_beam:
+            name = part.observations.name
+            raise FitError(f"{name}: {what} needs two beams per frame, it has one")
 
 
 def _null_scatter(part, vector, null_model):
@@ -414,7 +426,7 @@ def _null_scatter(part, vector, null_model):
             # beams unequal by e have the difference x + e (1 - x^2):
             # its constant part is in the design
             columns = np.column_stack([design, x**2])[good]
-            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=_RANK)
+            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=RANK)
             squares[i] = np.sum((z[good] - columns @ fit) ** 2)
             dof[i] = good.sum() - rank
     return squares, dof
@@ -450,3 +462,176 @@ def _null_design(observations, frames, null_model):
 
 def _harmonics(angle):
     return np.cos(angle), np.sin(angle)
+
+
+# ---- noise of frames: what is rough in wavelength ----
+
+
+# the share of the frames' freedom that harmonics may take from the measure of the noise
+_MOST_TURNING = 0.7
+# second differences of fewer wavelengths tell nothing
+_FEWEST_ROUGH = 5
+# independent data that tell a spread as well as the median of second differences along wavelengths
+_TELLS = 0.19
+
+
+def noise_from_roughness(measurement, vector=None):
+    r"""
+    Return the stated errors, or more where single frames are rough along the wavelengths.
+
+    What static and rotating optics do to the normalized difference of a frame is a sum of a
+    few harmonics of the stages' angles, sharp in wavelength or not; everything else that they do is
+    smooth in wavelength. So noise is what is left of the residuals' second differences along the
+    wavelengths without these harmonics. The diagnosis of what a model lacks compares with it, too.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like, optional
+        Parameters for the residuals, by default the current ones; shape (n_free,).
+
+    Returns
+    -------
+    NoiseEstimate
+        Besides photon and read noise it includes flicker that changes the ratio of the beams, and
+        what optics do that is sharp in wavelength and no harmonic. Infinite degrees of freedom
+        where the stated errors stand.
+
+    Raises
+    ------
+    FitError
+        If a dataset has fewer than five wavelengths, or the residuals tell no noise.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.calibration.noise import noise_from_roughness
+    >>> from astropolcal import instruments
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 70] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> noise = noise_from_roughness(Measurement(charis.chain(), observations))
+    >>> noise.method, bool(noise.dof[0] > 50)
+    ('roughness', True)
+    """
+    _need_two_beams(measurement, "roughness of differences")
+    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
+    parts = [_rough_frames(part, vector) for part in measurement.datasets]
+    sigma_of_data = np.concatenate([sigma for sigma, _ in parts])
+    freedom = [dof for part, (_, dof) in zip(measurement.datasets, parts, strict=True)
+               for _ in part.bins]  # fmt: skip
+    words = (
+        "the stated errors, or more where single frames are rough along the wavelengths: photon "
+        "and read noise, flicker, and what is sharp in wavelength"
+    )
+    return _of_data(measurement, sigma_of_data, np.array(freedom), "roughness", words)
+
+
+def _rough_frames(part, vector):
+    """Return the noise of each datum of a dataset, and its degrees of freedom."""
+    obs = part.observations
+    if obs.n_bins < _FEWEST_ROUGH:
+        raise FitError(
+            f"{obs.name}: {obs.n_bins} wavelengths tell no roughness; {_FEWEST_ROUGH} are needed"
+        )
+    right, left = obs.flux_right.T, obs.flux_left.T
+    single = OBSERVABLES["normalized_single_difference"]
+    errors = (obs.variance_right.T, obs.variance_left.T, obs.covariance.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = single.variance(right[None], left[None], *(error[None] for error in errors))
+        residual = single.evaluate(right[None], left[None]) - _predicted_differences(part, vector).T
+    frames = SimpleNamespace(variance=variance[None], valid=np.isfinite(residual))
+    angles = {}
+    for stage, angle in part.positions.items():
+        angles[stage] = np.zeros(obs.n_frames)
+        angles[stage][part.frames.T] = angle
+    residual = np.where(frames.valid, residual, 0.0)
+    (sigma,) = frame_noise(frames, residual[None], angles)
+    of_data = np.mean(sigma[:, part.frames] ** 2, axis=-1)[part.valid]
+    known = np.isfinite(variance) & (variance > 0) & frames.valid
+    stands = np.allclose(sigma[known], np.sqrt(variance[known])) and known.any()
+    dof = np.inf if stands else _TELLS * frames.valid.sum()
+    return np.sqrt(of_data / part.observable.frames_per_datum), dof
+
+
+def frame_noise(channel, residual, angles):
+    """
+    Return the noise of every number of each frame: the stated errors, or more by the data.
+
+    ``channel`` has the stated ``variance`` (n, W, F) and what is ``valid`` (W, F), ``residual`` has
+    the shape of the variance, ``angles`` the position of every stage, radian, (F,).
+
+    What static and rotating optics can do to a beam is a sum of a few
+    harmonics of the stages' angles, sharp in wavelength or not; everything else
+    is smooth in wavelength. So noise is what is left without either.
+    """
+    sigma = np.sqrt(channel.variance)
+    basis = _turning(angles, channel.valid)
+    for i in range(len(residual)):
+        rough = _roughness(residual[i], channel.valid, basis)
+        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
+        if not stated.any():
+            if not rough > 0:
+                raise FitError("no errors in the table, and the residuals tell no noise")
+            sigma[i] = rough
+            continue
+        if np.isfinite(rough):
+            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
+        sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
+    return sigma
+
+
+def _turning(angles, valid):
+    """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
+    waves = [np.ones(valid.shape[1], dtype=complex)]
+    for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
+        if stage in angles:
+            turns = [np.exp(1j * k * angles[stage]) for k in orders]
+            waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
+    waves = by_state(waves, angles)
+    whole = _whole(valid)
+    columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
+    basis = orthonormal(columns * whole[:, None], keep=1e-6)
+    # too few frames would be left to tell the noise
+    return basis if basis.shape[1] <= _MOST_TURNING * whole.sum() else basis[:, :0]
+
+
+def by_state(waves, angles):
+    """Return the waves, and for a modulator with two states those that change sign with them."""
+    state = angles.get("flc_state", np.zeros(1))
+    if np.ptp(state) == 0:
+        return waves
+    return [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
+
+
+def _whole(valid):
+    """Return which frames have a datum at every wavelength, (F,)."""
+    # a wavelength that is masked through the run, as in a band of water, makes no frame incomplete
+    return valid[valid.any(axis=1)].all(axis=0)
+
+
+def _roughness(residual, valid, basis):
+    """Return the scatter of second differences along the wavelengths, per datum."""
+    if len(residual) < _FEWEST_ROUGH:
+        return np.nan
+    whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
+    left = np.where(whole, residual, 0.0)
+    left = left - (left @ basis) @ basis.T
+    # white noise of unit variance has second differences of variance 1 + 4 + 1
+    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
+    # what stands still at a wavelength, as its brightness, is no noise
+    second = second - np.median(second, axis=1, keepdims=True)
+    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
+    # projection takes the freedom of its columns from the scatter
+    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
+    # a median, lest a few sharp features of the optics count as noise
+    return float(MAD_TO_SIGMA * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
+
+
+def _roughness_of(sigma, valid):
+    total = np.sqrt((sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2) / 6)
+    keep = valid[:-2] & valid[1:-1] & valid[2:]
+    return float(np.median(total[keep]))

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 r"""
-How residuals scatter and hang together, and the groups that are left out together.
+How residuals scatter and are correlated, and the groups that are left out together.
 
 What a model gets wrong is not independent from datum to datum: neighbouring wavelengths of a pair
 of frames depart alike, and so do the pairs at one setting of the derotator. Errors that count all
@@ -23,7 +23,7 @@ import numpy as np
 
 from astropolcal.exceptions import FitError
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.observations.quality import cycle_numbers, is_star
+from astropolcal.observations.quality import clusters, cycle_numbers, is_star, runs_of_frames
 
 __all__ = []
 
@@ -33,8 +33,6 @@ GROUPS = {
     "cycle": "half-wave-plate cycles",
     "dataset": "datasets",
 }
-# derotator angles that differ by less belong to one group
-_SAME_ANGLE = np.deg2rad(0.5)
 # runs into which the cycles of a star are divided
 _RUNS = 8
 
@@ -50,17 +48,10 @@ def leave_out_groups(measurement):
         turns = "derotator" in dataset.observations.frames.colnames
         if "parallactic" in dataset.positions or not turns:
             group = _star_runs(dataset)
-            groups.append(first + group[dataset.group_of_datum])
-            first += int(group.max()) + 1
-            continue
-        angle = dataset.observations.position("derotator")[dataset.frames[:, 0]]
-        # sorted angles fall apart into groups at every step larger than the tolerance
-        order = np.argsort(angle)
-        new = np.concatenate([[0], np.cumsum(np.diff(angle[order]) > _SAME_ANGLE)])
-        group = np.empty(len(angle), dtype=int)
-        group[order] = new
+        else:
+            group = clusters(dataset.observations.position("derotator")[dataset.frames[:, 0]])
         groups.append(first + group[dataset.group_of_datum])
-        first += int(new[-1]) + 1
+        first += int(group.max()) + 1
     return np.concatenate(groups)
 
 
@@ -68,9 +59,9 @@ def _star_runs(dataset):
     """Return the run of consecutive cycles of each group of frames, shape (n_groups,)."""
     cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
     rank = np.unique(cycle, return_inverse=True)[1]
-    runs = min(_RUNS, int(rank.max()) + 1)
+    count = int(rank.max()) + 1
     # equal runs of consecutive cycles; a derotator that follows the sky gives no angles to group by
-    return rank * runs // (int(rank.max()) + 1)
+    return runs_of_frames(count, min(_RUNS, count))[rank]
 
 
 def groups_by(measurement, by="derotator"):
@@ -89,7 +80,7 @@ def groups_by(measurement, by="derotator"):
     for name, count in names:
         if count < 2:
             raise FitError(
-                f"cross-validation by {by}: group {name} has a single member; at least 2 data a "
+                f"cross-validation by {by}: group {name} has a single member; at least 2 data per "
                 "wavelength are needed, group by something else or leave it out"
             )
     return groups
@@ -172,13 +163,13 @@ class _Part:
         return out
 
     def components(self):
-        """Yield whether pairs of a setting hang together, and the correlation of wavelengths."""
+        """Yield whether pairs of a setting are correlated, and the correlation of wavelengths."""
         yield from ((False, kernel) for kernel in self.kernels)
         if self.patterns.shape[1]:
             yield from ((True, kernel) for kernel in self.kernels[1:])
 
     def halves(self, columns):
-        """Return, for each component, columns before and behind its matrix, to be multiplied."""
+        """Return, for each component, columns before and after its matrix, to be multiplied."""
         dense = self.dense(columns)
         seen = np.tensordot(self.patterns, dense, axes=(0, 0))
         for together, kernel in self.components():

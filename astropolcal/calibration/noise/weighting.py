@@ -154,6 +154,7 @@ ROUNDS = 10
 _SETTLED = 1e-2
 # fewer degrees of freedom than this tell no noise
 _LEAST_FREEDOM = 0.5
+_MAX_EVALUATIONS = 100
 # normalized data do not reach this; one over a noise does
 _LARGEST = 1.0
 
@@ -164,7 +165,7 @@ class Weighting:
 
     ``choice`` says where it comes from: None for one level from all residuals, "wavelength",
     "errors" of the table, or "given"; ``sigma`` is that of every datum, NaN as long as no fit has
-    told it.
+    determined it.
     """
 
     choice: str | None
@@ -173,7 +174,7 @@ class Weighting:
     @property
     def is_known(self):
         """Whether every datum has a noise."""
-        return bool(np.isfinite(self.sigma).all())
+        return not np.isnan(self.sigma).any()
 
     @property
     def weight(self):
@@ -206,11 +207,11 @@ class Weighting:
     def updated(self, measurement, whitened=None):
         """Return the noise that the residuals of a fit with this noise show.
 
-        ``whitened`` is the linear problem of the measurement with this noise, if at hand.
+        ``whitened`` is the linear problem of the measurement with this noise, if available.
         """
         if not self.from_residuals:
             return self
-        whitened = around(measurement, self) if whitened is None else whitened
+        whitened = Problem(measurement, self).around() if whitened is None else whitened
         if self.choice == "wavelength":
             sigma = _by_wavelength(measurement, whitened.leverage)
             return Weighting(self.choice, sigma)
@@ -220,17 +221,69 @@ class Weighting:
         return Weighting(None, np.full(measurement.n_data, level))
 
 
-def around(measurement, weighting, vector=None):
-    """Return the linear problem around a vector, by default the current one."""
-    vector = measurement.vector() if vector is None else vector
-    free, weight = measurement.free, weighting.weight
-    data = measurement.jacobian(vector)
-    priors = None
-    if measurement.n_priors:
-        level = weighting.level if weighting.is_known else weighting.started(measurement).level
-        priors = free.prior_jacobian(vector) * level
-    data = data if weight is None else data * weight
-    return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
+class Problem:
+    """The least-squares problem of a measurement: data, priors and bounds, and their noise."""
+
+    def __init__(self, measurement, weighting):
+        self.measurement, self.weighting = measurement, weighting
+        #: The parameters that the measurement has when the problem is posed.
+        self.solution = measurement.vector()
+        weight = weighting.weight
+        # with equal weights residuals stay dimensionless, and the noise multiplies the priors
+        self.weights = np.ones(measurement.n_data) if weight is None else weight
+        if measurement.n_priors and not weighting.is_known:
+            weighting = weighting.started(measurement)
+        self.noise = weighting.level
+        self._low, self._high = measurement.free.bounds()
+
+    def residuals(self, vector, weights=None):
+        """Return weighted residuals of data and priors, model minus observed."""
+        data = self.measurement.predict(vector) - self.measurement.observed
+        priors = self.noise * self.measurement.free.prior_residuals(vector)
+        return np.concatenate([data * (self.weights if weights is None else weights), priors])
+
+    def jacobian(self, vector, weights=None):
+        """Return the derivative of `residuals`, (n_data + n_priors, n_free)."""
+        weights = self.weights if weights is None else weights
+        data = self.measurement.jacobian(vector) * weights
+        priors = self.measurement.free.prior_jacobian(vector) * self.noise
+        return np.concatenate([data, priors], axis=1).T
+
+    def around(self, vector=None):
+        """Return the linear problem around a vector, by default the solution."""
+        vector, free = self.solution if vector is None else vector, self.measurement.free
+        rows, n = self.jacobian(vector).T, self.measurement.n_data
+        return Whitened(rows[:, :n], physical_scale(free), rows[:, n:], free.at_bounds(vector))
+
+    def fit(self, start, counts=None, held=()):
+        """Return the vector, chi-square, and whether the fit arrived.
+
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
+        """
+        # a calibration is read where there is no scipy
+        from scipy.optimize import least_squares
+
+        # a datum drawn k times adds k r^2 to chi-square; one never drawn adds nothing
+        weights = self.weights if counts is None else self.weights * np.sqrt(counts)
+        live = np.setdiff1d(np.arange(start.size), held)
+        vector = start.copy()
+
+        def place(part):
+            vector[live] = part
+            return vector
+
+        # a radian, a micrometre and a 1 move the data by very different amounts
+        size = np.linalg.norm(self.jacobian(start, weights), axis=0)[live]
+        found = least_squares(
+            lambda part: self.residuals(place(part), weights),
+            # least_squares refuses a start outside of the bounds by a rounding error
+            np.clip(start[live], self._low[live], self._high[live]),
+            jac=lambda part: self.jacobian(place(part), weights)[:, live],
+            bounds=(self._low[live], self._high[live]),
+            x_scale=1 / np.where(size > 0, size, 1.0),
+            max_nfev=_MAX_EVALUATIONS,
+        )
+        return place(found.x).copy(), 2 * found.cost, found.status > 0
 
 
 # ---- the choices ------------------------------------------------------------------------
@@ -258,6 +311,18 @@ def first_weighting(measurement, weights):
     return Weighting("errors", measurement.sigma)
 
 
+def assumed(measurement, weights):
+    """Return the noise of data with weights, (n_data,); of None that of a fit of equal weights."""
+    if weights is not None:
+        with np.errstate(divide="ignore"):
+            # without weight is what has infinite noise
+            return Weighting(GIVEN, 1 / np.asarray(weights, dtype=float))
+    fitted = measurement.weighting
+    if fitted is not None and fitted.choice is None and fitted.is_known:
+        return fitted
+    return Weighting(None, np.full(measurement.n_data, np.nan)).started(measurement)
+
+
 def noise_of(measurement, weights=None):
     """Return the noise of every datum for a choice of weights, as `calibrate` takes it.
 
@@ -276,6 +341,11 @@ def noise_of(measurement, weights=None):
             if weighting.agrees(before):
                 break
     return weighting
+
+
+def problem_of(calibration):
+    """Return the least-squares problem of a calibration, which needs its data."""
+    return Problem(calibration.live_measurement(), weighting_of(calibration))
 
 
 def weighting_of(calibration):
@@ -334,7 +404,7 @@ def _rms(values):
 
 
 def _by_wavelength(measurement, leverage):
-    r"""Return one level a dataset and wavelength, not below the floor.
+    r"""Return one level per dataset and wavelength, not below the floor.
 
     :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h (Hoaglin & Welsch 1978, The
     American Statistician 32, 17).
@@ -364,7 +434,7 @@ def _by_wavelength(measurement, leverage):
 
 
 def given_noise(measurement, noise):
-    """Return the noise of every datum from one value, one a wavelength or one a datum."""
+    """Return the noise of every datum from one value, one per wavelength or one per datum."""
     try:
         noise = u.Quantity(noise).to_value(u.dimensionless_unscaled)
     except (TypeError, u.UnitConversionError):
@@ -376,7 +446,7 @@ def given_noise(measurement, noise):
     if noise.shape not in ((), (measurement.n_data,)):
         raise ParameterError(
             f"noise of shape {noise.shape}; allowed are one value, {len(measurement.wavelength)} "
-            f"(one a wavelength) or {measurement.n_data} (one a datum)"
+            f"(one per wavelength) or {measurement.n_data} (one per datum)"
         )
     return np.broadcast_to(noise, measurement.n_data).astype(float)
 

@@ -178,7 +178,7 @@ class Chain:
 
 
 def _crc_of(coords, log_prob, crc):
-    """Return the CRC that steps add to, whatever pieces they come in."""
+    """Return the CRC that steps add to, in pieces of any size."""
     for row, value in zip(coords, log_prob, strict=True):
         crc = zlib.crc32(np.ascontiguousarray(row, dtype="<f8").tobytes(), crc)
         crc = zlib.crc32(np.ascontiguousarray(value, dtype="<f8").tobytes(), crc)
@@ -302,10 +302,10 @@ def _opened(h5py, path):
         file = h5py.File(path, "r", libver="earliest", locking=True)
     except OSError as error:
         busy = isinstance(error, BlockingIOError) or "unable to lock" in str(error)
-        reason = _BUSY if busy else f"is no checkpoint ({one_line(error)})"
+        reason = _BUSY if busy else f"is not a checkpoint ({one_line(error)})"
         raise FitError(f"{path}: {reason}") from error
     except Exception as error:
-        raise FitError(f"{path}: is no checkpoint ({one_line(error)})") from error
+        raise FitError(f"{path}: is not a checkpoint ({one_line(error)})") from error
     with file:
         yield file
 
@@ -360,7 +360,7 @@ def _plain(h5py, file, name):
     found = file[name] if there else None
     plain = isinstance(found, h5py.Dataset) and found.dtype.kind in "fiub"
     if not plain or found.external or found.is_virtual or found.chunks:
-        raise ValueError(f"{name} is no plain array of this file")
+        raise ValueError(f"{name} is not a plain array of this file")
     # what is not written yet may be claimed, but not what a file has no room for
     if found.size and found.id.get_storage_size() < found.nbytes:
         raise ValueError(f"{name} claims {found.nbytes} bytes that are not in the file")

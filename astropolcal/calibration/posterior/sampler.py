@@ -13,6 +13,9 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.weighting import (
+    GIVEN,
+    Problem,
+    Weighting,
     given_noise,
     noise_of,
     weighting_of,
@@ -43,7 +46,7 @@ class LogPosterior:
         the one that the fit assumed, so that fit and posterior agree; one level
         from the residuals of all data if no fit is known.
     noise : float, `~astropy.units.Quantity` or array_like, optional
-        Noise to use instead: one value, one a wavelength, or one a datum.
+        Noise to use instead: one value, one per wavelength, or one per datum.
     parameters : sequence of str, optional
         What varies, ``"hwp.w_sio2"`` (all its values) or
         ``"derotator.horizontal[3]"``; all others keep their fitted values. By
@@ -82,9 +85,8 @@ class LogPosterior:
         self.sampled = _elements(free, parameters)
         #: Names of what varies, one an element.
         self.names = [free.names[i] for i in self.sampled]
-        units = [slot.unit for slot in free.slots for _ in range(slot.size)]
         #: Declared units of what varies.
-        self.units = [units[i] for i in self.sampled]
+        self.units = [free.units[i] for i in self.sampled]
         #: Factors from declared to canonical units.
         self.factors = free.factors()[self.sampled]
         #: Bounds of what varies, canonical.
@@ -154,9 +156,8 @@ class LogPosterior:
 
     def whitened_jacobian(self):
         """Return derivatives of data and priors over their noise, (n, n_data + n_priors)."""
-        data = self.measurement.jacobian(self.fitted) / self.sigma
-        priors = self.measurement.free.prior_jacobian(self.fitted)
-        return np.concatenate([data, priors], axis=1)[self.sampled]
+        problem = Problem(self.measurement, Weighting(GIVEN, self.sigma))
+        return problem.jacobian(self.fitted).T[self.sampled]
 
     def physical_scale(self):
         """Return a degree, a micrometre or a percent of what varies, canonical."""

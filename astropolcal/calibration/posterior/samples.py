@@ -108,7 +108,7 @@ class Convergence:
             key: value.shape for key, value in asdict(self).items() if hasattr(value, "shape")
         }
         if len(set(shapes.values())) != 1 or len(shapes["times"]) != 1:
-            raise ParameterError(f"convergence: one value a parameter is allowed, not {shapes}")
+            raise ParameterError(f"convergence: one value per parameter is allowed, not {shapes}")
 
     @classmethod
     def of(cls, chain, *, thin=1, burn_in=0, times=None):
@@ -260,7 +260,7 @@ class Posterior:
         times, at most half of all.
     convergence : Convergence, optional
         What the whole run says of itself, where the chain is a part of it
-        behind the burn-in.
+        after the burn-in.
 
     Raises
     ------
@@ -456,7 +456,7 @@ class Posterior:
 
     def samples(self, burn_in=None):
         """
-        Return the samples of all walkers behind the burn-in.
+        Return the samples of all walkers after the burn-in.
 
         Parameters
         ----------
@@ -523,7 +523,7 @@ class Posterior:
 
     def summary(self):
         """
-        Return one row a parameter, worked out from all samples behind the burn-in.
+        Return one row per parameter, worked out from all samples after the burn-in.
 
         Returns
         -------
@@ -547,13 +547,13 @@ class Posterior:
 
     def report(self):
         """
-        Return what is to be told of the posterior, ready for JSON.
+        Return a description of the posterior, ready for JSON.
 
         Returns
         -------
         dict
             ``converged``, ``words``, ``n_steps``, ``n_walkers``, ``burn_in``
-            (in steps), ``n_samples`` (behind the burn-in), ``acceptance``
+            (in steps), ``n_samples`` (after the burn-in), ``acceptance``
             (least and largest), ``seed``, ``settings``, and for each of
             ``parameters`` its ``unit``, ``fitted`` value, ``median``,
             ``lower``, ``upper``, ``std``, ``autocorrelation_time``,

@@ -76,7 +76,7 @@ class Calibration:
     at_bound : list of str
         Free parameters that ended at a bound.
     datasets : list of DatasetRecord
-        The data behind it.
+        The data of the calibration.
     settings : dict
         ``instrument``, ``observable``, ``fitter``, ``strategy``, ``weights``.
     fit : dict
@@ -309,7 +309,7 @@ class Calibration:
             ``"conditional"``, ``"badly determined"``, ``"open"``,
             ``"at bound"``, ``"tied"`` or ``"fixed"``); ``std_inward``, how far
             what is at a bound may go inward at one sigma; and for errors that
-            hang on such a bound ``conditional_on``, the names of what is at
+            depend on such a bound ``conditional_on``, the names of what is at
             it, and ``std_released``, the error without it. Arrays for
             parameters given per wavelength.
         """

@@ -56,9 +56,9 @@ def compare(members):
         ``path_diattenuation``, from the half-wave plate to the beam splitter with all stages at
         zero; ``least_efficiency`` and ``most_efficiency``, over the derotator angles, for the
         angle of polarization that is measured worst, without the telescope. Each of these also
-        with ``_std`` behind its name: the standard error to first order from the covariance of a
-        calibration, infinite where its data leave the quantity open, NaN where nothing that was
-        fitted moves it, and for what is no calibration.
+        with ``_std`` after its name: the standard error to first order from the covariance of a
+        calibration, infinite where its data do not determine the quantity, NaN where nothing that
+        was fitted moves it, and for what is not a calibration.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def _resolved(label, member):
     if isinstance(member, tuple) and len(member) == 2:
         return member[0], np.atleast_1d(u.Quantity(member[1])), None, None
     raise ParameterError(
-        f"{label}: {member!r} is no calibration, instrument, name of one, or (chain, wavelength)"
+        f"{label}: {member!r} is not a calibration, instrument, name of one, or (chain, wavelength)"
     )
 
 

@@ -20,7 +20,8 @@ from astropolcal.calibration.result.verdict import (
 )
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
-from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
+from astropolcal.files import columns, plain
 from astropolcal.words import counted
 
 __all__ = []
@@ -76,7 +77,7 @@ def _stars(stars):
 
 
 def _more_reasons(found):
-    """Return in full what the first line has no room for."""
+    """Return in full what the first line has no space for."""
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
     return list(_wrap(f"  - {words}" for words in told)) if hidden else []
@@ -139,7 +140,7 @@ def _accuracy_words(calibration):
         "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
         "paper's s_rel",
         f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
-        "  s_standard: rms error on datasets that the fit never saw"
+        "  s_standard: rms error on datasets that were not fitted"
         + ("" if calibration.fit.get("standards") else " (none given)"),
     ]
     return list(_wrap(lines))
@@ -183,7 +184,7 @@ def _standard_lines(entry):
 
 
 def _target_lines(calibration, targets):
-    """Return a table with one row a target: median and worst of the wavelengths."""
+    """Return a table with one row per target: median and worst of the wavelengths."""
     tables = target_accuracies(calibration, targets)
     if not tables:
         return []
@@ -196,10 +197,10 @@ def _target_lines(calibration, targets):
     infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
     if infinite:
         known = target_accuracies(calibration, targets, open_directions="ignore")
-        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+        lines += ["  as if the undetermined parameters were known:", *map(_target_row, known)]
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
-        lines.append("  AoLP any: at whichever angle the accuracy is worst")
+        lines.append("  AoLP any: the angle with the worst accuracy")
     lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
     return list(_wrap(lines))
 
@@ -224,7 +225,7 @@ def _short(values, function):
 
 
 def _wavelength_blocks(calibration, known):
-    """Return tables with one row a wavelength, and in each as many parameters as fit."""
+    """Return tables with one row per wavelength, and in each as many parameters as fit."""
     several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
     marks = "? badly determined, c conditional on a bound"
     for i in range(0, len(several), _N_COLUMNS):
@@ -298,7 +299,7 @@ def _gauge_lines(calibration):
 
 
 def _bound_lines(calibration, known):
-    """Name what is at a bound, how far it may go inward, and whose errors hang on that."""
+    """Name what is at a bound, how far it may go inward, and whose errors depend on that."""
     lines = []
     for name, entry in known.items():
         where = np.flatnonzero(np.ravel(entry["at_bound"]))
@@ -344,13 +345,6 @@ def _posterior_lines(calibration):
     )
 
 
-def _fitted_star(table):
-    columns = {f"{key}_percent": table[key].value for key in table.colnames[1:]}
-    nm = table["wavelength"].to_value(u.nm)
-    return {"name": table.meta["name"], "from_data": table.meta["from_data"],
-            "wavelength_nm": nm} | columns  # fmt: skip
-
-
 # ---- for machines ------------------------------------------------------------------
 
 
@@ -379,9 +373,12 @@ def to_dict(calibration, targets=TARGETS):
         "left_out": what_is_left_out(calibration),
         "stars": fit.get("stars", []),
         "mirrors": mirrors(calibration),
-        "fitted_stars": [_fitted_star(table) for table in fitted_stars(calibration)],
+        "fitted_stars": [
+            {key: table.meta[key] for key in ("name", "from_data")} | columns(table)
+            for table in fitted_stars(calibration)
+        ],
         "standards": [_standard(entry) for entry in fit.get("standards", [])],
-        "targets": [_target(table) for table in target_accuracies(calibration, targets)],
+        "targets": [target_entry(table) for table in target_accuracies(calibration, targets)],
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
@@ -396,7 +393,7 @@ def to_dict(calibration, targets=TARGETS):
         "stages": calibration.stages,
         "provenance": dict(calibration.provenance),
     }
-    return _plain(content)
+    return plain(content)
 
 
 def _dataset(record):
@@ -407,50 +404,20 @@ def _dataset(record):
         "content_hash": record.content_hash,
         "n_frames": record.n_frames,
         "n_masked": record.n_masked,
-        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
-        "n": _plain(table["n"]),
-        "k": _plain(table["k"]),
-        **{f"{key}_percent": _plain(_percent(table, key)) for key in _ACCURACIES},
+        "wavelength_nm": table["wavelength"].to_value(u.nm),
+        "n": table["n"],
+        "k": table["k"],
+        **{f"{key}_percent": _percent(table, key) for key in _ACCURACIES},
     }
 
 
 def _standard(entry):
     # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
-    return _plain(entry) | {"s_res_percent": _plain(entry["s_standard_percent"])}
-
-
-def _target(table):
-    angle = table.meta["aolp"]
-    shares = [key for key in table.colnames if key not in ("wavelength", "s_chi")]
-    return {
-        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
-        "aolp_deg": None if angle is None else float(angle.to_value(u.deg)),
-        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
-        **{f"{key}_percent": _plain(table[key].value) for key in shares},
-        "s_chi_deg": _plain(table["s_chi"].value),
-        "words": table.meta["words"],
-    }
+    return entry | {"s_res_percent": entry["s_standard_percent"]}
 
 
 def _parameter(entry):
-    return {key: _plain(value) for key, value in entry.items() if key != "unit"} | {
-        "unit": str(entry["unit"]) if entry["unit"] is not None else ""
-    }
-
-
-def _plain(value):
-    """Turn arrays, quantities and numpy scalars into what JSON knows; NaN into None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, u.Quantity):
-        return {"value": _plain(value.value), "unit": str(value.unit)}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+    return entry | {"unit": "" if entry["unit"] is None else str(entry["unit"])}
 
 
 # ---- mirrors, stars that no fit saw, and what is left open on sky ----
@@ -537,15 +504,10 @@ def star_lines(entry):
 def mirrors(calibration):
     """Return the values of all mirrors for machines."""
     tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
-    return [_entry(table) for table in tables]
-
-
-def _entry(table):
-    columns = {"wavelength_nm": table["wavelength"].to_value(u.nm)}
-    for key in table.colnames[1:]:
-        unit = "percent" if key.startswith("diattenuation") else "deg"
-        columns[f"{key}_{unit}"] = table[key].value
-    return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
+    return [
+        {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns(table)
+        for table in tables
+    ]
 
 
 # ---- what an accuracy for a target is made of -----------------------------------------------
@@ -575,11 +537,11 @@ def open_lines(calibration, infinite=True):
     for kind, says in (
         (
             "open",
-            "infinite by what the data leave open"
+            "infinite, because the data do not determine"
             if infinite
-            else "resting on priors, as the data leave it open",
+            else "from priors, because the data do not determine it",
         ),
-        ("badly determined", "large by what is badly determined"),
+        ("badly determined", "large, because of badly determined directions"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
@@ -593,7 +555,8 @@ def _turn(direction):
 
 
 def _open_words(direction):
-    lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
+    lead = direction["words"].partition(" cannot be distinguished")[0]
+    lead = lead.partition(" changes no datum")[0]
     return f"{lead}: {sky_words(direction['sky'])}"
 
 

@@ -12,7 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.words import counted
+from astropolcal.words import counted, p_words
 
 __all__ = ["Verdict"]
 
@@ -223,7 +223,7 @@ def _hanging(free):
     angles = _orientations(free)
     told = [str(e["conditional_on"]) for e in angles.values() if e["status"] == "conditional"]
     names = dict.fromkeys(name for by in told for name in by.split(", ") if name in angles)
-    return f"orientations hang on the bound of {', '.join(names)}" if names else ""
+    return f"orientations depend on the bound of {', '.join(names)}" if names else ""
 
 
 def _width(entry):
@@ -460,7 +460,7 @@ def _goodness(calibration):
     if tests:
         told = [
             f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
-            f"(p = {test['p_value']:.1g})"
+            f"({p_words(test['p_value'])})"
             for test in tests
         ]
         yield f"Scatter     {', '.join(told)}"

@@ -2,9 +2,9 @@
 """
 Covariance of calibrated parameters, with names and units, and errors at a bound.
 
-The matrix has no number for a parameter that the data leave open. What the data do know of such
-parameters (a sum of two angles, say) is kept beside it: the determined directions with their errors
-(``factor``) and the open ones (``null``). With these, the error of anything derived from the
+The matrix has no number for a parameter that the data do not determine. What the data do know of
+such parameters (a sum of two angles, say) is kept beside it: the determined directions with their
+errors (``factor``) and the open ones (``null``). With these, the error of anything derived from the
 parameters is right: finite where the open directions do not move it, infinite where they do.
 
 A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
@@ -16,9 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.calibration.identifiability.linearized import LARGE, declared_step, step_of
+from astropolcal.calibration.identifiability.linearized import (
+    LARGE,
+    RANK,
+    STILL,
+    declared_step,
+    step_of,
+)
 from astropolcal.calibration.noise.scatter import Scatter
-from astropolcal.calibration.noise.weighting import Weighting, around, weighting_of
+from astropolcal.calibration.noise.weighting import Problem, problem_of, weighting_of
 from astropolcal.exceptions import ParameterError
 
 __all__ = ["Covariance"]
@@ -26,8 +32,6 @@ __all__ = ["Covariance"]
 # share of both standard errors by which a covariance may differ from its transpose: far above
 # rounding, and too little to change anything
 _ASYMMETRY = 1e-6
-# a quantity that changes by less than this share of its slope stands still
-_STILL = 1e-5
 # directions that no residual pulls keep this share of the largest error, so that they stay known
 _LEAST = 1e-6
 
@@ -270,7 +274,7 @@ class _Axes:
         parts = [along_known, along_open, along_blind]
         size = np.sqrt(sum(np.sum(part**2, axis=1) for part in parts))
         # a rounding error along an open direction is no movement
-        limit = _STILL * size
+        limit = STILL * size
         is_open = np.abs(along_open).max(axis=1, initial=0.0) > limit
         blind = np.abs(along_blind).max(axis=1, initial=0.0) > limit
         if not self.partial:
@@ -311,18 +315,17 @@ def full_covariance(calibration):
         return known
     if calibration.measurement is None:
         return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
-    weighting = weighting_of(calibration)
-    whitened = around(calibration.measurement, weighting)
+    problem = problem_of(calibration)
     how = white_covariance if calibration.settings.get("errors") == "white" else covariance_around
-    return how(calibration.measurement, whitened, weighting)
+    return how(problem.measurement, problem.around(), problem.weighting)
 
 
 def covariance_around(measurement, whitened, weighting, scatter=None):
     """Return the covariance with its directions, of a problem that is decomposed once.
 
-    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and hang
-    together; where they do not tell, that of independent data. What is at a bound may go inward by
-    its error.
+    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and are
+    correlated; where they do not tell, that of independent data. What is at a bound may go inward
+    by its error.
     """
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
@@ -341,11 +344,7 @@ def white_covariance(measurement, whitened, weighting):
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
     null = whitened.null() * per_unit
-    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
-
-
-def _units(free):
-    return [slot.unit for slot in free.slots for _ in range(slot.size)]
+    return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
 def sandwich(measurement, whitened, middle, slack=None):
@@ -368,22 +367,12 @@ def sandwich(measurement, whitened, middle, slack=None):
     columns = whitened.live[whitened.errors.determined]
     determined = factor[:, columns]
     matrix[np.ix_(columns, columns)] = determined.T @ determined
-    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
+    return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
 def residual_variance(calibration):
     """Return the variance of a datum of weight one: 1 where every datum has its own noise."""
     return weighting_of(calibration).level ** 2
-
-
-def prior_noise(measurement, weights):
-    """Return the noise against which priors weigh in a fit; the residuals' if not known."""
-    if weights is not None or not measurement.n_priors:
-        return 1.0
-    fitted = measurement.weighting
-    if fitted is not None and fitted.choice is None and fitted.is_known:
-        return fitted.level
-    return Weighting(None, np.full(measurement.n_data, np.nan)).started(measurement).level
 
 
 def _open_of_file(calibration):
@@ -393,7 +382,7 @@ def _open_of_file(calibration):
     null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
     undetermined = ~np.isfinite(np.diag(known.matrix))
     undetermined &= [name not in set(calibration.at_bound) for name in known.names]
-    is_open = (np.abs(null[:, undetermined]) > _STILL).any(axis=1)
+    is_open = (np.abs(null[:, undetermined]) > STILL).any(axis=1)
     return null[is_open] * steps
 
 
@@ -414,8 +403,6 @@ STATUSES = (
 
 # an error that grows by less than this when the bounds are released hardly hangs on them
 _MATTERS = 1.1
-# derivatives that others take up to this share of the largest singular value are open
-_OPEN = 1e-9
 # as far from one bound as 68 % of what is anywhere between two
 _ANYWHERE = 0.6827
 # the spread of what is anywhere between two bounds, as a share of their distance
@@ -480,19 +467,15 @@ def _moved(whitened, held, response, steps, widths):
 
 
 def _without_others(measurement, whitened, held):
-    """Return derivatives and residuals less what the live parameters take up, and how these go."""
-    vector, weighting = measurement.vector(), measurement.weighting
+    """Return derivatives and residuals less what the live parameters absorb, and how these go."""
     rows = np.concatenate([whitened.rows, whitened.prior_rows])
-    weight = 1.0 if weighting.weight is None else weighting.weight
-    data = -weight * measurement.residuals(vector)
-    priors = weighting.level * measurement.free.prior_residuals(vector)
-    residual = np.concatenate([data, priors])
+    residual = Problem(measurement, measurement.weighting).residuals(measurement.vector())
     # orthonormal: each determined direction in units of its standard error
     basis = whitened.along(rows)
     along = basis.T @ rows[:, held]
     columns = rows[:, held] - basis @ along
     size = np.linalg.norm(columns, axis=0)
-    columns[:, size <= _OPEN * whitened.together.singular.max(initial=0.0)] = 0.0
+    columns[:, size <= RANK * whitened.together.singular.max(initial=0.0)] = 0.0
     # a step of what is held moves the live ones by this, shape (n_live, n_held)
     return columns, residual - basis @ (basis.T @ residual), -whitened.errors.half.T @ along
 

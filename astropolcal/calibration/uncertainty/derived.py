@@ -3,8 +3,8 @@
 Quantities that follow from a calibration, with their errors.
 
 To first order: with g the derivative of a quantity to the parameters and C their covariance, the
-variance is g C g. A quantity that moves along a direction which the data leave open has an infinite
-error, however small the change: no pseudo-inverse hides it.
+variance is g C g. A quantity that moves along a direction which the data do not determine has an
+infinite error, however small the change: no pseudo-inverse hides it.
 """
 
 from dataclasses import dataclass, field
@@ -14,7 +14,13 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import led
-from astropolcal.calibration.system import free_of, from_first_stage
+from astropolcal.calibration.system import (
+    between,
+    free_of,
+    from_first_stage,
+    per_canonical,
+    spread_out,
+)
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     find_optic,
@@ -30,6 +36,7 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import (
     Diattenuator,
     DiattenuatorRetarder,
@@ -63,7 +70,7 @@ class Derived:
         The quantity, of any shape.
     std : `~astropy.units.Quantity` or `~numpy.ndarray`
         Standard error from the calibration, of the same shape: infinite where
-        the data leave it open; NaN where it depends on parameters at a bound
+        the data do not determine it; NaN where it depends on parameters at a bound
         alone, or where a calibration file does not say.
     covariance : callable
         Called without arguments, the covariance of the flattened quantity in
@@ -93,7 +100,7 @@ class Derived:
         """
         Return the quantity as a `~specutils.Spectrum` with standard deviations.
 
-        What the data leave open is masked. An optic takes a spectrum for a parameter.
+        What the data do not determine is masked. An optic takes a spectrum for a parameter.
         """
         if np.shape(self.value) != np.shape(self.wavelength) or np.ndim(self.value) != 1:
             raise ParameterError("a spectrum has one value at each of several wavelengths")
@@ -270,7 +277,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     Raises
     ------
     ChainError
-        If there is no such optic, or it is no retarder.
+        If there is no such optic, or it is not a retarder.
     WavelengthRangeError
         If a wavelength is outside the grid of its parameters or the law's range.
 
@@ -368,21 +375,17 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
 def _at_wavelengths(calibration, leaf, keys, lam):
     """Return parameters (degree or 1) at wavelengths, and the share of each grid point."""
     grid = calibration.wavelength.to_value(u.nm)
-    order = np.argsort(grid)
     wanted = np.atleast_1d(lam.to_value(u.nm))
     # one number for all wavelengths holds anywhere
     several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
-    slack = 1e-6 * grid.max()
+    slack = SAME_WAVELENGTH * grid.max()
     outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
     if several and outside.any():
         raise WavelengthRangeError(
             f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
             f"{grid.min():.2f} to {grid.max():.2f} nm"
         )
-    # interpolation is linear in the values: row i says how much of grid point i goes into each
-    # wavelength, (n_grid, n_wanted)
-    rows = [np.interp(wanted, grid[order], unit[order]) for unit in np.eye(grid.size)]
-    weights = np.stack(rows, axis=1)
+    weights = between(wanted, grid)
     parts = []
     for key in keys:
         parameter = getattr(leaf, key)
@@ -394,18 +397,12 @@ def _at_wavelengths(calibration, leaf, keys, lam):
 
 def _of_parameters(calibration, leaf, keys, value, slopes, weights):
     """Return a quantity that depends on parameters of one optic at the same wavelength."""
-    free = free_of(calibration)
-    derivatives = {}
-    for key, slope in zip(keys, slopes, strict=True):
-        parameter = getattr(leaf, key)
-        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
-        slot, *_ = free.lookup(f"{leaf.name}.{key}")
-        if slot is not None:
-            own = np.ravel(slope)[:, None] * weights if slot.per_wavelength else np.ravel(slope)
-            shape = (*np.shape(value), slot.size) if slot.per_wavelength else np.shape(value)
-            derivatives[f"{leaf.name}.{key}"] = (own * factor).reshape(shape)
-    slopes = slopes_of(free, derivatives, np.shape(value))
-    return derive(calibration, free, value[()], slopes)
+    units = (getattr(leaf, key).unit for key in keys)
+    named = {
+        f"{leaf.name}.{key}": np.ravel(slope) * (1.0 if unit is None else unit.to(u.deg))
+        for key, slope, unit in zip(keys, slopes, units, strict=True)
+    }
+    return _by_name(calibration, value[()], named, weights)
 
 
 def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
@@ -453,13 +450,16 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     lam = _grid(calibration, wavelength)
     chain = with_beam(calibration.chains[dataset], beam)
     value = system_mueller(chain, lam, positions)
-    slopes = {
-        name: slope.value
-        for name, slope in system_mueller_derivatives(chain, lam, positions).items()
-    }
-    axis = None if lam.ndim == 0 else -3
+    return _by_name(calibration, value, system_mueller_derivatives(chain, lam, positions), axis=-3)
+
+
+def _by_name(calibration, value, slopes, mix=None, axis=0):
+    """Return a quantity with its error from derivatives by name, see `spread_out`."""
     free = free_of(calibration)
-    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+    mix = np.eye(len(calibration.wavelength)) if mix is None else mix
+    # a single quantity is one of one wavelength
+    slopes = spread_out(free, per_canonical(free, slopes), np.shape(value) or (1,), mix, axis)
+    return derive(calibration, free, value, slopes.reshape(-1, free.size))
 
 
 def _grid(calibration, wavelength):
@@ -469,31 +469,12 @@ def _grid(calibration, wavelength):
         return grid
     lam = u.Quantity(wavelength)
     several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
-    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
+    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=SAME_WAVELENGTH)):
         raise ParameterError(
             f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
             "leave out wavelength"
         )
     return lam
-
-
-def _spread_out(free, slopes, axis):
-    """Give the derivatives to parameters per wavelength their own axis; drop the fixed ones."""
-    spread, shape = {}, ()
-    for name, slope in slopes.items():
-        shape = slope.shape
-        slot, *_ = free.lookup(name)
-        if slot is None:
-            continue
-        if slot.per_wavelength:
-            wide = np.zeros((*shape, slot.size))
-            for i in range(slot.size):
-                here = (*[slice(None)] * (len(shape) + axis), i)
-                # the matrices of wavelength i depend on the i-th value of the parameter alone
-                wide[(*here, ..., i)] = slope[here]
-            slope = wide
-        spread[name] = slope
-    return spread, shape
 
 
 def derived_data(calibration, observations=None, dataset=0):
@@ -624,9 +605,7 @@ def derived_sky(
             change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
             slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
-    free = free_of(calibration)
-    axis = None if np.ndim(lam) == 0 else -2
-    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+    return _by_name(calibration, value, slopes, axis=-2)
 
 
 def _double_difference_rows(chain, lam, positions, modulator):

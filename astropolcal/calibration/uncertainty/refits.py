@@ -4,7 +4,7 @@ Errors of parameters that do not come from one covariance: refits, and robust es
 
 Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
 one, all others refitted, is a better statement than a standard error, and need not be symmetric.
-Where the data leave a parameter open the profile is flat.
+Where the data do not determine a parameter, its profile is flat.
 
 Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
 derotator that stands slightly wrong), so their residuals are not independent, and errors from the
@@ -22,9 +22,14 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
-from astropolcal.calibration.identifiability.linearized import declared_step, decompose
+from astropolcal.calibration.identifiability.linearized import (
+    STILL,
+    Whitened,
+    declared_step,
+    decompose,
+)
 from astropolcal.calibration.noise.scatter import labels_of
-from astropolcal.calibration.noise.weighting import around, weighting_of
+from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty.covariance import (
     Covariance,
     full_covariance,
@@ -39,66 +44,6 @@ from astropolcal.units import to_unit
 __all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
 _FEWEST_BLOCKS = 3
-_MAX_EVALUATIONS = 100
-
-
-class Refit:
-    """The least-squares problem of a calibration: data, priors, bounds."""
-
-    def __init__(self, calibration):
-        self.measurement = calibration.live_measurement()
-        self.solution = self.measurement.vector()
-        weighting = weighting_of(calibration)
-        weights = weighting.weight
-        # with equal weights residuals stay dimensionless, and the
-        # noise multiplies the priors instead
-        self.weights = np.ones(self.measurement.n_data) if weights is None else weights
-        self._noise = weighting.level
-        self._low, self._high = self.measurement.free.bounds()
-
-    def residuals(self, vector, weights):
-        """Return weighted residuals of data and priors."""
-        data = weights * (self.measurement.predict(vector) - self.measurement.observed)
-        return np.concatenate([data, self._noise * self.measurement.free.prior_residuals(vector)])
-
-    def jacobian(self, vector, weights):
-        """Return the derivative of `residuals`, (n_data + n_priors, n_free)."""
-        data = self.measurement.jacobian(vector) * weights
-        priors = self.measurement.free.prior_jacobian(vector) * self._noise
-        return np.concatenate([data, priors], axis=1).T
-
-    def fit(self, start, counts=None, held=()):
-        """Return the vector, chi-square, and whether the fit arrived.
-
-        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
-        """
-        from scipy.optimize import least_squares
-
-        # a datum drawn k times adds k r^2 to chi-square; one never drawn adds nothing
-        weights = self.weights if counts is None else self.weights * np.sqrt(counts)
-        live = np.setdiff1d(np.arange(start.size), held)
-        vector = start.copy()
-
-        def place(part):
-            vector[live] = part
-            return vector
-
-        found = least_squares(
-            lambda part: self.residuals(place(part), weights),
-            # least_squares refuses a start outside of the bounds by a rounding error
-            np.clip(start[live], self._low[live], self._high[live]),
-            jac=lambda part: self.jacobian(place(part), weights)[:, live],
-            bounds=(self._low[live], self._high[live]),
-            # a radian, a micrometre and a 1 move the data by very different amounts
-            x_scale=self._scale(start, weights)[live],
-            max_nfev=_MAX_EVALUATIONS,
-        )
-        return place(found.x).copy(), 2 * found.cost, found.status > 0
-
-    def _scale(self, vector, weights):
-        """Return the natural step of each parameter; 1 for one that moves nothing."""
-        size = np.linalg.norm(self.jacobian(vector, weights), axis=0)
-        return 1 / np.where(size > 0, size, 1.0)
 
 
 # ---- profile likelihood: chi-square along one parameter, all others refitted ----
@@ -268,7 +213,7 @@ def profile(calibration, name, values=None, n=21):
     if n < 3:
         raise FitError(f"n = {n}; a profile needs at least 3 values")
     index = covariance.names.index(name)
-    refit = Refit(calibration)
+    refit = problem_of(calibration)
     unit = covariance.units[index]
     factor = refit.measurement.free.factors()[index]
     best = refit.solution[index] / factor
@@ -461,7 +406,7 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
     """
     if n < 2:
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
-    refit = Refit(calibration)
+    refit = problem_of(calibration)
     groups = _blocks(refit.measurement, block)
     rng = np.random.default_rng(check_seed(seed))
     # what all data determine, a resample must determine too
@@ -521,14 +466,14 @@ def _singular_values(refit, scale):
     """Return the singular values that are not zero, of columns of natural size."""
     jacobian = refit.jacobian(refit.solution, refit.weights * scale)
     size = np.linalg.norm(jacobian, axis=0)
-    singular = np.linalg.svd(jacobian / np.where(size > 0, size, 1.0), compute_uv=False)
-    return singular[singular > 1e-9 * singular[0]] if np.ndim(scale) == 0 else singular
+    found = Whitened(jacobian.T, 1 / np.where(size > 0, size, 1.0)).data
+    return found.singular[: found.rank] if np.ndim(scale) == 0 else found.singular
 
 
 def _result(calibration, refit, vectors, block, groups, rejected):
     known = full_covariance(calibration)
     samples = vectors / refit.measurement.free.factors()
-    is_open = (np.abs(known._axes().open) > 1e-5).any(axis=0)
+    is_open = (np.abs(known._axes().open) > STILL).any(axis=0)
     # where the data leave a direction open, a fit ends anywhere along it
     samples[:, is_open] = np.nan
     n_blocks = sum(int(numbers.max()) + 1 for _, numbers in groups)
@@ -549,9 +494,9 @@ def standard_errors(calibration, method=None, groups=None):
     r"""
     Return the standard errors of the free parameters.
 
-    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and hang
-    together. ``"white"`` takes them to be independent, with the noise of its weights.
-    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`.
+    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and are
+    correlated. ``"white"`` takes them to be independent, with the noise of its weights.
+    ``"robust"`` lets groups of residuals be correlated in any way, see `robust_covariance`.
     ``"van-holstein"`` is the error that calibrations of SPHERE/IRDIS and CHARIS quote (van Holstein
     et al. 2020, A&A 633, A64,
     Appendix E): each wavelength is a fit of its own in which the parameters
@@ -576,8 +521,8 @@ def standard_errors(calibration, method=None, groups=None):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``name``, ``std`` and ``unit``, one row a parameter; NaN for
-        those at a bound, that the data leave open, or (van Holstein) that are
+        Columns ``name``, ``std`` and ``unit``, one row per parameter; NaN for
+        those at a bound, that the data do not determine, or (van Holstein) that are
         common to all wavelengths. ``meta`` has ``method``, ``held`` and, for
         ``"robust"``, ``groups``.
 
@@ -616,8 +561,8 @@ def standard_errors(calibration, method=None, groups=None):
     covariance = calibration.covariance
     stds, held, meta = covariance.stds, [], {}
     if method == "white":
-        weighting, live = weighting_of(calibration), calibration.live_measurement()
-        stds = white_covariance(live, around(live, weighting), weighting).stds
+        problem = problem_of(calibration)
+        stds = white_covariance(problem.measurement, problem.around(), problem.weighting).stds
     if method == "robust":
         groups = "derotator" if groups is None else groups
         stds = robust_covariance(calibration, groups).stds
@@ -674,7 +619,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Raises
     ------
     FitError
-        If there are fewer than three groups, the labels are not one a datum,
+        If there are fewer than three groups, the labels are not one per datum,
         or a choice is unknown.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
@@ -707,12 +652,10 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     """
     if correction not in CORRECTIONS:
         raise FitError(f"correction = {correction!r}; allowed are {', '.join(CORRECTIONS)}")
-    weighting, measurement = weighting_of(calibration), calibration.measurement
+    problem = problem_of(calibration)
+    measurement, whitened = problem.measurement, problem.around()
     labels = _labels(measurement, groups)
-    whitened = around(measurement, weighting)
-    residuals = measurement.residuals()
-    if weighting.weight is not None:
-        residuals = residuals * weighting.weight
+    residuals = problem.residuals(problem.solution)[: measurement.n_data]
     # derivatives to the determined directions, each in units of its standard error
     slopes = whitened.along(whitened.rows)
     # (n_groups, rank): how far each group alone pulls the solution, in standard errors
@@ -725,7 +668,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
         n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
         middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
     # priors are taken at their word: their variance is not read from residuals
-    prior = weighting.level * whitened.along(whitened.prior_rows)
+    prior = problem.weighting.level * whitened.along(whitened.prior_rows)
     middle += prior.T @ prior
     return sandwich(measurement, whitened, middle)
 
@@ -734,7 +677,7 @@ def _labels(measurement, groups):
     labels = labels_of(measurement, groups) if isinstance(groups, str) else np.asarray(groups)
     if labels.shape != (measurement.n_data,):
         raise FitError(
-            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one a datum"
+            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one per datum"
         )
     _, numbers = np.unique(labels, return_inverse=True)
     if numbers.max() + 1 < _FEWEST_GROUPS:
@@ -761,11 +704,10 @@ def _pull(slopes, residuals, correction):
 
 def _per_wavelength(calibration):
     """Return the errors of fits wavelength by wavelength, in declared units."""
-    measurement = calibration.live_measurement()
-    free, weights = measurement.free, weighting_of(calibration).weight
-    weights = 1.0 if weights is None else weights
-    jacobian = measurement.jacobian(measurement.vector()) * weights
-    residuals = measurement.residuals() * weights
+    problem = problem_of(calibration)
+    measurement, free = problem.measurement, problem.measurement.free
+    jacobian = problem.jacobian(problem.solution).T
+    residuals = problem.residuals(problem.solution)[: measurement.n_data]
     at_bound, names = set(calibration.at_bound), free.names
     stds = np.full(free.size, np.nan)
     for i in range(len(measurement.wavelength)):
@@ -774,7 +716,7 @@ def _per_wavelength(calibration):
         rows = measurement.bins == i
         if own.size and rows.sum() > own.size:
             scale = physical_scale(free)[own]
-            found = decompose(jacobian[np.ix_(own, rows)].T * scale)
+            found = decompose(jacobian[np.ix_(own, np.flatnonzero(rows))].T * scale)
             # no number for what the data leave open
             half = np.linalg.norm(found.half, axis=0)
             unit_noise = np.where(found.determined, half, np.nan) * scale

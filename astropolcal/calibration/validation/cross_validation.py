@@ -3,8 +3,8 @@
 Accuracy of a calibration per wavelength (s_res, s_mean, s_cv, s_standard), and its chi-square.
 
 The first two accuracies look back at the data of the fit. The others are errors of predictions: of
-settings that were left out of the fit, and of a dataset that the fit never saw (a standard).
-Whether the residuals exceed the noise is told by chi-square where the noise is known, and by F
+settings that were left out of the fit, and of a dataset that was not fitted (a standard).
+Whether the residuals exceed the noise is decided by chi-square where the noise is known, and by F
 where it is itself estimated.
 """
 
@@ -16,13 +16,13 @@ import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import null_space, physical_scale
+from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors
 from astropolcal.calibration.noise.scatter import leave_out_groups
-from astropolcal.calibration.noise.weighting import weighting_of
-from astropolcal.calibration.uncertainty.covariance import prior_noise
+from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.exceptions import FitError
+from astropolcal.words import p_words
 
 __all__ = ["LackOfFit", "lack_of_fit"]
 
@@ -108,11 +108,9 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
     The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
     for a linear model, and a small group moves no parameter far.
     """
-    weight = np.ones(measurement.n_data) if weights is None else np.asarray(weights, dtype=float)
-    free = measurement.free
-    priors = free.prior_jacobian(vector) * prior_noise(measurement, weights)
-    problem = Whitened(jacobian * weight, physical_scale(free), priors, free.at_bounds(vector))
-    root = problem.along(problem.rows)
+    problem = Problem(measurement, assumed(measurement, weights))
+    whitened, weight = problem.around(vector), problem.weights
+    root = whitened.along(whitened.rows)
     residuals = measurement.residuals(vector) * weight
     order = np.argsort(labels, kind="stable")
     ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1
@@ -141,7 +139,7 @@ def _checked(measurement, groups):
     groups = np.asarray(groups)
     if groups.shape != (measurement.n_data,):
         raise FitError(
-            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one a datum"
+            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one per datum"
         )
     labels, counts = np.unique(groups, return_counts=True)
     if (counts < 2).any():
@@ -155,9 +153,9 @@ def _checked(measurement, groups):
 def _undetermined(measurement, vector, jacobian, out, weights):
     """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
     scale = physical_scale(measurement.free)
-    kept = jacobian[:, ~out] * (1.0 if weights is None else weights[~out])
-    kept = np.concatenate([kept, measurement.free.prior_jacobian(vector)], axis=1)
-    null = null_space(measurement.free, kept) * scale
+    problem = Problem(measurement, assumed(measurement, weights))
+    kept = problem.jacobian(vector)[np.append(~out, np.ones(measurement.n_priors, dtype=bool))]
+    null = Whitened(kept.T, scale).data.null * scale
     # which combinations of what the others leave open do the data left out see, and how strongly
     left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
     limit = _STILL * np.abs(jacobian * scale[:, None]).max(initial=0.0)
@@ -183,7 +181,7 @@ def _listed(names):
 def _fit_without(measurement, vector, out, weights):
     model = measurement.canonical()
     model.stand_at(vector)
-    noise = prior_noise(model, weights)
+    noise = Problem(model, assumed(model, weights)).noise
     index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
     with warnings.catch_warnings():
         # a fit that stops early still gives an honest, if poorer, prediction
@@ -195,8 +193,6 @@ def _fit_without(measurement, vector, out, weights):
 # ---- goodness of fit: whether the residuals exceed the noise ----
 
 
-# a singular value below this share of the largest belongs to a null direction
-_RANK = 1e-9
 # fewer degrees of freedom than this give no test
 _LEAST_FREEDOM = 0.5
 # what happens by chance less often than this is no chance
@@ -256,7 +252,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     where it comes from replicates of the same data, their scatter is taken out of
     the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are data
     like any other: a row each of r, :math:`\sigma` and J. So a prior that the data
-    overrule adds to chi-square, one that decides what the data leave open adds
+    overrule adds to chi-square, one that decides what the data do not determine adds
     nothing, and one that a fit heeds leaves more freedom to the data.
 
     Parameters
@@ -370,26 +366,15 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
 def _low_rank(measurement, vector, sigma, weights, fitted):
     """Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
 
-    One row a datum, and behind them one a prior of the fit.
+    One row per datum, and after them one a prior of the fit.
     """
     nothing = np.zeros((measurement.n_data, 0))
     if not fitted:
         return nothing, nothing
-    free = measurement.free
-    level = prior_noise(measurement, weights)
-    weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights, float)
-    weights = np.append(weights, np.full(measurement.n_priors, level))
-    slope = np.hstack([measurement.jacobian(vector), free.prior_jacobian(vector)])
-    slope = slope[~free.at_bounds(vector)].T
-    # columns of unit length, lest the rank depend on units
-    scale = np.sqrt(np.sum((slope * weights[:, None]) ** 2, axis=0))
-    slope = slope[:, scale > 0] / scale[scale > 0]
-    slope *= weights[:, None]
-    # the triangular factor has the same right vectors, and there are far more data than columns
-    triangle = np.linalg.qr(slope, mode="r") if len(slope) > slope.shape[1] else slope
-    _, values, right = np.linalg.svd(triangle, full_matrices=False)
-    some = values > _RANK * values.max(initial=0.0)
-    basis = slope @ (right[some] / values[some, None]).T
+    problem = Problem(measurement, assumed(measurement, weights))
+    whitened = problem.around(vector)
+    weights = np.append(problem.weights, np.full(measurement.n_priors, problem.noise))
+    basis = whitened.along(np.concatenate([whitened.rows, whitened.prior_rows]))
     # in units of the noise the hat matrix is a b^T
     known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
     by_noise = (weights * known)[:, None]
@@ -447,7 +432,7 @@ def _verdict(chi2, expected, p_value, noise, priors):
         says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
     else:
         says = "the residuals agree with the noise"
-    says += f" (p = {p_value:.3g})"
+    says += f" ({p_words(p_value)})"
     if priors is not None and priors["p_value"] < _UNLIKELY:
-        says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
+        says += f"; the data disagree with the priors ({p_words(priors['p_value'])})"
     return f"{says}; noise: {noise.words}"

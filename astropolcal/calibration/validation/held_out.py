@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Prediction of standards: datasets that the fit of a calibration never saw."""
+"""Prediction of standards: datasets that the fit of a calibration did not use."""
 
 import astropy.units as u
 import numpy as np
@@ -7,9 +7,10 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import ChainError, FitError, ObservationError
+from astropolcal.exceptions import ChainError, FitError
+from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH, bins_on_grid
 from astropolcal.optics import PolarizedSource
 
 __all__ = ["add_standard"]
@@ -23,18 +24,18 @@ def refuse_fitted(calibration, observations):
     seen = {record.content_hash: record.name for record in calibration.datasets}
     if observations.content_hash in seen:
         raise FitError(
-            f"{observations.name} is no independent standard: the calibration was fitted "
+            f"{observations.name} is not an independent standard: the calibration was fitted "
             f"to it as {seen[observations.content_hash]}"
         )
 
 
 def standard_accuracy(calibration, chain, observations, positions=None):
-    """Return how well a calibration predicts a dataset that its fit never saw.
+    """Return how well a calibration predicts a dataset that its fit did not use.
 
     The table of `add_standard`, which keeps it with the calibration.
     """
     refuse_fitted(calibration, observations)
-    rows = rows_on_grid(calibration, observations)
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     predicted = _calibrated_chain(calibration, chain, rows, observations.name)
     known = parameter_table([predicted])
     fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
@@ -63,22 +64,8 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 
 def predicted_chain(calibration, chain, observations):
     """Return the chain with the calibration's values at the wavelengths of the observations."""
-    rows = rows_on_grid(calibration, observations)
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     return _calibrated_chain(calibration, chain, rows, observations.name, sources=True)
-
-
-def rows_on_grid(calibration, observations):
-    """Return the calibration's wavelength (index) of each of the observations'."""
-    grid, own = (w.to_value(u.nm) for w in (calibration.wavelength, observations.wavelength))
-    nearest = np.abs(own[:, None] - grid).argmin(axis=1)
-    off = np.abs(grid[nearest] - own) > SAME_WAVELENGTH * own
-    if off.any():
-        raise ObservationError(
-            f"{observations.name}: {off.sum()} of {own.size} wavelengths, such as "
-            f"{own[off][0]:.3f} nm, are none of the calibration's {grid.size} from "
-            f"{grid.min():.3f} to {grid.max():.3f} nm (nearest {grid[nearest][off][0]:.3f} nm)"
-        )
-    return nearest
 
 
 def _calibrated_chain(calibration, chain, rows, name, sources=False):
@@ -191,7 +178,8 @@ def _words(table, same_source):
     moved = table.meta["open_percent"]
     if moved > _WORTH_A_WORD * np.nanmedian(table["s_standard"].value):
         words += (
-            f"; along what the calibration leaves open the prediction moves by up to {moved:.2g} % "
+            f"; along what the calibration does not determine the prediction moves by "
+            f"up to {moved:.2g} % "
             "a degree, so its gauge counts"
         )
     return words
@@ -226,8 +214,8 @@ def add_standard(calibration, chain, observations, positions=None):
         ``s_standard / s_cv``: 1 where the standard is predicted as well as settings left out of
         the fit. Meta ``name``, ``source``, ``content_hash``, ``n_frames``, ``words``;
         ``open_percent``: by how much the prediction moves, at most, for one degree, micrometre or
-        percent along what the calibration leaves open; and ``not_calibrated``: optics whose values
-        are those of the chain.
+        percent along what the calibration does not determine; and ``not_calibrated``: optics whose
+        values are those of the chain.
 
     Raises
     ------
@@ -255,11 +243,7 @@ def add_standard(calibration, chain, observations, positions=None):
     """
     table = standard_accuracy(calibration, chain, observations, positions)
     entry = {key: table.meta[key] for key in ("name", "source", "content_hash", "n_frames")}
-    entry["wavelength_nm"] = table["wavelength"].to_value(u.nm).tolist()
-    entry["n"] = np.asarray(table["n"]).tolist()
-    for key in ("s_standard", "bias", "scatter", "s_cv"):
-        entry[f"{key}_percent"] = table[key].to_value(u.percent).tolist()
-    entry["chi"] = np.asarray(table["chi"]).tolist()
+    entry |= columns(table, "wavelength", "n", "s_standard", "bias", "scatter", "s_cv", "chi")
     entry |= {key: table.meta[key] for key in ("open_percent", "not_calibrated", "words")}
     others = [
         other

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
-from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted, rows_on_grid
+from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import (
@@ -15,8 +15,10 @@ from astropolcal.exceptions import (
     ObservationError,
     WavelengthRangeError,
 )
+from astropolcal.files import columns
 from astropolcal.measurement import Measurement
 from astropolcal.observations.quality import cycle_numbers
+from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
 
@@ -45,9 +47,9 @@ def star_stokes(calibration, chain, observations, positions=None):
     Returns
     -------
     `~astropy.table.QTable`
-        One row a wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
+        One row per wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
         standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
-        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one a cycle, NaN
+        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one per cycle, NaN
         where a cycle does not determine them.
 
     Raises
@@ -59,7 +61,7 @@ def star_stokes(calibration, chain, observations, positions=None):
 
     Examples
     --------
-    Frames of a star behind a telescope that does nothing, seen as they are:
+    Frames of a star downstream of a telescope that does nothing, seen as they are:
 
     >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import star_stokes
@@ -154,7 +156,7 @@ def star_accuracy(table, q=0.0, u_=0.0):
     table : `~astropy.table.QTable`
         As from ``star_stokes``.
     q, u_ : float or array_like
-        What is known of the star, one a wavelength.
+        What is known of the star, one per wavelength.
 
     Returns
     -------
@@ -289,24 +291,12 @@ def _fitted_words(table):
 # ---- check of a calibration with a star of known polarization that no fit has seen ----
 
 
-# what is kept with a calibration, and in which unit
-_KEPT = {
-    "dolp": u.percent,
-    "dolp_err": u.percent,
-    "dolp_sys_err": u.percent,
-    "dolp_known": u.percent,
-    "dolp_known_err": u.percent,
-    "aolp": u.deg,
-    "aolp_err": u.deg,
-    "aolp_sys_err": u.deg,
-    "aolp_known": u.deg,
-    "aolp_known_err": u.deg,
-    "dolp_error": u.percent,
-    "aolp_error": u.deg,
-    "s_dolp": u.percent,
-    "s_q": u.percent,
-    "s_u": u.percent,
-}
+# what is kept with a calibration
+_KEPT = (
+    *("dolp", "dolp_err", "dolp_sys_err", "dolp_known", "dolp_known_err"),
+    *("aolp", "aolp_err", "aolp_sys_err", "aolp_known", "aolp_known_err"),
+    *("dolp_error", "aolp_error", "s_dolp", "s_q", "s_u"),
+)
 
 
 def star_check(calibration, chain, observations, positions=None, star=None):
@@ -377,7 +367,8 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     for key in accuracy.colnames[1:]:
         table[key] = accuracy[key]
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
-    _add_claims(table, calibration, rows_on_grid(calibration, observations))
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
+    _add_claims(table, calibration, rows)
     table.meta["words"] = _words(table)
     return table
 
@@ -469,11 +460,7 @@ def add_star_check(calibration, chain, observations, positions=None):
     table = star_check(calibration, chain, observations, positions)
     entry = {key: table.meta[key] for key in ("name", "star", "words")}
     entry["content_hash"] = observations.content_hash
-    entry["wavelength_nm"] = table["wavelength"].to_value(u.nm).tolist()
-    entry["n_cycles"] = np.asarray(table["n_cycles"]).tolist()
-    for key, unit in _KEPT.items():
-        suffix = "percent" if unit == u.percent else "deg"
-        entry[f"{key}_{suffix}"] = table[key].to_value(unit).tolist()
+    entry |= columns(table, "wavelength", "n_cycles", *_KEPT)
     others = calibration.fit.get("stars", [])
     # checked again, a star replaces its entry
     others = [other for other in others if other["content_hash"] != entry["content_hash"]]

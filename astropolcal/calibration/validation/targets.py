@@ -11,6 +11,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
 from astropolcal.calibration.noise.scatter import groups_by
 from astropolcal.calibration.system import model_error
@@ -22,14 +23,13 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.files import columns
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
 
 __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
 
-# what changes by less than this share of all its changes along an open direction stands still
-_STILL = 1e-5
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 
 
@@ -59,7 +59,7 @@ class SkyErrors:
             for matrix in (self._covariance, self._known, self._open, self._blind)
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
-        limit = _STILL**2 * (known + is_open + blind)
+        limit = STILL**2 * (known + is_open + blind)
         lost = blind > limit
         if not self._partial:
             lost &= known <= limit
@@ -130,15 +130,15 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
         Degree and angle of linear polarization of each. An angle of None stands for any: each
         error is then that at its worst angle.
     open_directions : {"infinite", "ignore"}
-        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
-        are infinite, or zero as if the choice that the calibration made were true.
+        As for `~astropolcal.correction.correct`: errors along directions that the data do not
+        determine are infinite, or zero as if the choice that the calibration made were true.
 
     Returns
     -------
     list of `~astropy.table.QTable`
-        One a target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
-        ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
-        the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
+        One per target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
+        ``s_chi`` (degree), infinite where it depends on a direction that the data do not determine;
+        in the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
         the chain has no half-wave plate.
 
     Raises
@@ -177,7 +177,7 @@ def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
     errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
-    words += "; as if what the data leave open were known" if ignore else ""
+    words += "; as if the undetermined parameters were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
         if p == 0:
@@ -215,21 +215,20 @@ def keep_sky_accuracy(calibration, view=None):
         calibration.fit["sky_settings"] = settings_of(calibration.measurement)
     view = view_of_calibration(calibration) if view is None else view
     tables = _accuracies(calibration, TARGETS, [_target(*one) for one in TARGETS], view)
-    calibration.fit["sky_accuracy"] = [_kept(table) for table in tables]
+    calibration.fit["sky_accuracy"] = [
+        {key.lower(): value for key, value in target_entry(table).items()} for table in tables
+    ]
     return calibration
 
 
-def _kept(table):
+def target_entry(table):
+    """Return the accuracies for a target as plain numbers and lists."""
     aolp = table.meta["aolp"]
-    columns = {f"{key.lower()}_percent": table[key].to_value(u.percent) for key in KEYS[:3]}
     return {
         "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
         "aolp_deg": None if aolp is None else float(aolp.to_value(u.deg)),
-        "wavelength_nm": table["wavelength"].to_value(u.nm).tolist(),
-        **{key: values.tolist() for key, values in columns.items()},
-        "s_chi_deg": table["s_chi"].to_value(u.deg).tolist(),
         "words": table.meta["words"],
-    }
+    } | columns(table)
 
 
 # ---- the equations of the paper ------------------------------------------------------------
@@ -277,14 +276,14 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     Parameters
     ----------
     dolp : `~astropy.units.Quantity` or float
-        The target's degree of linear polarization; scalar or one a wavelength.
+        The target's degree of linear polarization; scalar or one per wavelength.
     aolp : `~astropy.units.Quantity`
-        Its angle of linear polarization; scalar or one a wavelength.
+        Its angle of linear polarization; scalar or one per wavelength.
     polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
         Accuracies of the calibrations with the internal source polarized
         (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
         (s_sky), such as ``Calibration.accuracy``. What is missing counts as
-        zero; its column is NaN and ``meta["words"]`` says so.
+        zero; its column is NaN and ``meta["words"]`` names it.
     column : {"s_mean", "s_res", "s_cv"}
         Which accuracy to take: the paper's is ``s_mean``, the error of a
         prediction at one setting is ``s_cv``.
@@ -341,7 +340,8 @@ def _for_target(dolp, aolp, s_rel, s_abs):
     for name, value in (("dolp", dolp), ("aolp", aolp)):
         if np.shape(value) not in ((), shape):
             raise ParameterError(
-                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, one a wavelength"
+                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, "
+                "one per wavelength"
             )
     return propagate_accuracy(dolp, aolp, s_rel, s_abs)
 
@@ -391,7 +391,7 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     Returns
     -------
     list of `~astropy.table.QTable`
-        As `target_accuracy` gives them, one a target, with ``dolp`` and ``aolp`` in the
+        As `target_accuracy` gives them, one per target, with ``dolp`` and ``aolp`` in the
         meta; none if no dataset is of a known kind.
 
     Raises
@@ -513,14 +513,14 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         The calibration; one that was read from a file has its data no more, so
         ``groups`` cannot be chosen.
     standard : Observations or Measurement, optional
-        The dataset the fit never saw: observations with the set-up of
+        The dataset the fit did not use: observations with the set-up of
         ``dataset``, or a measurement with a chain of its own, at its current
         parameters. By default those that the calibration remembers, see
         `~astropolcal.calibration.add_standard`.
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
-        Cross-validate anew by what makes a group, or by the group of each datum; by
+        Cross-validate again by what makes a group, or by the group of each datum; by
         default ``s_cv`` is what the calibration remembers (derotator angles).
 
     Returns

@@ -166,7 +166,7 @@ def get_effect(name):
 def _check_declared(effect):
     """Check that an effect has its attributes and is of a known kind."""
     if not isinstance(effect, Effect):
-        raise GapError(f"{effect!r} is no Effect")
+        raise GapError(f"{effect!r} is not an Effect")
     lacking = [key for key in _NEEDED if not getattr(effect, key)]
     if lacking:
         raise GapError(f"effect {effect.name or type(effect).__name__} lacks {', '.join(lacking)}")

@@ -55,7 +55,7 @@ def may_be_polarized(roles):
 
 
 def every_wavelength(context):
-    """Return one value a wavelength, whatever degree the context asks for."""
+    """Return one value per wavelength, for any degree that the context asks for."""
     return np.eye(len(context.wavelength))
 
 
@@ -180,7 +180,7 @@ class BandAverage(Effect):
     """
 
     def retarder(self, roles):
-        """Return the derotator, or the steepest retarder behind it that stands still."""
+        """Return the derotator, or the steepest retarder downstream of it that is static."""
         if self.where.relation == "in" or roles.derotator is None:
             return roles.derotator
         names = [leaf.name for leaf in roles.leaves]
@@ -252,7 +252,7 @@ def retardance_slopes(retarder):
 
 class Recoating(Effect):
     """
-    A mirror that changes from one dataset to the next, as when it is coated anew or washed.
+    A mirror that changes from one dataset to the next, as when it is recoated or washed.
 
     The datasets of stars are taken in the order in which they are given; the first one is the
     reference, and each of the others has a change of its own.
@@ -409,7 +409,7 @@ class Alternative(Effect):
         super().__init__(name, title, where, words=words, change=change, **settings)
 
     def cells(self, chains):
-        """Return none: an alternative is no perturbation."""
+        """Return none: an alternative is not a perturbation."""
         return ()
 
     def edit(self, chains, context):
@@ -431,12 +431,12 @@ class Alternative(Effect):
 
 
 def flipped_before(chain, optic, *, label, **_):
-    """Return a chain with a reflection in front of an optic."""
+    """Return a chain with a reflection upstream of an optic."""
     return insert_optic(chain, optics.ParityFlip(name=label), before=optic.name)
 
 
 def flipped_behind(chain, optic, *, roles, label, **_):
-    """Return a chain with a reflection behind an optic taken out, or put in."""
+    """Return a chain with a reflection downstream of an optic taken out, or put in."""
     order = [leaf.name for leaf in roles.leaves]
     behind = roles.leaves[order.index(optic.name) :]
     flips = [leaf for leaf in behind if isinstance(leaf, optics.ParityFlip)]

@@ -96,7 +96,7 @@ class EffectParameter:
 
     @property
     def canonical_neutral(self):
-        """Value at which the effect is absent, canonical; scalar or one a wavelength."""
+        """Value at which the effect is absent, canonical; scalar or one per wavelength."""
         if self.neutral is not None:
             value = u.Quantity(self.neutral)
             return value.value * canonical_factor(value.unit)
@@ -122,7 +122,7 @@ class Edit:
     Parameters
     ----------
     chains : list
-        One a dataset.
+        One per dataset.
     parameters : list of EffectParameter
         What the effect adds.
     ties : dict of str to Tie
@@ -168,7 +168,7 @@ class Context:
     flux : float
         Median flux of a beam, in the tables' unit.
     degree : int or None
-        Degree of the laws in wavelength, None for one value a wavelength, or
+        Degree of the laws in wavelength, None for one value per wavelength, or
         "default" for that of each effect.
     tracking : tuple of (float, float)
         Law by which the half-wave plate of each dataset follows the sky, see
@@ -239,7 +239,7 @@ def label_of(name):
 
 class Effect:
     """
-    An effect that the model of an instrument may lack, told by its place, kind and dependence.
+    An effect that the model of an instrument may lack, defined by its place, kind and dependence.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ class Effect:
         What it is, for a reader.
     place : str
         ``"after:OPTIC"``, ``"before:OPTIC"``, ``"in:OPTIC"`` (the frame that turns with it),
-        ``"source"``, ``"telescope"`` (in front of the half-wave plate) or ``"detector"``; an optic
+        ``"source"``, ``"telescope"`` (upstream of the half-wave plate) or ``"detector"``; an optic
         by its name or its role.
     kind : str or tuple of str
         Key of `~astropolcal.optics.GENERATORS`; ``"diattenuation"`` and ``"retardance"`` are of
@@ -301,7 +301,7 @@ class Effect:
     ...                  place="after:hwp", kind="diattenuation",
     ...                  dependence="harmonic:derotator:1", limit=0.05)
     >>> flexure.cell([instruments.get("charis").chain()]).title
-    'diattenuation along the axes behind the half-wave plate that changes once in a turn of the derotator'
+    'diattenuation along the axes downstream of the half-wave plate that changes once in a turn of the derotator'
     """  # noqa: E501
 
     name = title = place = where = optic = inserted = near = absorbed_by = scale = limit = None
@@ -382,7 +382,7 @@ class Effect:
         >>> from astropolcal.gap.effects import Effect
         >>> film = optics.Diattenuator(theta=30 * u.deg, name="film")
         >>> Effect.insert(film, before="wollaston", limit=0.1, degree=1)
-        <Effect film: Diattenuator in front of the wollaston>
+        <Effect film: Diattenuator upstream of the wollaston>
         """
         given = {"after": after, "before": before, "in": inside}
         told = [Where(key, value) for key, value in given.items() if value is not None]
@@ -445,7 +445,7 @@ class Effect:
         return [self, *(self.at(name) for name in others)]
 
     def applies(self, chains):
-        """Return whether one of the chains, one a dataset, has the place for this effect."""
+        """Return whether one of the chains, one per dataset, has the place for this effect."""
         return any(self.applies_to(self.roles(chain)) for chain in chains)
 
     def applies_to(self, roles):
@@ -527,7 +527,7 @@ class Effect:
         return [EffectParameter(name, *self._sizes(), law) for name in names]
 
     def _sizes(self):
-        """Return size to expect and limit, a tenth of which is expected if nothing is said."""
+        """Return size to expect and limit, a tenth of which is expected if none is given."""
         kind = self.kinds[0] if self.kinds else ""
         scale, limit = self.scale, self.limit
         if limit is None:

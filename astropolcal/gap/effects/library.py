@@ -2,7 +2,7 @@
 """
 The table of effects: of each its place, kind and dependence, sizes, words and reference.
 
-Places are told by the role of an optic, see `Roles`, so that a row fits every instrument.
+Places are given by the role of an optic, see `Roles`, so that a row fits every instrument.
 """
 
 import astropy.units as u
@@ -58,7 +58,7 @@ _M3 = Where("in", "telescope_mirror", True, turned=0.0, otherwise=Where("before"
 
 _ON_PLATE = {"words": "half-wave plate"}
 _AT_DETECTOR = {"words": "detector", "category": "detector"}
-_BEHIND = {"words": "relay behind the derotator"}
+_BEHIND = {"words": "relay downstream of the derotator"}
 _IN_TELESCOPE = {
     kind: {"words": "tertiary mirror", "near": (Where("telescope"), (f"{kind}_h", f"{kind}_d"))}
     for kind in ("diattenuation", "retardance")
@@ -239,7 +239,7 @@ _DEROTATOR_EFFECTS = [
 _FRINGES = Fringes(
     "fringes", "fringes of a plane-parallel window", _RELAY, ("retardance_d", "retardance_h"),
     inserted=optics.EllipticalRetarder(), free=_ANY_AXIS, **_size(1, 30, u.deg),
-    words="plane-parallel window behind the derotator",
+    words="plane-parallel window downstream of the derotator",
     shows="sinusoid in one over the wavelength",
     reference="Harrington et al. 2017, doi:10.1117/1.JATIS.3.4.048001",
 )  # fmt: skip
@@ -248,7 +248,7 @@ _DRIFTING = Fringes(
     ("retardance_d", "retardance_h"), inserted=optics.DriftRetarder(mount="sequence"),
     near=(_RELAY, ("retardance_d", "retardance_h"), ("time", "constant")),
     free=(*_ANY_AXIS, "horizontal_rate", "diagonal_rate"), **_size(1, 30, u.deg),
-    words="plane-parallel window behind the derotator",
+    words="plane-parallel window downstream of the derotator",
     shows="sinusoid in one over the wavelength, with time",
     reference="Harrington & Sueoka 2018, doi:10.1117/1.JATIS.4.1.018006",
 )  # fmt: skip
@@ -256,7 +256,7 @@ _DRIFTING = Fringes(
 _RELAY_EFFECTS = [
     # beyond half a turn a retardance comes back with the other sign
     _effect(
-        "static_retarder", "retarder that stands still behind the derotator",
+        "static_retarder", "retarder that is static downstream of the derotator",
         _RELAY, _CIRCULAR_H_D, optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
         _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength",
         _HARRINGTON_2019, **_BEHIND,
@@ -269,7 +269,7 @@ _RELAY_EFFECTS = [
     ),
     *(one.of(thickness) for thickness in (8, 4, 12) for one in (_FRINGES, _DRIFTING)),
     _effect(
-        "static_diattenuator", "diattenuator that stands still behind the derotator",
+        "static_diattenuator", "diattenuator that is static downstream of the derotator",
         _RELAY, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.005, 0.3),
         "single differences of all sources, at all plate and derotator angles",
         "de Boer et al. 2020, doi:10.1051/0004-6361/201834989", **_BEHIND,
@@ -279,7 +279,7 @@ _RELAY_EFFECTS = [
     # is not physical
     _effect(
         "anisotropic_depolarizer",
-        "depolarizer behind the derotator that is not the same for all orientations",
+        "depolarizer downstream of the derotator that is not the same for all orientations",
         _RELAY, _DEPOLARIZED, optics.Depolarizer(theta=22.5 * u.deg), "retained_q",
         _size(0.01, 0.5), "Q measured where there is U, with the derotator angle",
         _HARRINGTON_2019, equal={"retained_v": "retained_q"}, **_BEHIND,
@@ -312,7 +312,7 @@ _SOURCE_EFFECTS = [
     # degree of circular polarization = sin(retardance), 1 deg is 1.7 percent
     _effect(
         "source_circular",
-        "circular polarization of the source (or a retarder in front of the plate)",
+        "circular polarization of the source (or a retarder upstream of the plate)",
         Where("after", "polarizer", True, turned=45), ("retardance_d", "retardance_h"),
         _NO_RETARDER, "retardance", _size(1, 45, u.deg),
         "constant in plate angle, varies with derotator angle",
@@ -321,19 +321,19 @@ _SOURCE_EFFECTS = [
     ),
     _effect(
         "retarder_before_plate",
-        "retarder in front of the half-wave plate in the path of the unpolarized source",
+        "retarder upstream of the half-wave plate in the path of the unpolarized source",
         Where("after", "mirror", True, turned=45), ("retardance_d", "retardance_h"),
         _NO_RETARDER, "retardance", _size(5, 90, u.deg),
         "constant in plate angle, varies with derotator angle, unpolarized data alone", _HOLSTEIN,
-        words="in front of the half-wave plate",
+        words="upstream of the half-wave plate",
     ),
     _effect(
         "source_linear",
-        "linear polarization of the source, or a mirror in front of the half-wave plate",
+        "linear polarization of the source, or a mirror upstream of the half-wave plate",
         _ENTRANCE, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.01, 0.3),
         "harmonic 4 of the plate angle, as the derotator turns it",
         "McIntosh et al. 2026, Sec. 5.2 (fold mirror of the internal source)",
-        words="in front of the half-wave plate", category="source",
+        words="upstream of the half-wave plate", category="source",
     ),
     _effect(
         "source_rotation_drift", "polarization of the source that turns through the run",
@@ -376,7 +376,7 @@ _SKY_EFFECTS = [
         when=lambda roles: may_be_polarized(roles) and mirror_leaves("diattenuation")(roles),
     ),
     Recoating(
-        "m3_recoating", "tertiary mirror that is coated anew between two datasets of stars",
+        "m3_recoating", "tertiary mirror that is recoated between two datasets of stars",
         _M3, "diattenuation", inserted=optics.Diattenuator(), free=("diattenuation",),
         **_size(0.003, 0.1), **_IN_TELESCOPE["diattenuation"], reference=_HARTEN,
         shows="as the diattenuation of the tertiary mirror, in some datasets and not in others",
@@ -462,8 +462,8 @@ _HELD_EFFECTS = [
     # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
     _held(
         "mirror_misalignment",
-        "orientation of the mirror in front of the half-wave plate, far from where it should be",
-        _MIRROR, "rotation", "mirror in front of the half-wave plate", _size(1, 45, u.deg),
+        "orientation of the mirror upstream of the half-wave plate, far from where it should be",
+        _MIRROR, "rotation", "mirror upstream of the half-wave plate", _size(1, 45, u.deg),
         shows=_PHASE.format("unpolarized data alone"),
     ),
     _held(
@@ -509,16 +509,16 @@ def _followed(name, title, shows, *factors, needs="parallactic"):
 _ALTERNATIVES = [
     Alternative(
         "mirror_flip",
-        "odd number of reflections behind the derotator that the model lacks (or has too many)",
-        "relay behind the derotator", "relay", flipped_behind,
+        "odd number of reflections downstream of the derotator, missing or in excess",
+        "relay downstream of the derotator", "relay", flipped_behind,
         shows="everywhere: U and V have the wrong sign",
         when=lambda roles: roles.splitter is not None,
     ),
     # an odd number in all: two flips with only rotators between them are a rotation
     Alternative(
         "mirror_flip_before_plate",
-        "odd number of reflections in front of the half-wave plate that the model lacks",
-        "in front of the half-wave plate", Where("before", "plate"), flipped_before, shows=_TURNED,
+        "odd number of reflections upstream of the half-wave plate that the model lacks",
+        "upstream of the half-wave plate", Where("before", "plate"), flipped_before, shows=_TURNED,
     ),
     Alternative("hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", other_sign,
                 shows=_TURNED),
@@ -542,7 +542,7 @@ _ALTERNATIVES = [
               "the parallactic angle", -1.0, 1.0),
     _followed("hwp_tracking_altitude_sign", "follows the altitude with the wrong sign",
               "four times the altitude", 1.0, -1.0, needs="altitude"),
-    _followed("hwp_not_tracking", "stands still between the commands",
+    _followed("hwp_not_tracking", "does not move between the commands",
               "parallactic angle and altitude", 0.0, 0.0),
 ]  # fmt: skip
 

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Places of effects in a chain, told by its optics and by what these are for."""
+"""Places of effects in a chain, given by its optics and by what these are for."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ __all__ = []
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
 _NO_STAGES = (None, "parallactic", "altitude")
-_BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
+_BEHIND, _BEHIND_PLATE = "downstream of the derotator", "downstream of the half-wave plate"
 
 
 @dataclass(frozen=True)
 class Where:
-    """A place in chains, told by an optic."""
+    """A place in chains, given by an optic."""
 
     #: ``"after"``, ``"before"`` or ``"in"`` an optic, the latter in the frame that turns with it;
     #: ``"source"``, ``"telescope"`` or ``"detector"``.
@@ -38,7 +38,7 @@ class Where:
 
     @classmethod
     def of(cls, place):
-        """Return the place of a text such as ``"after:hwp"``, None where it is no place."""
+        """Return the place of a text such as ``"after:hwp"``, None where it is not a place."""
         relation, _, optic = place.partition(":")
         known = ("after", "before", "in") if optic else ("source", "telescope", "detector")
         return cls(relation, optic or None) if relation in known else None
@@ -46,16 +46,16 @@ class Where:
     @property
     def words(self):
         """The place in words."""
-        side = {"after": "behind the ", "before": "in front of the "}.get(self.relation, "")
+        side = {"after": "downstream of the ", "before": "upstream of the "}.get(self.relation, "")
         return f"{side}{self.optic or self.relation}"
 
     @property
     def follows(self):
-        """Whether the orientation is that of the optic, whatever that is."""
+        """Whether the orientation is that of the optic, regardless of its value."""
         return self.relation == "in" and self.turned is None
 
     def anchor(self, roles):
-        """Return the optic by which the place is told, None where there is none."""
+        """Return the optic by which the place is given, None where there is none."""
         own = [] if self.is_role else [o for o in roles.leaves if o.name == self.optic]
         return next(iter(own), getattr(roles, self.optic or "", None))
 
@@ -96,7 +96,7 @@ class Where:
         return found
 
     def in_front_of(self, roles):
-        """Return the name of the place in front of the optic."""
+        """Return the name of the place upstream of the optic."""
         return Where("before", self.optic, self.is_role).cell_place(roles)
 
 
@@ -116,9 +116,9 @@ class Roles:
     The optics of a chain by what they are for.
 
     There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
-    on a stage in front of it, or without it all but those on ``derotator``; the derotators are
-    retarders on a stage behind the plate, whatever it is called; the telescope's mirrors stand
-    between the rotation by the parallactic angle and the plate.
+    on a stage upstream of it, or without it all but those on ``derotator``; the derotators are
+    retarders on a stage downstream of the plate, regardless of its name; the telescope's mirrors
+    stand between the rotation by the parallactic angle and the plate.
 
     Parameters
     ----------
@@ -238,15 +238,15 @@ def adapted(effects, chains):
     effects : sequence of Effect
         The library.
     chains : sequence
-        One a dataset.
+        One per dataset.
 
     Returns
     -------
     list of Effect
         An effect that acts on one kind of optic comes once for each such optic: under its own name
         for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
-        of what stands behind it name the half-wave plate; where there is no such plate, that of a
-        plate names the optic.
+        of what stands downstream of it name the half-wave plate; where there is no such plate,
+        the words name the optic.
 
     Examples
     --------
