@@ -287,6 +287,15 @@ def stages(chain):
     return tuple(dict.fromkeys(leaf.stage for leaf in leaves(chain) if leaf.stage))
 
 
+def states_of(chain):
+    """Return the states that a chain knows, lists by the column of the table, ``"beam"`` too."""
+    known = {}
+    for column, equals, state in (stage.partition("=") for stage in stages(chain)):
+        if equals:
+            known.setdefault(column, []).append(state)
+    return known
+
+
 def with_beam(chain, beam):
     """
     Return a copy of the chain that follows one beam of its beam splitter.

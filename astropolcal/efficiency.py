@@ -6,6 +6,9 @@ polarization only. The efficiency is the degree of linear polarization that a cy
 half-wave plate measures of a source that is completely polarized (McIntosh et al. 2026, Sec. 7.1):
 of the normalized double differences at 0 and 22.5 deg, downstream of an ideal beam splitter. The
 modulation efficiency of the real one does not enter.
+
+Of any sequence of frames, of any polarimeter, `demodulation` gives the modulation matrix, what
+turns the fluxes into Stokes parameters with the least noise, and the efficiencies of each of these.
 """
 
 from dataclasses import dataclass
@@ -20,9 +23,19 @@ from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.instruments import SkyLaw
 from astropolcal.observations.pointings import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
-from astropolcal.units import angle_to_rad
+from astropolcal.propagation import Propagator
+from astropolcal.simulation import beams_of_frames, stage_positions
+from astropolcal.units import angle_to_rad, canonical_factor, length_to_um
+from astropolcal.words import counted
 
-__all__ = ["BestDerotator", "best_derotator", "polarimetric_efficiency"]
+__all__ = [
+    "BestDerotator",
+    "Demodulation",
+    "best_derotator",
+    "best_modulation",
+    "demodulation",
+    "polarimetric_efficiency",
+]
 
 # plus and minus angles of the half-wave plate, and where a modulator has exchanged the beams
 _CYCLE = [0, 45, 22.5, 67.5] * u.deg
@@ -39,7 +52,11 @@ def sky_path(chain):
     found = leaves(chain)
     # the first optic that treats the two beams differently is the beam splitter
     end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
-    moving = (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES))
+    moving = (
+        i
+        for i, leaf in enumerate(found)
+        if leaf.stage is not None and leaf.stage not in COORDINATES
+    )
     train = list(found[next(moving, end) : end])
     if not train:
         raise ChainError("the chain has no optic on a stage upstream of a beam splitter")
@@ -51,8 +68,12 @@ def sky_path(chain):
 
 def has_derotator(chain):
     """Return whether a chain has a derotator: an optic on a stage that is not the plate's."""
-    angles = set(stages(sky_path(chain))) - {*COORDINATES, *_SKY, "hwp"}
-    return bool(angles)
+    return bool(_turning(sky_path(chain)))
+
+
+def _turning(path):
+    """Return the stages with angles that are neither the plate's nor those of the sky."""
+    return {stage for stage in stages(path) if stage not in COORDINATES} - {*_SKY, "hwp"}
 
 
 def polarimetric_efficiency(
@@ -178,7 +199,7 @@ def _plate_law(path, instrument, mode):
 
 def _derotator_stage(path):
     """Return the stage that turns with the derotator, None where there is none."""
-    angles = set(stages(path)) - {*COORDINATES, *_SKY, "hwp"}
+    angles = _turning(path)
     if "derotator" in angles or not angles:
         return "derotator" if angles else None
     return angles.pop() if len(angles) == 1 else None
@@ -186,7 +207,8 @@ def _derotator_stage(path):
 
 def _positions(path, derotator, altitude, parallactic, law):
     """Return the position of every stage in radian."""
-    wanted, turning = set(stages(path)) - set(COORDINATES), _derotator_stage(path)
+    wanted = {stage for stage in stages(path) if stage not in COORDINATES}
+    turning = _derotator_stage(path)
     found = {"hwp": 0.0}
     if derotator is not None:
         found[turning or "derotator"] = angle_to_rad(derotator, "derotator")
@@ -349,3 +371,238 @@ def best_derotator(
     table["least"] = efficiency.min(axis=(1, 2))
     table["now"] = efficiency[:, 0].min(axis=1)
     return BestDerotator(table["offset"][np.argmax(table[by])], table, law)
+
+
+# ---- modulation of any sequence of frames --------------------------------------------------------
+
+#: Below this a Stokes parameter is not modulated.
+_LEAST = 1e-3
+_COMPONENTS = ("IQU", "IQUV")
+_STARTS = 8
+
+
+@dataclass(frozen=True)
+class Demodulation:
+    r"""
+    How a sequence of frames modulates Stokes parameters, and how these are found again.
+
+    A measurement is one beam of one frame, :math:`I_m = O\,S`; what has least noise is
+    :math:`S = D\,I_m` with the pseudo-inverse :math:`D = (O^T W O)^{-1} O^T W` for the inverse
+    variances W.
+
+    Parameters
+    ----------
+    components : str
+        ``"IQU"`` or ``"IQUV"``.
+    modulation : `~numpy.ndarray`
+        O, shape (n_wavelengths, n_measurements, n_components): right and left beam of each frame
+        in turn, or each single beam; for light of unit intensity.
+    matrix : `~numpy.ndarray`
+        D, shape (n_wavelengths, n_components, n_measurements).
+    efficiency : `~numpy.ndarray`
+        Shape (n_wavelengths, n_components): :math:`\epsilon_i = (n \sum_j D_{ij}^2)^{-1/2}` with
+        the mean of the first column of O as the unit, at best 1 for I and :math:`\sum \epsilon^2
+        = 1` for the others.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.efficiency import Demodulation
+    >>> two = np.array([[[0.5, 0.5], [0.5, -0.5]]])
+    >>> Demodulation("IQ", two, np.linalg.inv(two), np.ones((1, 2))).stokes([[1.5, 0.5]]).tolist()
+    [[2.0, 1.0]]
+    """
+
+    components: str
+    modulation: np.ndarray
+    matrix: np.ndarray
+    efficiency: np.ndarray
+
+    def stokes(self, fluxes):
+        """Return Stokes parameters, (n_wavelengths, n_components), of fluxes (n_wavelengths, n)."""
+        fluxes = np.asarray(fluxes, dtype=float)
+        return np.einsum("wkn,wn->wk", self.matrix, fluxes)
+
+
+def demodulation(chain, wavelength, frames, *, components="IQUV", variance=None):
+    """
+    Return the modulation of a sequence of frames, its optimal demodulation and efficiencies.
+
+    Efficiencies are those of del Toro Iniesta & Collados (2000), Appl. Opt. 39, 1637,
+    doi:10.1364/AO.39.001637.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The optics from the light that is to be measured to the detector, without a source.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    frames : `~astropy.table.QTable`
+        One row a frame with the position or state of every stage, as
+        `~astropolcal.simulation.simulate` takes it.
+    components : {"IQUV", "IQU"}
+        What is solved for; without V it is taken as zero.
+    variance : array_like, optional
+        Of the measurements, relative to each other, (n_measurements,); by default all alike.
+
+    Returns
+    -------
+    Demodulation
+
+    Raises
+    ------
+    ParameterError
+        If an efficiency is below 0.001, or a choice is unknown.
+    ChainError
+        If the position of a stage is missing.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal import optics
+    >>> from astropolcal.efficiency import demodulation
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
+    >>> cycle = QTable({"hwp": [0, 45, 22.5, 67.5] * u.deg})
+    >>> demodulation(chain, [1.6] * u.um, cycle, components="IQU").efficiency.round(3).tolist()
+    [[1.0, 0.707, 0.707]]
+    """
+    if components not in _COMPONENTS:
+        raise ParameterError(f"components = {components!r}; allowed are {', '.join(_COMPONENTS)}")
+    found = _demodulated(_modulation(chain, wavelength, frames), components, variance)
+    weak = ~(found.efficiency >= _LEAST)
+    if weak.any():
+        w, k = np.argwhere(weak)[0]
+        lam = np.atleast_1d(u.Quantity(wavelength))[w]
+        raise ParameterError(
+            f"the efficiency of {components[k]} is {np.nan_to_num(found.efficiency[w, k]):.2g} at "
+            f"{lam:.6g}; {_LEAST:g} is needed: the {counted(len(frames), 'frame')} do not "
+            "modulate it"
+        )
+    return found
+
+
+def _modulation(chain, wavelength, frames):
+    """Return the rows of all measurements, (n_wavelengths, n_measurements, 4)."""
+    names, frames, _ = beams_of_frames(chain, frames, None)
+    lam, positions = length_to_um(wavelength), stage_positions(chain, frames)
+    if not positions:
+        positions = {"frame": np.zeros(len(frames))}
+    light = [Propagator(chain, np.atleast_1d(lam), positions, one) for one in np.eye(4)]
+    # (4, beams, n_wavelengths, n_frames)
+    fluxes = np.stack([one.fluxes()[: len(names)] for one in light])
+    return np.moveaxis(fluxes, (2, 3, 1), (0, 1, 2)).reshape(fluxes.shape[2], -1, 4)
+
+
+def _demodulated(rows, components, variance=None):
+    """Return the demodulation of rows, the efficiency zero where they do not determine it."""
+    rows = rows[..., : len(components)]
+    count = rows.shape[1]
+    variance = np.ones(count) if variance is None else np.asarray(variance, dtype=float)
+    if variance.shape != (count,) or not np.all(np.isfinite(variance) & (variance > 0)):
+        raise ParameterError(
+            f"variance of shape {variance.shape}; {count} numbers above zero are needed"
+        )
+    root = 1 / np.sqrt(variance)
+    # a flux that never comes is no unit
+    unit = np.maximum(rows[..., 0].mean(axis=1), np.finfo(float).tiny)
+    normal = rows / unit[:, None, None]
+    # singular values far below what an efficiency may be
+    matrix = np.linalg.pinv(normal * root[:, None], rcond=_LEAST**2) * root
+    noise = count * np.sum(matrix**2, axis=2)
+    # of a parameter that is not modulated the pseudo-inverse gives only a part
+    told = np.einsum("wkn,wnk->wk", matrix, normal)
+    whole = (np.abs(told - 1) < _LEAST) & (noise > 0)
+    efficiency = np.where(whole, 1 / np.sqrt(np.where(noise > 0, noise, 1.0)), 0.0)
+    return Demodulation(components, rows, matrix / unit[:, None, None], efficiency)
+
+
+def best_modulation(chain, wavelength, frames, free, *, components="IQUV", seed=0):
+    """
+    Find angles, or retardances, with which a sequence modulates Stokes parameters best.
+
+    What is least is the noise of the Stokes parameters but I, the sum of the inverse squares of
+    their efficiencies, over the wavelengths, from several random starts.
+
+    Parameters
+    ----------
+    chain, wavelength, frames, components
+        As for `demodulation`.
+    free : sequence of str
+        Stages whose angles in all frames are free, such as ``"qwp"``, and parameters that are,
+        such as ``"lcvr_A.retardance"``; scalars within their bounds.
+    seed : int
+        Of the starts; the first is as given.
+
+    Returns
+    -------
+    chain : `~astropy.modeling.CompoundModel`
+        A copy with the parameters found.
+    frames : `~astropy.table.QTable`
+        A copy with the angles found, 0 to 180 deg.
+    best : Demodulation
+
+    Raises
+    ------
+    ParameterError
+        If nothing free is known by that name, or no start modulates all.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal import optics
+    >>> from astropolcal.efficiency import best_modulation
+    >>> chain = (optics.LinearRetarder(retardance=132 * u.deg, mount="qwp", name="qwp")
+    ...          | optics.LinearPolarizer(name="analyser"))
+    >>> frames = QTable({"qwp": [-50, -15, 15, 50] * u.deg})
+    >>> best_modulation(chain, [0.6] * u.um, frames, ["qwp"])[2].efficiency.round(2).tolist()
+    [[1.0, 0.58, 0.58, 0.58]]
+    """
+    from scipy.optimize import minimize
+
+    chain, frames, rng = chain.copy(), frames.copy(), np.random.default_rng(seed)
+    settings = [_setting(chain, frames, name) for name in free]
+    sizes = np.cumsum([value.size for value, *_ in settings])[:-1]
+    start = np.concatenate([value for value, *_ in settings]) if settings else np.zeros(0)
+    low, high = (
+        np.concatenate([np.full(v.size, ends[i]) for v, ends, _ in settings]) for i in (0, 1)
+    )
+
+    def noise(values):
+        for (*_, put), own in zip(settings, np.split(values, sizes), strict=True):
+            put(own)
+        found = _demodulated(_modulation(chain, wavelength, frames), components)
+        return float(np.mean(np.sum(1 / np.maximum(found.efficiency[:, 1:], _LEAST) ** 2, axis=1)))
+
+    tried = [start, *rng.uniform(low, high, (_STARTS, start.size))]
+    ends = [minimize(noise, one, bounds=list(zip(low, high, strict=True))) for one in tried]
+    noise(min(ends, key=lambda one: one.fun).x)
+    return chain, frames, demodulation(chain, wavelength, frames, components=components)
+
+
+def _setting(chain, frames, name):
+    """Return value (radian or canonical), ends, and what sets it, of a stage or a parameter."""
+    optic, _, key = name.partition(".")
+    if not key and name in stages(chain) and name not in COORDINATES and name in frames.colnames:
+
+        def turn(values):
+            frames[name] = np.rad2deg(values) % 180 * u.deg
+
+        return angle_to_rad(frames[name], name), (-np.pi, np.pi), turn
+    known = {leaf.name: leaf for leaf in leaves(chain)}
+    if optic not in known or key not in known[optic].param_names:
+        raise ParameterError(
+            f"free = {name!r} is neither a column of frames with the angle of a stage nor "
+            "optic.parameter of the chain"
+        )
+    parameter = getattr(known[optic], key)
+    factor = canonical_factor(parameter.unit)
+    ends = [np.nan if end is None else end * factor for end in parameter.bounds]
+    if parameter.size > 1 or not np.all(np.isfinite(ends)):
+        raise ParameterError(f"free = {name!r} must be one number with bounds")
+
+    def put(values):
+        parameter.value = float(values[0] / factor)
+
+    return np.atleast_1d(parameter.value * factor), tuple(ends), put

@@ -101,7 +101,9 @@ class _Step:
 
 class Propagator:
     """
-    The fluxes that a chain with one beam splitter predicts, and their derivatives.
+    The fluxes that a chain predicts, and their derivatives.
+
+    Without a beam splitter the left beam is dark.
 
     ``wavelength`` in micrometre, ``positions`` of each stage in radian or a number, shape
     (n_columns,); what differs between the beams, such as a flux, may have shape (2, n_wavelengths,
@@ -115,7 +117,10 @@ class Propagator:
         self.wavelength = wavelength
         self.shape = (len(wavelength), _column_count(positions))
         self.source = np.asarray(source, dtype=float).reshape(1, 1, 4)
-        split = next(i for i, leaf in enumerate(self.leaves) if leaf.depends_on_beam)
+        # of a single beam the arm is the last optic that is more than a turn of the frame
+        acting = [i for i, leaf in enumerate(self.leaves) if not leaf.rotates_frame]
+        split = next((i for i in acting if self.leaves[i].depends_on_beam), max(acting, default=-1))
+        beams = ("right", "left") if splits(self.leaves) else ("right",)
         make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
         self._common = make[:split]
         self._arms = [
@@ -123,12 +128,12 @@ class Propagator:
                 _Node(i, _for_beam(leaf, beam), wavelength, positions)
                 for i, leaf in enumerate(self.leaves[split:], start=split)
             ]
-            for beam in ("right", "left")
+            for beam in beams
         ]
         frame = _follow(self._common, 0.0)
         for arm in self._arms:
             _follow(arm, frame)
-        first, other = (arm[0] for arm in self._arms)
+        first, other = self._arms[0][0], self._arms[-1][0]
         same = np.array_equal(first.stage_angle, other.stage_angle)
         self._same_entrance = same and not first.leaf.rotates_frame
         self._meeting = _meeting(self._common, self._arms) if self._same_entrance else None
@@ -149,12 +154,12 @@ class Propagator:
             return Sweep(self, values).fluxes
         common, frame = _at(self._common, values, 0.0)
         arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
-        (right, phase), (left, _) = arms
         # what stands still meets the light of all frames as two rows per wavelength
-        rows, phase = _inward(common[self._meeting :], np.concatenate([right, left], axis=1), phase)
+        rows = np.concatenate([row for row, _ in arms], axis=1)
+        rows, phase = _inward(common[self._meeting :], rows, arms[0][1])
         light, fresh = _behind(common[: self._meeting], self.source, keep=False)
         fluxes = turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
-        return tuple(_whole(fluxes[..., beam], self.shape) for beam in (0, 1))
+        return _both([_whole(fluxes[..., beam], self.shape) for beam in range(len(arms))])
 
     def forward(self, values=None):
         """Carry the light through the chain and keep what derivatives need; return a Sweep."""
@@ -166,9 +171,19 @@ class Propagator:
         return [leaf.values_at(self.wavelength, own) for leaf, own in pairs]
 
 
+def splits(found):
+    """Return whether one of some optics splits the light into two beams."""
+    return any(leaf.splits_light for leaf in found)
+
+
+def _both(fluxes):
+    """Return the fluxes of two beams; of a chain without a splitter the left one is dark."""
+    return tuple(fluxes) if len(fluxes) > 1 else (fluxes[0], np.zeros_like(fluxes[0]))
+
+
 def _check(found, positions, n_wavelengths):
-    if not any(leaf.splits_light for leaf in found):
-        raise ChainError("the chain has no beam splitter, so it predicts no beam fluxes")
+    if all(leaf.rotates_frame for leaf in found):
+        raise ChainError("the chain has no optic that polarizes or splits the light")
     for leaf in found:
         label = f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}"
         if leaf.stage and leaf.stage not in positions:
@@ -226,7 +241,7 @@ class Sweep:
             last, seen = _enter(arm, light, entered=same)
             fluxes.append(_flux(last, seen, propagator.shape))
         #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
-        self.fluxes = tuple(fluxes)
+        self.fluxes = _both(fluxes)
 
     def crossings(self, wanted, weights):
         """
@@ -255,10 +270,12 @@ class Sweep:
         for optic, parameter in wanted:
             by_optic.setdefault(optic, []).append(parameter)
         adjoint, behind = 0.0, []
-        for steps, weight in zip(self._arms, weights, strict=True):
+        # a dark beam has no arm
+        alone = crossings if len(self._arms) == 1 else None
+        for steps, weight in zip(self._arms, weights, strict=False):
             row = np.zeros((*weight.shape, 4))
             row[..., 0] = weight
-            inward, pairs = _back(steps, row, [], by_optic, result)
+            inward, pairs = _back(steps, row, [], by_optic, result, alone)
             adjoint, behind = adjoint + inward, behind + pairs
         _back(self._common, adjoint, behind, by_optic, result, crossings)
         shape = self._propagator.shape

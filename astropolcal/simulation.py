@@ -7,11 +7,12 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import stages
+from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
+from astropolcal.observations.pointings import in_state
 from astropolcal.optics.core import finite_position
-from astropolcal.propagation import Propagator
+from astropolcal.propagation import Propagator, splits
 from astropolcal.units import length_to_um
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
@@ -75,7 +76,8 @@ def simulate(
     Parameters
     ----------
     chain : `~astropy.modeling.CompoundModel`
-        The true chain, with a beam splitter.
+        The true chain. Without a beam splitter there is one beam, or one for each
+        ``mount="beam=NAME"`` of an `~astropolcal.optics.StateAnalyser`.
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     frames : `~astropy.table.QTable`
@@ -125,10 +127,11 @@ def simulate(
     """
     wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
     # for unit source, (n_wavelengths, n_frames)
-    right, left = expected_fluxes(chain, wavelength, frames, source)
+    names, frames, lamp = beams_of_frames(chain, frames, lamp)
+    fluxes = expected_fluxes(chain, wavelength, frames, source)[: len(names)]
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # photons arrive in electrons, whatever a camera counts in
-    electrons = np.stack([right.T * scale, left.T * scale]) * _positive("gain", gain)
+    electrons = np.stack([flux.T * scale for flux in fluxes]) * _positive("gain", gain)
     check_electrons(electrons)
     # of the expectation: an error from the drawn flux would be too small where that is low
     variance = electrons + _positive("read_noise", read_noise, zero=True) ** 2
@@ -137,10 +140,25 @@ def simulate(
         # one read noise a beam and frame, not a pixel
         drawn = rng.poisson(electrons) + rng.normal(0.0, 1.0, electrons.shape) * read_noise
         electrons = drawn.astype(float)
-    table = _table(wavelength, frames, electrons / gain, np.sqrt(variance) / gain)
+    table = _table(wavelength, frames, names, electrons / gain, np.sqrt(variance) / gain)
     # meta that are given go before it
     table.meta = {"simulated": True, **(meta or {})}
     return Observations.from_table(table, name=name)
+
+
+def beams_of_frames(chain, frames, lamp):
+    """Return the columns of the fluxes, and the frames and their lamp, one for each beam."""
+    if splits(leaves(chain)):
+        return ("flux_right", "flux_left"), frames, lamp
+    beams = states_of(chain).get("beam")
+    if not beams or "beam" in frames.colnames:
+        return ("flux",), frames, lamp
+    count = len(beams)
+    repeated = frames[np.repeat(np.arange(len(frames)), count)]
+    if "group" not in frames.colnames:
+        repeated["group"] = np.repeat(np.arange(len(frames)), count)
+    repeated["beam"] = np.tile(beams, len(frames))
+    return ("flux",), repeated, None if lamp is None else np.repeat(lamp, count)
 
 
 def check_seed(seed):
@@ -160,6 +178,18 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     ``frames`` has the position of every stage, one row per frame; a column such as ``hwp_true``
     goes before ``hwp``. ``source`` is the Stokes vector of the light that enters.
     """
+    positions = stage_positions(chain, frames)
+    propagator = Propagator(chain, length_to_um(wavelength), positions, source)
+    shape = (len(wavelength), len(frames))
+    right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
+    # a beam that is extinguished may be below zero by a rounding error
+    if min(right.min(), left.min()) < -_ROUNDING:
+        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
+    return right.clip(0.0), left.clip(0.0)
+
+
+def stage_positions(chain, frames):
+    """Return the position of each stage of a chain that frames have, canonical, (n_frames,)."""
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
     columns = {s: true if true in frames.colnames else s for s, true in known.items()}
@@ -169,13 +199,7 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
         for stage, column in columns.items()
         if column in frames.colnames
     }
-    propagator = Propagator(chain, length_to_um(wavelength), positions, source)
-    shape = (len(wavelength), len(frames))
-    right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
-    # a beam that is extinguished may be below zero by a rounding error
-    if min(right.min(), left.min()) < -_ROUNDING:
-        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
-    return right.clip(0.0), left.clip(0.0)
+    return positions | {s: in_state(frames, s, "frames") for s in known if "=" in s}
 
 
 def _positive(name, value, zero=False):
@@ -218,7 +242,7 @@ def entering_flux(flux, lamp, n_frames, n_wavelengths):
     return lamp[:, None] * np.broadcast_to(flux, (n_wavelengths,))
 
 
-def _table(wavelength, frames, fluxes, errors):
+def _table(wavelength, frames, names, fluxes, errors):
     n_frames, n_wavelengths = fluxes.shape[1:]
     table = QTable()
     table["frame"] = np.repeat(np.arange(n_frames), n_wavelengths)
@@ -227,7 +251,7 @@ def _table(wavelength, frames, fluxes, errors):
     for column in frames.colnames:
         if column != "frame":
             table[column] = np.repeat(frames[column], n_wavelengths)
-    for beam, flux, error in zip(("right", "left"), fluxes, errors, strict=True):
-        table[f"flux_{beam}"] = flux.ravel() * u.adu
-        table[f"flux_{beam}_err"] = error.ravel() * u.adu
+    for name, flux, error in zip(names, fluxes, errors, strict=True):
+        table[name] = flux.ravel() * u.adu
+        table[f"{name}_err"] = error.ravel() * u.adu
     return table

@@ -16,12 +16,25 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_beam
+from astropolcal.chain import (
+    find_optic,
+    leaves,
+    stages,
+    states_of,
+    system_mueller,
+    with_beam,
+)
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import is_physical
 from astropolcal.observations.quality import is_star
-from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
+from astropolcal.optics import (
+    COORDINATES,
+    LinearPolarizer,
+    Optic,
+    PolarizedSource,
+    StateAnalyser,
+)
 from astropolcal.simulation import simulate
 
 __all__ = ["check_instrument"]
@@ -125,6 +138,8 @@ def moved_value(parameter, rng):
 
 # optics behind which nothing is left of what polarization the light had
 _LIGHTS = (LinearPolarizer, PolarizedSource)
+# what tells polarization where no optic splits the light
+_ANALYSERS = (LinearPolarizer, StateAnalyser)
 # columns that every table may have
 _COLUMNS = ("hwp", "derotator", "parallactic", "altitude", "flc_state")
 _CYCLE = np.array([0, 45, 22.5, 67.5, 11.25, 56.25, 33.75, 78.75])
@@ -209,8 +224,11 @@ class Probe:
             odd = [name for name in found if not name.replace("-", "_").isidentifier()]
             require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
             splitters = [leaf.name for leaf in leaves(chain) if leaf.splits_light]
-            words = f"{source}: one optic must split the light, not {splitters}"
-            require(len(splitters) == 1, words)
+            require(len(splitters) < 2, f"{source}: one optic may split the light, not {splitters}")
+            analysers = [o for o in leaves(chain)[1:] if isinstance(o, _ANALYSERS)]
+            require(
+                splitters or analysers, f"{source}: one optic must split the light, or analyse it"
+            )
 
     def check_bounds(self):
         for grid in (None, self.few):
@@ -226,6 +244,10 @@ class Probe:
         for leaf in leaves(chain):
             matrix = system_mueller(leaf, grid, self._positions(leaf))
             require(np.all(is_physical(matrix)), f"{label}: {leaf.name} is not physical")
+        if not any(leaf.splits_light for leaf in leaves(chain)):
+            whole = system_mueller(chain, grid, self._positions(chain))
+            require(np.all(is_physical(whole)), f"{label}: the beam is not physical")
+            return
         for beam in ("right", "left"):
             whole = system_mueller(with_beam(chain, beam), grid, self._positions(chain))
             require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
@@ -248,11 +270,13 @@ class Probe:
         found, inner, names = leaves(sky), leaves(chain), optic_names(sky)
         # what a lamp meets before anything turns belongs to the lamp
         first = next((i for i, leaf in enumerate(inner) if leaf.stage), len(inner))
+        if self.instrument.entrance in (own := [leaf.name for leaf in inner]):
+            first = own.index(self.instrument.entrance)
         left = [leaf.name for leaf in inner[:first] if leaf.name in names]
         require(not left, f"{source}: {', '.join(left)} of the source would be upstream of a star")
-        lights = [leaf.name for leaf in found if isinstance(leaf, _LIGHTS)]
-        require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
         kept = [leaf.name for leaf in inner[first:]]
+        lights = [o.name for o in found if isinstance(o, _LIGHTS) and o.name not in kept]
+        require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
         words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
         require(names[-len(kept) :] == kept, f"{source}: {words}")
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
@@ -351,8 +375,10 @@ class Probe:
                 f"{source}: double differences are off by {off:.2g} from those of the frames; "
                 "do stages stand where its positions say?",
             )
+            left = 1.0 if observations.single_beam else observations.flux_left
+            ratio = observations.flux_right / left
             # an unpolarized lamp may give the same in all frames; one source that varies is enough
-            largest = max(largest, np.ptp(observations.flux_right / observations.flux_left))
+            largest = max(largest, float(np.ptp(ratio) / np.mean(ratio)))
         require(largest > 1e-6, "no source gives fluxes that change with the modulator")
 
     def check_calibrates(self):
@@ -400,6 +426,11 @@ class Probe:
             # both states of a modulator at every position
             frames = frames[np.repeat(np.arange(len(frames)), 2)]
             frames["flc_state"] = np.tile([0, 1], len(frames) // 2)
+        for column, states in states_of(chain).items():
+            # every state of a device at every position; of beams there are all at once
+            if column != "beam":
+                frames = frames[np.repeat(np.arange(len(frames)), len(states))]
+                frames[column] = np.tile(states, len(frames) // len(states))
         settings = {"flux": 1e8, "noise": noise, "seed": self.seed, "meta": meta}
         grid = self.few if grid is None else grid
         return simulate(chain, grid, frames, name=f"simulated {source}", **settings)
@@ -411,7 +442,7 @@ class Probe:
         steps = np.linspace(0, 1, n_cycles).repeat(_CYCLE.size)
         frames = QTable({"hwp": hwp * u.deg, "derotator": (20 + shift + 75 * steps) * u.deg})
         known = {"parallactic": -60 + shift + 100 * steps, "altitude": 40 + shift + 30 * steps}
-        wanted = set(stages(chain)) - {*COORDINATES, "hwp", "derotator"}
+        wanted = {s for s in stages(chain) if s not in COORDINATES} - {"hwp", "derotator"}
         on_sky = bool(wanted & set(known))
         for stage in sorted(wanted | (set(known) if on_sky else set())):
             frames[stage] = known.get(stage, 10 + shift + 60 * steps) * u.deg
@@ -426,7 +457,7 @@ RULES = {
     "documentation": "its class has a docstring, and references say where the values are from",
     "wavelengths": "they are lengths, each positive, finite and another",
     "sources": "a chain is built for each of its sources, and an unknown source is refused",
-    "names": "every optic has a name of its own, and one of them splits the light",
+    "names": "every optic has a name of its own, and at most one of them splits the light",
     "bounds": "starting values are finite, within their bounds and as many as the wavelengths",
     "physical": "every optic is physical, at random positions, and so is the whole",
     "on sky": "a chain from the sky starts with the telescope, and nothing of the source is in it",

@@ -374,10 +374,20 @@ def test_derivatives_are_linear_in_the_weights(random_chain, seed):
 # --- what is refused ------------------------------------------------------------------------
 
 
-def test_chain_without_beam_splitter():
-    for chain in (optics.LinearPolarizer(), optics.BeamGain(), optics.FluxGain()):
-        with pytest.raises(ChainError, match="no beam splitter, so it predicts no beam fluxes"):
-            Propagator(chain, LAM, {})
+def test_chain_without_beam_splitter_has_a_dark_left_beam():
+    turns = {"hwp": np.deg2rad([0.0, 22.5, 45.0])}
+    plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    for source, level in (((1, 0, 0, 0), [0.5] * 3), ((1, 1, 0, 0), [1, 0.5, 0])):
+        for behind in ([], [optics.Rotator(theta=20 * u.deg)]):
+            chain = join([plate, optics.LinearPolarizer(name="analyser"), *behind])
+            light = Propagator(chain, LAM, turns, source)
+            for right, left in (light.fluxes(), light.forward().fluxes):
+                np.testing.assert_allclose(right, [level] * 3, atol=1e-12)
+                assert not left.any()
+    slopes = light.forward().derivatives([(0, 0)], [np.ones((3, 3)), np.ones((3, 3))])
+    np.testing.assert_allclose(slopes[0, 0], [[0, -2, 0]] * 3, atol=1e-12)
+    with pytest.raises(ChainError, match="no optic that polarizes or splits"):
+        Propagator(optics.Rotator(), LAM, {})
 
 
 def test_stage_without_position():

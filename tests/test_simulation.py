@@ -199,9 +199,11 @@ def test_stage_without_position_is_refused(chain, frames):
         simulate(chain, WAVELENGTH, frames)
 
 
-def test_chain_without_beam_splitter_is_refused(frames):
-    with pytest.raises(ChainError, match="beam splitter"):
-        simulate(optics.LinearPolarizer(), 1.6 * u.um, frames)
+def test_chain_without_beam_splitter_has_one_beam(frames):
+    found = simulate(optics.LinearPolarizer(), 1.6 * u.um, frames, flux=100, noise=False)
+    assert found.single_beam
+    np.testing.assert_allclose(found.flux_right, 50)
+    assert {"flux", "flux_err"} < set(found.to_table().colnames)
 
 
 # ---- parts -------------------------------------------------------------------------------

@@ -250,10 +250,15 @@ def from_first_stage(chain, wanted=None):
     found = leaves(chain)
     for i, leaf in enumerate(found):
         on_stage = (
-            leaf.stage not in (None, *COORDINATES) if wanted is None else leaf.stage in wanted
+            leaf.stage is not None and leaf.stage not in COORDINATES
+            if wanted is None
+            else leaf.stage in wanted
         )
         if on_stage:
             return join(found[i:])
+    if wanted is None and any(leaf.stage in COORDINATES for leaf in found):
+        # whatever is in several states is not a source
+        return chain
     raise ChainError("the chain has no optic on a stage; give the chain from the sky")
 
 
@@ -262,7 +267,11 @@ def split_chain(chain):
     found = leaves(chain)
     # up to there it is the telescope or the calibration source
     start = next(
-        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *_TELESCOPE, *COORDINATES)),
+        (
+            i
+            for i, leaf in enumerate(found)
+            if leaf.stage not in (None, *_TELESCOPE) and leaf.stage not in COORDINATES
+        ),
         0,
     )
     return found[:start], found[start:]

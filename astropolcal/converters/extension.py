@@ -52,6 +52,8 @@ OPTIC_MODULES = {
     "PowerLawMirror": "mirrors",
     "Rotator": "retarders",
     "StarSource": "sources",
+    "StateAnalyser": "states",
+    "StateRetarder": "states",
     "StrayLight": "modulated",
     "TwoLayerWaveplate": "retarders",
     "VectorDiattenuator": "polarizers",

@@ -73,7 +73,8 @@ def correct(
         instrumental polarization that the calibration predicts, and takes the instrument for
         ideal in everything else, as `~astropolcal.correction.ideal_chain` makes it; for comparison.
     observable : {"intensity", "single", "double"}, optional
-        What is fitted: the beams, or their single or double differences and sums. The
+        What is fitted: the beams, or their single or double differences and sums. Single beams
+        are fitted by their intensities. The
         last are blind to what is the same in both frames of a pair, such as a gain that differs
         between the beams. By default what the calibration fitted: single differences, or double
         ones. Frames that have no pairs are fitted by their intensities, with a warning; frames
@@ -228,6 +229,9 @@ def _check_choices(mode, weights):
 def _observable(calibration, frames, observable):
     """Return what is fitted, by default what the calibration has fitted, and doubts in words."""
     fitted = getattr(calibration, "settings", {}).get("observable")
+    if frames.groups is not None and frames.pairs is None:
+        # beams that have no partner with which they could be compared
+        observable = observable or "intensity"
     if observable is None and fitted in OBSERVABLES:
         observable = "single" if OBSERVABLES[fitted].frames_per_datum == 1 else "double"
         if observable == "double" and frames.pairs is None:

@@ -33,11 +33,15 @@ class ScienceFrames:
         Shape (n_wavelengths,).
     positions : dict
         Position of every stage of the chain, (n_frames,), or (nodes, n_frames) at the
-        Gauss-Legendre nodes of the exposures; without a unit in radian.
+        Gauss-Legendre nodes of the exposures; without a unit in radian. Of a device with states
+        the state in each frame, under the name of its column.
     pairs : `~numpy.ndarray` or None
         Frames of the pairs of double differences.
     scale : `~numpy.ndarray` or None
         Relative brightness of the frames.
+    groups : `~numpy.ndarray` or None
+        Group of each frame, (n_frames,), where those of a group share their brightness: of single
+        beams, by default all of them, and the beams of an exposure.
     unit : `~astropy.units.UnitBase`
         Of the fluxes.
     north_up : bool
@@ -70,6 +74,7 @@ class ScienceFrames:
     positions: dict
     pairs: np.ndarray | None = None
     scale: np.ndarray | None = None
+    groups: np.ndarray | None = None
     unit: u.UnitBase = u.adu
     north_up: bool = False
     centre: tuple | None = None
@@ -144,7 +149,7 @@ class ScienceFrames:
                 common[inside] = ~missing.any(axis=0)
                 if common.any():
                     fluxes[:, :, w] = self._totals(w, common)[0]
-        return replace(self, scale=frame_brightness(rows, fluxes, **settings))
+        return replace(self, scale=frame_brightness(rows, fluxes, self.groups, **settings))
 
     def _totals(self, w, pixels):
         """Return the light of both beams in some pixels, NaN for none; and which pixels lack."""
@@ -166,9 +171,9 @@ class ScienceFrames:
     def from_arrays(
         cls,
         right,
-        left,
-        wavelength,
-        positions,
+        left=None,
+        wavelength=None,
+        positions=None,
         *,
         variance_right=None,
         variance_left=None,
@@ -188,7 +193,9 @@ class ScienceFrames:
         ----------
         right, left, variance_right, variance_left : array_like
             Images or spectra in memory, mapped from disk, or of dask, and their variances, shape
-            (n_frames, n_wavelengths, ...); NaN where there is none.
+            (n_frames, n_wavelengths, ...); NaN where there is none. Of a single beam ``left`` is
+            None; of several others ``right``, and ``variance_right``, are a dict of the name of
+            each beam to its fluxes: ``positions`` are still those of the exposures.
         names : sequence of str, optional
             What to call the frames.
         batch : int, optional
@@ -213,6 +220,12 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
+        if left is None:
+            given = right, variance_right, positions, settings, names
+            right, variance_right, positions, settings, names = _single(*given)
+            # no light falls where there is no beam, and nothing is learnt from it
+            left = np.broadcast_to(0.0, np.shape(right))
+            variance_left = None if variance_right is None else np.broadcast_to(1.0, left.shape)
         source = ArraySource(right, left, variance_right, variance_left, names, batch)
         if position_angle is not None:
             options = {"centre": centre, "mirrored": mirrored, "order": order}
@@ -342,6 +355,28 @@ class ScienceFrames:
             centre=middle,
             **settings,
         )
+
+
+def _single(fluxes, variances, positions, settings, names):
+    """Return single beams frame by frame, an exposure of several beams as several frames."""
+    if not isinstance(fluxes, dict):
+        n = len(fluxes)
+        return fluxes, variances, positions, {"groups": np.zeros(n, dtype=int)} | settings, names
+    beams, count = list(fluxes), len(fluxes)
+    stacked = [
+        None if each is None else np.stack([each[name] for name in beams], axis=1)
+        for each in (fluxes, variances)
+    ]
+    n = len(stacked[0])
+    flat = [None if a is None else a.reshape(n * count, *a.shape[2:]) for a in stacked]
+    placed = {
+        name: np.repeat(value, count, axis=-1) if np.ndim(value) else value
+        for name, value in positions.items()
+    }
+    placed["beam"] = np.tile(beams, n)
+    names = [f"frame {i}" for i in range(n)] if names is None else names
+    names = [f"{name}, beam {beam}" for name in names for beam in beams]
+    return *flat, placed, {"groups": np.repeat(np.arange(n), count)} | settings, names
 
 
 def _circle(shape):

@@ -20,6 +20,7 @@ from astropolcal.exceptions import (
     ChainError,
     WavelengthRangeError,
 )
+from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
@@ -170,6 +171,10 @@ def _placed(positions, wanted):
     """Return the positions of all columns in canonical floats, and the weights of the nodes."""
     placed = {}
     for name in wanted:
+        column, _, state = name.partition("=")
+        if name not in positions and state and column in positions:
+            placed[name] = (plain_states(np.atleast_1d(positions[column])) == state).astype(float)
+            continue
         if name not in positions:
             raise ChainError(
                 f"no position of {name!r}, which the chain needs; there is "

@@ -334,19 +334,25 @@ def _refuse_undetermined(found, labels):
 _STEPS, _SETTLED = 50, 1e-13
 
 
-def frame_brightness(rows, fluxes, **settings):
+def frame_brightness(rows, fluxes, groups=None, **settings):
     """
     Return the relative brightness of frames, (n_wavelengths, n_frames), of mean one.
 
     ``fluxes`` are those of the whole image of each beam, (2, n_frames, n_wavelengths), NaN where
     there is none, which gives one; the settings are those of `estimator`. The sum of both beams
     follows the light that enters, but also, by a little, its polarization: brightness and Stokes
-    parameters are found in turn until they settle.
+    parameters are found in turn until they settle. Frames of one of the ``groups``, (n_frames,),
+    share their brightness.
     """
     fluxes = np.asarray(fluxes, dtype=float)
+    member = np.eye(fluxes.shape[1])
+    if groups is not None:
+        kinds = np.unique(groups, return_inverse=True)[1]
+        member = np.equal.outer(kinds, kinds).astype(float)
     # shape (n_wavelengths, n_frames), as the scale of an estimator
     totals = fluxes.sum(axis=0).T
     missing = np.isnan(totals)
+    totals = np.where(missing, np.nan, np.nan_to_num(totals) @ member)
     dark = ~(totals > 0) & ~missing
     if dark.any():
         wavelength, frame = np.argwhere(dark)[0]
@@ -366,6 +372,7 @@ def frame_brightness(rows, fluxes, **settings):
         stokes = estimator(rows, scale=scale, **settings).apply(fluxes)
         # the light of an undetermined component is not known, and small
         expected = np.einsum("bwfs,sw->wf", rows[..., : len(stokes)], np.nan_to_num(stokes))
+        expected = np.where(missing, 0.0, expected) @ member
         expected[unknown] = 1.0
         if not np.all(expected[~missing] > 0):
             break

@@ -13,6 +13,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.gap.problem import OPEN, TOUCHES
 from astropolcal.measurement import Measurement
+from astropolcal.observations.observables import default_observable
 from astropolcal.optics import Perturbation
 
 ACCURACIES = ("s_res", "s_mean", "s_cv")
@@ -223,7 +224,7 @@ def accuracies(model, cross_validate=True):
     """
     instrument = next((o.instrument for o in model.observations if o.instrument), None)
     found = {
-        "observable": "normalized_double_difference",
+        "observable": default_observable(model.observations),
         "wavelength_nm": _number(1e3 * model.problem.wavelength),
         "rms_percent": None,
         "datasets": [],

@@ -351,7 +351,8 @@ def _how_large(content):
         return f"{percent(before)} %{more} (noise {percent(noise)} %)"
 
     keys, double = ("before_percent", "after_percent"), content["double_difference"]
-    text = "In single differences the model is off by "
+    single = content["accuracy_before"]["observable"] == "intensity"
+    text = f"In {'intensities' if single else 'single differences'} the model is off by "
     if double:
         text = "In double differences, which calibrate fits, the model is off by "
         text += f"{gaps(*(double[key] for key in keys), double['noise_percent'])}; "

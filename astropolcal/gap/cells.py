@@ -166,6 +166,7 @@ def _pattern(text):
             f" that changes {times.get(parts[-1], parts[-1] + ' times')} in a turn of the {stage}"
         ),
         "direction": lambda: f" that depends on the direction of the last move of the {stage}",
+        "state": lambda: f" where {' is '.join(stage.split('='))}",
         "move": lambda: f" that grows with the last move of the {stage}",
     }.get(parts[0], lambda: "")()
 
@@ -205,9 +206,11 @@ class Place:
 def places(chain):
     """Return the places of a chain, in the order in which the light meets them."""
     found = [o for o in leaves(chain) if not (o.name or "").startswith("gap_")]
-    split = next(i for i, o in enumerate(found) if o.splits_light)
+    # a chain of one beam ends with its last optic
+    split = next((i for i, o in enumerate(found) if o.splits_light), len(found))
     found = found[: split + 1]
     turning = [o for o in found if o.stage is not None and o.stage not in COORDINATES]
+    turning = [o for o in turning if not o.splits_light]
     first = turning[0] if turning else found[-1]
     out = [Place("source", before=first.name)] if found[0] is not first else []
     own = [o for o in turning if o.stage not in _SKY and not o.rotates_frame]
@@ -242,10 +245,14 @@ def dependences(problem, most_steps=_MOST_STEPS):
         stage
         for dataset in problem.datasets
         for stage in dataset._given
-        if stage not in (*COORDINATES, *_SKY)
+        if stage not in COORDINATES and stage not in _SKY
     )
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
+    names += [
+        f"state:{stage}"
+        for stage in dict.fromkeys(s for d in problem.datasets for s in d._given if "=" in s)
+    ]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
@@ -487,9 +494,11 @@ class Probes:
         fluxes = self.problem.fluxes[i]
         if fluxes is None:
             return
-        usual = np.median(fluxes)
+        single = channel.groups is not None
+        # half the usual flux of both beams, whether both have light or one
+        usual = np.median(fluxes[0]) / 2 if single else np.median(fluxes)
         # light that is added counts as much as the source gives in the frame, in these units
-        added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
+        added = (1 + single) * usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")
         # the first frame has none before it, and its own counts, as in a chain
         before = fluxes.copy()
@@ -504,6 +513,8 @@ class Probes:
             "crosstalk": (half, -half),
         }
         for kind, (one, other) in changes.items():
+            if single and kind not in ("background", "nonlinearity"):
+                continue
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)
 

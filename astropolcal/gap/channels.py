@@ -9,12 +9,17 @@ lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
 The lamp is common to all wavelengths of a frame: its drift is a smooth curve
 through the run and its flicker a random shift of all wavelengths of a frame
 together, so that neither counts as a gap.
+
+A single beam has the sum only, and of the lamp nothing is known but that the frames of a group
+share its brightness, a number for each wavelength.
 """
+
+from types import SimpleNamespace
 
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import orthonormal
-from astropolcal.calibration.noise.estimates import by_state
+from astropolcal.calibration.noise.estimates import by_state, frame_noise
 
 __all__ = []
 
@@ -24,6 +29,8 @@ _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
 # a flicker below this is not told to what depends on the flux
 _LARGE_FLICKER = 0.1
+# a single beam of fewer standard deviations than this is no datum
+_FAINT = 5.0
 
 
 class Channels:
@@ -45,7 +52,15 @@ class Channels:
                     (var_right + var_left + 2 * cov) / total**2,
                 ]
             )
-        self.valid = dataset.valid & np.isfinite(self.observed).all(axis=0)
+        #: Index of the channel that tells the gap, and how many channels have data.
+        self.told, self.count = (1, 1) if obs.single_beam else (0, 2)
+        self.groups = obs.brightness_groups if obs.single_beam else None
+        usable = ~obs.mask.T if obs.single_beam else dataset.valid
+        self.valid = usable & np.isfinite(self.observed).all(axis=0)
+        if obs.single_beam:
+            # the logarithm of a flux within its noise is none; the differences are 1, and told
+            self.valid &= ~(self.variance[1] > _FAINT**-2)
+            self.variance[0] = 1.0
         self.observed = np.where(self.valid, self.observed, 0.0)
         #: Whether the table states errors.
         self.stated = bool(np.any(np.isfinite(self.variance) & (self.variance > 0) & self.valid))
@@ -86,12 +101,21 @@ class Channels:
         """
         weight = np.where(self.valid, 1 / sigma, 0.0)
         self.sigma = sigma
-        self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        if self.groups is None:
+            self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        else:
+            self.lamp, weight[0] = _GroupLamp(self.groups), 0.0
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
         design = self._sum_whitened(self.lamp.design(self.valid))
         #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
-        self.nuisance = orthonormal(design.reshape(len(design), -1).T)
+        design = design.reshape(len(design), -1)
+        if self.groups is None:
+            self.nuisance = orthonormal(design.T)
+        else:
+            # no two groups have a datum in common
+            norm = np.linalg.norm(design, axis=1, keepdims=True)
+            self.nuisance = (design / np.where(norm > 0, norm, 1.0))[norm[:, 0] > 0].T
 
     def whiten(self, array):
         """Divide residuals or derivatives, (..., 2, W, F), by the noise and take the lamp out."""
@@ -109,6 +133,13 @@ class Channels:
         out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
         return out
 
+    def gap(self, residual):
+        """Return what of residuals (2, W, F) is a gap: differences, or sums less their lamp."""
+        if self.groups is None:
+            return residual[0]
+        level, weight = residual[1], self.valid / np.square(self.sigma[1])
+        return np.where(self.valid, level - self.lamp.mean(level, weight), 0.0)
+
     def _sum_whitened(self, array):
         weight, (direction, shrink) = self._whitening[0][1], self._whitening[1]
         scaled = array * weight
@@ -119,6 +150,11 @@ class Channels:
     def n_nuisance(self):
         """Number of numbers that describe the lamp."""
         return self.nuisance.shape[1]
+
+    @property
+    def n_data(self):
+        """Number of data, less the numbers that describe the lamp."""
+        return self.count * int(self.valid.sum()) - self.n_nuisance
 
 
 class _Lamp:
@@ -189,6 +225,31 @@ class _Lamp:
         return np.concatenate([own.reshape(-1, *valid.shape), common]) * valid
 
 
+class _GroupLamp(_Lamp):
+    """Brightness of the frames of a single beam: one number for each group and wavelength."""
+
+    flicker, degree, color = 0.0, 0, 0
+
+    def __init__(self, groups):
+        self.groups = groups
+        # (F, n_groups)
+        self.member = np.eye(groups.max() + 1)[groups]
+
+    def mean(self, values, weight):
+        """Return the mean of (..., F) over the group of each frame."""
+        total = (weight @ self.member) @ self.member.T
+        return ((values * weight) @ self.member @ self.member.T) / np.where(total > 0, total, 1.0)
+
+    def brightness(self, shift, weight):
+        """Return the brightness of each frame, that of its group, (F,)."""
+        return self.mean(shift, weight)
+
+    def design(self, valid):
+        """Return the columns of the lamp, shape (k, W, F)."""
+        own = np.eye(len(valid))[:, None, :, None] * self.member.T[None, :, None, :]
+        return own.reshape(-1, *valid.shape) * valid
+
+
 def _mean(values, weight, axis):
     norm = (weight**2).sum(axis=axis)
     return (values * weight**2).sum(axis=axis) / np.where(norm > 0, norm, 1.0)
@@ -242,6 +303,17 @@ def settings(angles, n):
     columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
     columns = by_state(columns, angles)[: n // 6]
     return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
+
+
+def noise(channel, residual, angles):
+    """Return the noise of every datum, see `frame_noise`; of a single beam less its groups."""
+    if channel.groups is None:
+        return frame_noise(channel, residual, angles)
+    lamp = _GroupLamp(channel.groups)
+    level = residual[1] - lamp.mean(residual[1], channel.valid * 1.0)
+    sums = SimpleNamespace(variance=channel.variance[1:], valid=channel.valid)
+    (sigma,) = frame_noise(sums, np.where(channel.valid, level, 0.0)[None], angles)
+    return np.stack([np.ones_like(sigma), sigma])
 
 
 def expected_fluxes(channel, sweep):

@@ -157,8 +157,8 @@ class Diagnosis:
 
     @property
     def noise_floor_percent(self):
-        """Noise of a normalized single difference, root mean square, in percent."""
-        parts = [c.sigma[0][c.valid] for c in self.nominal.problem.channels]
+        """Noise of a normalized single difference, or a single beam, rms, in percent."""
+        parts = [c.sigma[c.told][c.valid] for c in self.nominal.problem.channels]
         return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     @property
@@ -195,7 +195,7 @@ class Diagnosis:
 def _gap_of_fit(model):
     """Return the root mean square of the differences' residuals, in percent."""
     gaps = model.problem.differences(model.fit.coefficients)
-    parts = [g[0][c.valid] for g, c in zip(gaps, model.problem.channels, strict=True)]
+    parts = [c.gap(g)[c.valid] for g, c in zip(gaps, model.problem.channels, strict=True)]
     return 100 * float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
 
 
@@ -322,8 +322,8 @@ def _nested(base, smooth, groups, say, cells):
         gaps = whole.problem.differences(start.coefficients)
         for channel, gap, here in zip(problem.channels, gaps, seen, strict=True):
             mine = channel.valid & here
-            squares[k] += np.sum(gap[0][mine] ** 2)
-            whitened[k] += np.sum(channel.whiten(gap)[:, mine] ** 2) / 2
+            squares[k] += np.sum(channel.gap(gap)[mine] ** 2)
+            whitened[k] += np.sum(channel.whiten(gap)[:, mine] ** 2) / channel.count
             counts[k] += mine.sum()
     keep = counts > 0
     labels = [label for label, there in zip(labels, keep, strict=True) if there]

@@ -90,8 +90,10 @@ def suspect_frames(model):
     Those of which only the lamp is off come last. There are none where no frame stands out, or so
     many that the model is at fault and not the frames. Where an optic is missing from the model
     everywhere, a small fault of one frame cannot be distinguished from it: look again once the
-    optic is in.
+    optic is in. A single beam accuses no frame, as others of its group would have to tell.
     """
+    if any(channel.groups is not None for channel in model.problem.channels):
+        return []
     search = Search(model)
     accused, last = search.accused()
     found = _Hearing(search).faults(accused, last) if accused else []

@@ -608,7 +608,7 @@ def _by_wavelength(problem, coefficients):
     total, count = np.zeros((2, len(problem.wavelength)))
     for (channel, dataset), rows in zip(_datasets(problem), problem.segments, strict=True):
         total[dataset.bins] += square[rows].reshape(channel.shape).sum(axis=(0, 2))
-        count[dataset.bins] += 2 * channel.valid.sum(axis=1)
+        count[dataset.bins] += channel.count * channel.valid.sum(axis=1)
     return total / np.maximum(count, 1)
 
 

@@ -139,7 +139,7 @@ def exposures(model, *, flux_matters=False):
     found, trains = [], model.trains
     polarized = [Roles(train).polarizer is not None for train in trains]
     for i, (train, observations) in enumerate(zip(trains, model.observations, strict=True)):
-        if "hwp" not in observations.frames.colnames:
+        if "hwp" not in observations.frames.colnames or observations.single_beam:
             continue
         run = _run(i, train, observations)
         # of several datasets it has to be said whose source and lamp it is
@@ -163,7 +163,7 @@ def _run(i, train, observations):
     states, take = (), np.ones(observations.n_frames, dtype=bool)
     if MODULATOR in stages(train):
         states, take = STATES, observations.position(MODULATOR) < 0.5
-    names = [s for s in stages(train) if s not in (*COORDINATES, "hwp")]
+    names = [s for s in stages(train) if s not in COORDINATES and s != "hwp"]
     known = set(observations.frames.colnames)
     where = {
         name: tuple(np.round(np.rad2deg(observations.position(name)[take]), 6)[:_LONGEST])
@@ -327,7 +327,7 @@ def _repetitions(diagnosis):
     worst = max(
         range(len(problem.segments)), key=lambda i: float(np.mean(squares[problem.segments[i]]))
     )
-    n = 2 * int(problem.channels[worst].valid.sum())
+    n = problem.channels[worst].count * int(problem.channels[worst].valid.sum())
     excess = float(np.sum(squares[problem.segments[worst]])) / n
     # the scatter of repetitions has a variance that is known to this share
     gain = np.log(max(excess, 1.0)) / np.sqrt(2 / n + 2 / (n * (_REPEATS - 1)))

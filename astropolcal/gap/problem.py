@@ -12,9 +12,8 @@ import numpy as np
 from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
-from astropolcal.calibration.noise.estimates import frame_noise
 from astropolcal.chain import Train, leaves
-from astropolcal.gap.channels import Channels, expected_fluxes, orthonormal, settings
+from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
@@ -99,10 +98,11 @@ class GapProblem:
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
+        single = all(each.single_beam for each in observations)
         self.measurement = Measurement(
             chains,
             observations,
-            observable="normalized_single_difference",
+            observable="intensity" if single else "normalized_single_difference",
             ties=ties,
             copy=copy,
             positions=[
@@ -272,7 +272,7 @@ class GapProblem:
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
-            channel.set_noise(frame_noise(channel, residual, angles), residual, saturating)
+            channel.set_noise(noise(channel, residual, angles), residual, saturating)
         self.fluxes = [
             expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)
@@ -381,7 +381,7 @@ class GapProblem:
     def n_data(self):
         """Number of rows that hold data, less the numbers that describe the lamps."""
         known = int(np.count_nonzero(self._holds.any(axis=1)))
-        return known + sum(2 * int(c.valid.sum()) - c.n_nuisance for c in self.channels)
+        return known + sum(channel.n_data for channel in self.channels)
 
     def decomposed(self, coefficients):
         """
@@ -479,7 +479,7 @@ def _positions(chain, observations, fluxes):
     expected = {
         "flux": fluxes,
         "total_flux": np.stack([fluxes.sum(axis=0)] * 2),
-        "previous_flux": fluxes / before,
+        "previous_flux": np.divide(fluxes, before, out=np.ones_like(fluxes), where=before > 0),
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
 

@@ -127,9 +127,9 @@ def held_out(model, groups):
             numbers, problem.channels, problem.differences(fit.coefficients), strict=True
         ):
             seen = channel.valid & (number == i)
-            squares[i] += np.sum(gap[0][seen] ** 2)
-            # two channels a datum: half, so that noise gives 1 a datum
-            whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / 2
+            squares[i] += np.sum(channel.gap(gap)[seen] ** 2)
+            # mostly two channels a datum: half, so that noise gives 1 a datum
+            whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / channel.count
             counts[i] += seen.sum()
     keep = counts > 0
     labels = [label for label, here in zip(labels, keep, strict=True) if here]
@@ -159,7 +159,7 @@ def foreseen(model, groups):
             rows.append(here)
             # whitened differences are divided by their noise; sums have none of their own here
             size = np.zeros(shape)
-            size[0] = channel.sigma[0]
+            size[channel.told] = channel.sigma[channel.told]
             scale.append(size[seen])
             counts[i] += seen[0].sum()
         rows, scale = np.concatenate(rows), np.concatenate(scale)
@@ -170,7 +170,7 @@ def foreseen(model, groups):
         lever = np.clip(lever, 0.0, _MOST_LEVER)
         gap = residual[rows] + left @ ((lever / (1 - lever)) * (left.T @ residual[rows]))
         squares[i] = np.sum((gap * scale) ** 2)
-        whitened[i] = np.sum(gap**2) / 2
+        whitened[i] = np.sum(gap**2) / problem.channels[0].count
     keep = counts > 0
     labels = [label for label, here in zip(labels, keep, strict=True) if here]
     return HeldOut(labels, squares[keep], whitened[keep], counts[keep])

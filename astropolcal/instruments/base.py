@@ -287,6 +287,9 @@ class Instrument(ABC):
         How the instrument's FITS files look; None if they cannot be reduced here.
     references : tuple of str
         Where the values come from.
+    entrance : str
+        The first optic behind the internal source, which a star's light meets behind the
+        telescope.
     sky_law : SkyLaw
         How half-wave plate and derotator follow the sky.
     sky_options : tuple of str
@@ -325,6 +328,7 @@ class Instrument(ABC):
     files = None
     references = ()
     sky_options = ()
+    entrance = "hwp"
     max_age = 365 * u.day
     changes = ()
 
@@ -535,7 +539,7 @@ class Instrument(ABC):
         chain = without_nuisance(chain)
         if "parallactic" in stages(chain):
             return chain
-        behind = behind_telescope(chain, self.name)
+        behind = behind_telescope(chain, self)
         return join([*self.telescope_optics(behind, **options), *behind])
 
     def _check_options(self, options):

@@ -238,16 +238,15 @@ def _check_standard(source, target):
         )
 
 
-def behind_telescope(chain, name):
-    """
-    Return the optics of a chain from ``hwp`` on.
-
-    The name of the instrument is for the message.
-    """
+def behind_telescope(chain, instrument):
+    """Return the optics of a chain of an instrument from its entrance on, such as ``hwp``."""
     found = leaves(chain)
-    start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
+    start = next((i for i, leaf in enumerate(found) if leaf.name == instrument.entrance), None)
     if start is None:
-        raise ChainError(f"{name}: the chain has no optic 'hwp' to put the telescope before")
+        raise ChainError(
+            f"{instrument.name}: the chain has no optic {instrument.entrance!r} to put the "
+            "telescope before"
+        )
     return found[start:]
 
 

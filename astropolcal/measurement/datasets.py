@@ -8,11 +8,12 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal import instruments
-from astropolcal.chain import leaves, stages
+from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
+from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
-from astropolcal.propagation import Propagator
+from astropolcal.propagation import Propagator, splits
 
 __all__ = []
 
@@ -40,6 +41,7 @@ class Dataset:
     """
 
     def __init__(self, chain, observations, observable, free, wavelength, positions=None):
+        _check_fit(chain, observations, observable)
         self.observations = observations
         self.observable = observable
         self.n_free = free.size
@@ -99,8 +101,10 @@ class Dataset:
         ]
         # one masked frame spoils the whole difference
         bad = self._grouped(obs.mask[columns].T).any(axis=0)
+        groups = obs.brightness_groups[self.frames[:, 0]]
+        self.observable = self.observable.of(right[0], errors[0][0], ~bad, groups)
         #: True where a group of frames gives a datum, (n_wavelengths, n_groups).
-        self.valid = ~bad
+        self.valid = ~bad & getattr(self.observable, "valid", True)
         # what is masked may be zero or NaN; it is dropped by the index, not by the arithmetic
         with np.errstate(invalid="ignore", divide="ignore"):
             self.observed = self.observable.evaluate(right, left)[self.valid]
@@ -201,13 +205,50 @@ class Dataset:
                 out[where, each] += slope
             else:
                 out[where] += slope
+        out = self.observable.gathered(out, right, left)
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
+
+
+def _check_fit(chain, observations, observable):
+    """Refuse a table whose beams or states are not those of the chain."""
+    name, split = observations.name, splits(leaves(chain))
+    if split == observations.single_beam:
+        has, needs = ("one beam", "two") if split else ("two beams", "one")
+        raise ObservationError(
+            f"{name}: the table has {has} a frame, the chain {needs}; "
+            + ("flux_right and flux_left" if split else "flux, or flux_NAME for each beam,")
+            + " are needed"
+        )
+    if observations.single_beam != (observable.name == "intensity"):
+        words = ("one beam", "intensity") if observations.single_beam else ("two beams", "another")
+        raise ObservationError(
+            f"{name}: observable {observable.name} of {words[0]} a frame; allowed is {words[1]}"
+        )
+    for column, states in states_of(chain).items():
+        # a column that is missing is named where its positions are read
+        found = observations.frames.columns.get(column, [])
+        strange = sorted(set(plain_states(found)) - set(states))
+        if strange:
+            raise ObservationError(
+                f"{name}: {column} = {', '.join(strange)} in the table; the chain knows "
+                f"{', '.join(states)}"
+            )
 
 
 def _positions(chain, observations, positions):
     if positions is None:
         positions = _reader(observations)(observations, chain)
-    return {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}
+    found = {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}
+    used = ~observations.mask.all(axis=1)
+    for stage, angle in found.items():
+        lost = used & ~np.isfinite(angle).reshape(-1, observations.n_frames).all(axis=0)
+        if lost.any():
+            frame = observations.frames["frame"][np.argmax(lost)]
+            raise ObservationError(
+                f"{observations.name}, frame {frame}: {stage} is not known; a finite number is "
+                "needed"
+            )
+    return found
 
 
 def _reader(observations):

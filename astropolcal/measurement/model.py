@@ -18,7 +18,7 @@ from astropy.modeling import FittableModel, Parameter
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations.observables import get_observable
+from astropolcal.observations.observables import default_observable, get_observable
 from astropolcal.observations.reading import common_wavelengths
 from astropolcal.optics._modelling import LinearlyTied, with_own_scalars, without_units
 from astropolcal.units import to_unit
@@ -40,8 +40,10 @@ class Measurement(FittableModel):
         The chain of each dataset. Optics of the same name are the same optic.
     observations : Observations or sequence of Observations
         The datasets.
-    observable : str or Observable
-        What is compared; see `astropolcal.observations.OBSERVABLES`.
+    observable : str or Observable, optional
+        What is compared; see `astropolcal.observations.OBSERVABLES`. By default normalized double
+        differences, of tables without a column ``hwp`` single ones, and of single beams the
+        intensity.
     positions : sequence of dict, optional
         For each dataset the position of every stage in radian, shape
         (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of each
@@ -98,7 +100,7 @@ class Measurement(FittableModel):
         chain,
         observations,
         *,
-        observable="normalized_double_difference",
+        observable=None,
         positions=None,
         ties=None,
         wavelength=None,
@@ -110,6 +112,8 @@ class Measurement(FittableModel):
             pairs = [(item.copy(), obs, position) for item, obs, position in pairs]
         self._chains = [item for item, _, _ in pairs]
         self._chains_are_shared = self._fitted = False
+        if observable is None:
+            observable = default_observable([obs for _, obs, _ in pairs])
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
         self.free = FreeParameters(self._chains, len(self.wavelength), ties)

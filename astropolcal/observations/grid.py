@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table, vstack
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
@@ -26,14 +26,17 @@ BEAM_ERRORS = ("flux_right_err", "flux_left_err")
 SINGLE_ERRORS = ("single_difference_err", "single_sum_err")
 """Columns with the standard deviations of R - L and R + L."""
 
-REQUIRED = ("frame", "bin", "wavelength", "hwp", "derotator", "flux_right", "flux_left")
+REQUIRED = ("frame", "bin", "wavelength")
+BEAMS = ("flux_right", "flux_left")
+"""Columns of two beams; of one beam at a time it is ``flux``."""
 CELL_COLUMNS = (
     "bin",
     "wavelength",
-    "flux_right",
-    "flux_left",
+    *BEAMS,
     *BEAM_ERRORS,
     *SINGLE_ERRORS,
+    "flux",
+    "flux_err",
     "mask_reason",
 )
 _ANGLES = ("hwp", "derotator", "parallactic", "altitude")
@@ -58,7 +61,7 @@ class Grid:
     bin: np.ndarray
     wavelength: u.Quantity
     flux_unit: u.UnitBase
-    # (F, W), NaN where masked
+    # (F, W), NaN where masked; of one beam at a time the left one is zero
     flux_right: np.ndarray
     flux_left: np.ndarray
     # error columns as given, (F, W) each; empty if there are none
@@ -66,6 +69,8 @@ class Grid:
     # (F, W): 0 usable, else 1 + index in ``reasons``
     reason: np.ndarray
     reasons: tuple
+    # whether a frame has one beam only
+    single: bool = False
 
 
 def build_grid(table, label):
@@ -74,7 +79,11 @@ def build_grid(table, label):
 
     ``label`` is the file or name for messages. Cells that are masked give one warning per reason.
     """
-    table = check_table(table, label, REQUIRED)
+    if isinstance(table, Table) and len(table):
+        table = beams_as_frames(check_table(table, label, ()), label)
+    there = set(getattr(table, "colnames", ()))
+    single = "flux" in there and not there & {*BEAMS}
+    table = check_table(table, label, (*REQUIRED, "flux") if single else (*REQUIRED, *BEAMS))
     frame = _integers(table, "frame", label)
     bins = _integers(table, "bin", label)
     wavelength = _wavelengths(table, label)
@@ -89,7 +98,7 @@ def build_grid(table, label):
     by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
     frames = _frame_table(table, frame_numbers, first, frame_index, angles, label)
 
-    flux_unit, values = _measured(table, label)
+    flux_unit, values = _measured(table, label, ("flux",) if single else BEAMS)
     code, reasons = mask_rows(table, values, label)
     # -1: no row has spoken for this cell yet
     reason = np.full(shape, -1)
@@ -111,12 +120,51 @@ def build_grid(table, label):
         bin=bin_numbers,
         wavelength=by_bin,
         flux_unit=flux_unit,
-        flux_right=arrays.pop("flux_right"),
-        flux_left=arrays.pop("flux_left"),
+        flux_right=(right := arrays.pop("flux" if single else "flux_right")),
+        flux_left=np.where(np.isnan(right), np.nan, 0.0) if single else arrays.pop("flux_left"),
         errors=arrays,
         reason=reason,
         reasons=tuple(reasons),
+        single=single,
     )
+
+
+def beams_as_frames(table, label):
+    """
+    Return a table with columns ``flux_NAME`` of other beams as one of a single ``flux``.
+
+    Each beam of a frame becomes a frame with its name in the column ``beam``; those of an exposure
+    have its number in ``group``, as they share the brightness of the source.
+    """
+    if {"flux", *BEAMS} & set(table.colnames):
+        return table
+    named = [name for name in table.colnames if name.startswith("flux_")]
+    beams = [name for name in named if not name.endswith("_err")]
+    # what is missing then is named together
+    if not beams or not set(REQUIRED) <= set(table.colnames):
+        return table
+    errors = [f"{name}_err" for name in beams]
+    lacking = [name for name in errors if name not in named]
+    if 0 < len(lacking) < len(beams):
+        raise ObservationError(f"{label}: missing column {', '.join(lacking)}")
+    if len(beams) > 1 and "beam" in table.colnames:
+        raise ObservationError(
+            f"{label}: columns beam and {', '.join(beams)}; one of both tells the beam"
+        )
+    frame, count = _integers(table, "frame", label), len(beams)
+    parts = []
+    for number, name in enumerate(beams):
+        part = table.copy()
+        part.remove_columns([one for one in named if one in beams or one in errors])
+        part["flux"] = table[name]
+        if not lacking:
+            part["flux_err"] = table[f"{name}_err"]
+        if count > 1:
+            part["frame"] = frame * count + number
+            part["beam"] = name.removeprefix("flux_")
+            part["group"] = part["group"] if "group" in part.colnames else frame
+        parts.append(part)
+    return vstack(parts, metadata_conflicts="silent")
 
 
 def _integers(table, name, label):
@@ -236,25 +284,27 @@ def _filled(comparison):
     return np.array(np.ma.getdata(plain), dtype=bool) & ~mask
 
 
-def _measured(table, label):
+def _measured(table, label, beams):
     """Return the unit of the fluxes, and fluxes and errors in it, by name."""
-    flux_unit = table["flux_right"].unit if hasattr(table["flux_right"], "unit") else None
+    flux_unit = getattr(table[beams[0]], "unit", None)
     flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
     if not isinstance(flux_unit, u.UnitBase) or isinstance(flux_unit, u.UnrecognizedUnit):
         raise ObservationError(
-            f"{label}: column flux_right has unit {flux_unit}, a linear unit such as adu is needed"
+            f"{label}: column {beams[0]} has unit {flux_unit}, a linear unit such as adu is needed"
         )
     # the right beam sets the unit; the left one and the errors are converted
-    names = ["flux_right", "flux_left", *_error_columns(table, label)]
-    values = {name: numeric_column(table, name, label, flux_unit) for name in names}
-    for name in names[2:]:
+    errors = _error_columns(table, label, beams)
+    values = {name: numeric_column(table, name, label, flux_unit) for name in (*beams, *errors)}
+    for name in errors:
         first_bad_row(values[name] < 0, name, values[name], label, "errors above zero")
     return flux_unit, values
 
 
-def _error_columns(table, label):
-    """Return the pair of error columns to use: of the beams, of the single differences, or none."""
+def _error_columns(table, label, beams):
+    """Return the error columns to use: of the beams, of the single differences, or none."""
     found = ()
+    if beams != BEAMS:
+        return ("flux_err",) if "flux_err" in table.colnames else found
     for pair in (BEAM_ERRORS, SINGLE_ERRORS):
         there = [name for name in pair if name in table.colnames]
         if len(there) == 1:
@@ -296,8 +346,9 @@ def mask_rows(table, values, label):
 
 def _complaints(values):
     """Yield what may be wrong with single rows: columns, bad rows, reason."""
-    names = list(values)
-    for kind, pair in (("flux", names[:2]), ("error", names[2:])):
+    errors = [name for name in values if name.endswith("_err")]
+    fluxes = [name for name in values if name not in errors]
+    for kind, pair in (("flux", fluxes), ("error", errors)):
         if pair:
             both = np.array([values[name] for name in pair])
             # NaN compares as false and is lost too
@@ -363,6 +414,9 @@ def beam_variances(flux_right, flux_left, errors):
     """
     if not errors:
         return tuple(np.full_like(flux_right, np.nan) for _ in range(3))
+    if "flux_err" in errors:
+        dark = np.where(np.isnan(flux_right), np.nan, 0.0)
+        return errors["flux_err"] ** 2, dark, dark
     if BEAM_ERRORS[0] in errors:
         right, left = (errors[name] ** 2 for name in BEAM_ERRORS)
         return right, left, np.where(np.isnan(right), np.nan, 0.0)

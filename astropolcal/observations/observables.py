@@ -124,6 +124,19 @@ class Observable(ABC):
         terms = d_right**2 * var_right + d_left**2 * var_left + 2.0 * cov * d_right * d_left
         return terms.sum(axis=0)
 
+    def of(self, right, variance, usable, groups):
+        """
+        Return the observable of a dataset; one whose data depend on other data keeps these.
+
+        ``right``, its ``variance`` and what is ``usable`` have shape (W, P), ``groups`` of frames
+        that share the brightness of the source (P,).
+        """
+        return self
+
+    def gathered(self, slopes, right, left):
+        """Return derivatives of the data, (n, W, P), from those of the frames of each datum."""
+        return slopes
+
     def frame_covariance(self, right, left, var_right, var_left, cov, frames):
         """
         Return the covariance between data, which is not zero where they share a frame.
@@ -318,6 +331,114 @@ class NormalizedTripleDifference(Observable):
         return np.stack([up, down, down, up]), np.stack([down, up, up, down])
 
 
+class Intensity(Observable):
+    r"""
+    Flux of a single beam over the mean of its group, whose brightness is not known.
+
+    The frames of a group share the brightness of the source, one number for each wavelength. From
+    the second on, the brightest first, each is compared with what the model and the frames before
+    it lead to expect: the recursive residuals of the linear problem in the brightness (Brown,
+    Durbin & Evans 1975, J. R. Stat. Soc. B 37, 149, doi:10.1111/j.2517-6161.1975.tb01532.x). They
+    are independent, have the noise of their frames, and their squares add up to those that the
+    best brightness leaves, so that there are as many data as frames less one for each group.
+    """
+
+    name = "intensity"
+    description = "flux over the mean of its group of frames, of free brightness"
+    frames_per_datum = 1
+
+    def evaluate(self, right, left):
+        """Return the flux over its mean, shape (W, P); see `Observable.evaluate`."""
+        return right[0] / right[0].mean(axis=-1, keepdims=True)
+
+    def derivative(self, right, left):
+        """Return what each frame contributes; `gathered` adds those of its group."""
+        return np.ones_like(right), np.zeros_like(left)
+
+    def of(self, right, variance, usable, groups):
+        """Return the observable of a dataset; see `Observable.of`."""
+        return _GroupedIntensity(right, variance, usable, groups)
+
+
+class _GroupedIntensity(Intensity):
+    """The observable of one dataset: the frames of each group in order of their flux."""
+
+    def __init__(self, flux, variance, usable, groups):
+        flux = np.where(usable, flux, 0.0)
+        known = usable & np.isfinite(variance) & (variance > 0)
+        # of a table without errors all frames weigh the same
+        weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0 if known.any() else 1.0)
+        self._groups = np.unique(groups, return_inverse=True)[1]
+        count = np.maximum(self._totals(usable.astype(float)), 1.0)
+        self._mean = self._totals(flux) / count
+        self._order = np.stack([np.lexsort((-row, self._groups)) for row in flux])
+        # place at which the group of each place begins, the same at all wavelengths
+        ordered = self._groups[self._order[0]]
+        self._first = np.searchsorted(ordered, ordered)
+        self._flux, self._weight = flux, weight * usable
+        self._sorted = self._in_order(flux)
+        self._pull = self._in_order(self._weight * flux)
+        seen = self._before(self._pull * self._sorted)
+        told = seen > 0
+        self._seen = np.where(told, seen, 1.0)
+        size = 1 / np.sqrt(1 + self._pull * self._sorted / self._seen)
+        self._size = np.where(told, size, 0.0)
+        #: Where a frame gives a datum, shape (W, P): not the first of its group.
+        self.valid = usable & (self._back(self._size) > 0)
+
+    def evaluate(self, right, left):
+        """Return the data of fluxes, (W, P), in units of the mean flux of each group."""
+        return self._over_mean(self._flux + self._left(self._scaled(right[0])))
+
+    def gathered(self, slopes, right, left):
+        """Return the derivatives of the data; the brightness follows the model."""
+        pull = self._weight * self._flux
+        turn = self._totals(pull * slopes) / self._totals(pull * right[0])
+        change = self._left(self._factor(right[0]) * slopes)
+        return self._over_mean(change - self._left(self._scaled(right[0])) * turn)
+
+    def variance(self, right, left, var_right, var_left, cov=0.0):
+        """Return the variance of the data: that of the flux, as they are independent."""
+        return self._over_mean(self._over_mean(var_right[0]))
+
+    def _over_mean(self, array):
+        return array / np.where(self._mean > 0, self._mean, 1.0)
+
+    def _factor(self, flux):
+        """Return the brightness that makes fluxes of the model those of the table."""
+        pull = self._weight * self._flux
+        total = self._totals(pull * flux)
+        return self._totals(pull * self._flux) / np.where(total > 0, total, np.inf)
+
+    def _scaled(self, flux):
+        return self._factor(flux) * flux
+
+    def _totals(self, array):
+        """Return the sums over the group of each frame, (..., W, P)."""
+        member = np.eye(self._groups.max() + 1)[self._groups]
+        return (array @ member) @ member.T
+
+    def _in_order(self, array):
+        order = np.broadcast_to(self._order, array.shape)
+        return np.take_along_axis(array, order, axis=-1)
+
+    def _back(self, array):
+        out = np.empty(array.shape)
+        np.put_along_axis(out, np.broadcast_to(self._order, array.shape), array, axis=-1)
+        return out
+
+    def _before(self, array):
+        """Return the sums over the frames of the group that come before each, in order."""
+        total = np.cumsum(array, axis=-1) - array
+        return total - total[..., self._first]
+
+    def _left(self, array):
+        """Return recursive residuals of an array (..., W, P), zero for that of the table."""
+        array = self._in_order(array)
+        expected = self._sorted * self._before(self._pull * array) / self._seen
+        return self._back(self._size * (array - expected))
+
+
 OBSERVABLES = {
     observable.name: observable
     for observable in (
@@ -328,7 +449,18 @@ OBSERVABLES = {
         NormalizedTripleDifference(),
     )
 }
-"""Every registered `Observable`, by name; the first one is the default."""
+"""Every registered `Observable` of two beams, by name; the first one is the default."""
+
+_INTENSITY = Intensity()
+
+
+def default_observable(observations):
+    """Return the name of the observable for datasets: what their design allows."""
+    if all(one.single_beam for one in observations):
+        return Intensity.name
+    if all("hwp" in one.frames.colnames for one in observations):
+        return NormalizedDoubleDifference.name
+    return NormalizedSingleDifference.name
 
 
 def get_observable(name):
@@ -337,9 +469,8 @@ def get_observable(name):
         return name
     # "Double-Difference" and "double difference" are one name
     key = "_".join(str(name).lower().replace("-", " ").replace("_", " ").split())
-    if key in OBSERVABLES:
-        return OBSERVABLES[key]
-    hint = did_you_mean(key, OBSERVABLES)
-    raise ObservationError(
-        f"unknown observable {name!r}; allowed are {', '.join(OBSERVABLES)}{hint}"
-    )
+    known = OBSERVABLES | {_INTENSITY.name: _INTENSITY}
+    if key in known:
+        return known[key]
+    hint = did_you_mean(key, known)
+    raise ObservationError(f"unknown observable {name!r}; allowed are {', '.join(known)}{hint}")

@@ -13,7 +13,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import clock
+from astropolcal.observations.pointings import angle_or_zero, clock
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
 
@@ -290,7 +290,8 @@ def frame_groups(observations, kind, rows, label, **limits):
     of `pair_frames`, rows and label are for messages.
     """
     frames, time = observations.frames, clock(observations.frames)
-    angles = tuple(observations.position(name) * u.rad for name in ("hwp", "derotator"))
+    plate = observations.position("hwp") * u.rad
+    angles = plate, angle_or_zero(observations, "derotator") * u.rad
     named = limits | {"rows": rows, "name": label}
     labels = np.asarray(frames["frame"]).tolist()
     if kind == "hwp":

@@ -315,9 +315,8 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     found = {"altitude": altitude, "parallactic": parallactic}
     if "derotator" in observations.frames.colnames:
         found["derotator"] = observations.position("derotator")
-    hwp = observations.position("hwp")
     follows = tracked(0.0, parallactic, altitude, law)
-    offset = hwp
+    offset = angle_or_zero(observations, "hwp")
     if "hwp_true" in observations.frames.colnames:
         # what the plate really did differs from the law by a constant offset in each frame
         offset = observations.position("hwp_true") - follows
@@ -326,6 +325,8 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
             stage: smeared(angle, motion(observations, angle, duty), nodes, when)
             for stage, angle in found.items()
         }
+    if "hwp" not in observations.frames.colnames:
+        return found
     follows = tracked(0.0, found["parallactic"], found["altitude"], law)
     return found | {"hwp": offset + follows}
 
@@ -385,6 +386,8 @@ def frame_coordinate(observations, name):
     it multiplies the flux by 1 + p F_before / F_now, a `~astropolcal.optics.FluxGain` with
     ``power=-1`` and ``mount="previous_flux"``.
     """
+    if "=" in name:
+        return in_state(observations.frames, name, observations.name)
     if name not in COORDINATES:
         raise ObservationError(
             f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
@@ -410,12 +413,40 @@ def frame_coordinate(observations, name):
         # both entries alike: what depends on all of the light acts on both beams alike
         total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
         return np.stack([total, total])
-    # stable: frames of one time stay in the order of the table
-    order = np.argsort(time, kind="stable")
-    # what the frame before leaves behind; the first one has none, and 1 changes nothing there
+    # what the frame before leaves behind, of several beams that of the same one; the first has
+    # none, and 1 changes nothing there, nor where there is no light
+    beams = observations.frames.columns.get("beam", np.zeros(observations.n_frames))
     ratio = np.ones_like(fluxes)
-    ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
+    for beam in np.unique(beams):
+        own = np.flatnonzero(np.asarray(beams) == beam)
+        # stable: frames of one time stay in the order of the table
+        order = own[np.argsort(time[own], kind="stable")]
+        now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
+        ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def angle_or_zero(observations, stage):
+    """Return the position of a stage, zero in all frames where the table has no such column."""
+    if stage in observations.frames.colnames:
+        return observations.position(stage)
+    return np.zeros(observations.n_frames)
+
+
+def in_state(frames, name, label):
+    """Return 1 where a column of frames has a state, ``"COLUMN=STATE"``, and 0 elsewhere, (F,)."""
+    column, _, state = name.partition("=")
+    if column not in frames.colnames:
+        raise ObservationError(
+            f"{label}: no column {column!r}, whose state {state!r} the chain needs; it has "
+            f"{', '.join(frames.colnames)}"
+        )
+    return (plain_states(frames[column]) == state).astype(float)
+
+
+def plain_states(column):
+    """Return the states of a column as text, by which optics know them."""
+    return np.array([str(value).strip() for value in column])
 
 
 def _last_move(time, angle, name):

@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
 
@@ -59,7 +60,7 @@ def runs_of_frames(count, number):
 
 def derotator_runs(observations):
     """Return the number of the run of frames at one derotator angle of every frame, (F,)."""
-    angle = observations.position("derotator")
+    angle = angle_or_zero(observations, "derotator")
     return np.cumsum(np.abs(np.diff(angle, prepend=angle[:1])) > SAME_ANGLE)
 
 
@@ -78,7 +79,7 @@ def cycle_numbers(observations, start=None):
     if "cycle" in frames.colnames:
         # numbers of cycles need not be consecutive
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = _step_of(observations.position("hwp"))
+    plate = _step_of(angle_or_zero(observations, "hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
     moved = np.diff(derotator_runs(observations), prepend=0) > 0
     first = None if start is None else _step_of(angle_to_rad(start, "start"))
@@ -103,8 +104,11 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     """
     Mask the frames of cycles that lack an angle of the half-wave plate.
 
-    They give q without u, or neither. A frame masked at all wavelengths counts as missing.
+    They give q without u, or neither. A frame masked at all wavelengths counts as missing. Without
+    a half-wave plate all frames stay.
     """
+    if "hwp" not in observations.frames.colnames:
+        return observations
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
@@ -164,6 +168,9 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     """
     if not (limit > 0 and sigma > 0):
         raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
+    if observations.single_beam:
+        # its flux follows the modulation, not only the lamp
+        return observations
     # a lamp changes by factors
     logarithm = np.log(brightness(observations))
     degree = min(2, max(int(np.isfinite(logarithm).sum()) - 4, 0))

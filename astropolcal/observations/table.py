@@ -43,9 +43,10 @@ class Observations:
     ============================== ========= =========================================
     frame, bin                               whole numbers
     wavelength                     length    one value per bin
-    hwp, derotator                 angle     positions of the stages
+    hwp, derotator, ...            angle     positions of the stages that the chain has
     parallactic, altitude          angle     optional, on sky
-    flux_right, flux_left          any, one  ordinary and extraordinary beam
+    flux_right, flux_left          any, one  ordinary and extraordinary beam; or
+    flux, or flux_NAME             any, one  a single beam, or several others
     flux_right_err, flux_left_err  of flux   optional errors of the beams, or
     single_difference_err,         of flux   errors of R - L and R + L (used where
     single_sum_err                           the former are absent)
@@ -165,7 +166,7 @@ class Observations:
         >>> Observations.from_table(QTable({"frame": [0], "bin": [0], "hwp": [0]}), name="x")
         Traceback (most recent call last):
         ...
-        astropolcal.exceptions.ObservationError: x: missing columns wavelength, derotator, flux_right, flux_left; it has frame, bin, hwp
+        astropolcal.exceptions.ObservationError: x: missing columns wavelength, flux_right, flux_left; it has frame, bin, hwp
         """  # noqa: E501
         label = str(name if path is None else path)
         table = complete_table(table, label)
@@ -226,6 +227,19 @@ class Observations:
         return self._grid.flux_left
 
     @property
+    def single_beam(self):
+        """Whether each frame has one beam only: `flux_right`; `flux_left` is then zero."""
+        return self._grid.single
+
+    @property
+    def brightness_groups(self):
+        """Number of the group of frames that share the brightness of the source, shape (F,)."""
+        frames = self._grid.frames
+        if "group" not in frames.colnames:
+            return np.zeros(self.n_frames, dtype=int)
+        return np.unique(np.asarray(frames["group"]), return_inverse=True)[1]
+
+    @property
     def variance_right(self):
         """Variance of `flux_right`, shape (F, W), NaN where masked or unknown."""
         return self._variances[0]
@@ -275,7 +289,8 @@ class Observations:
 
     def _measured(self):
         grid = self._grid
-        return {"flux_right": grid.flux_right, "flux_left": grid.flux_left, **grid.errors}
+        fluxes = {"flux_right": grid.flux_right, "flux_left": grid.flux_left}
+        return ({"flux": grid.flux_right} if grid.single else fluxes) | grid.errors
 
     def __len__(self):
         return self.n_frames
@@ -312,8 +327,8 @@ class Observations:
         low, high = self.wavelength.min(), self.wavelength.max()
         lines = [f"{self.name}: {self._headline()}"]
         lines.append(f"wavelength: {low.value:g} to {high.value:g} {high.unit}")
-        for column in ("hwp", "derotator", "parallactic", "altitude"):
-            if column in self._grid.frames.colnames:
+        for column in self._grid.frames.colnames:
+            if _is_angle(self._grid.frames[column]):
                 lines.append(f"{column}: {_span(np.rad2deg(self.position(column)))} deg")
         lines.append(f"errors: {' and '.join(self._grid.errors) or 'none'}")
         lines += [f"masked, {why}: {counted(n, 'cell')}" for why, n in self.mask_reasons.items()]

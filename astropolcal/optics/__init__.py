@@ -38,6 +38,7 @@ from astropolcal.optics.retarders import (
     TwoLayerWaveplate,
 )
 from astropolcal.optics.sources import Light, PolarizedSource, StarSource
+from astropolcal.optics.states import StateAnalyser, StateRetarder
 
 __all__ = [
     "COORDINATES",
@@ -70,6 +71,8 @@ __all__ = [
     "PowerLawMirror",
     "Rotator",
     "StarSource",
+    "StateAnalyser",
+    "StateRetarder",
     "StrayLight",
     "TwoLayerWaveplate",
     "VectorDiattenuator",

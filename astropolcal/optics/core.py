@@ -34,10 +34,21 @@ RATES = ("parallactic_rate", "derotator_rate")
 #: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
 MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
 
+
+class _Coordinates(tuple):
+    """Names of positions that are numbers; all of the form ``"COLUMN=STATE"`` are among them."""
+
+    __slots__ = ()
+
+    def __contains__(self, name):
+        return tuple.__contains__(self, name) or (isinstance(name, str) and "=" in name)
+
+
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
 #: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
-#: last moves of the stages, and the fluxes.
-COORDINATES = ("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES)
+#: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
+#: has that state and 0 in the others.
+COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
 
 
 def finite_position(value, name, stage=None):

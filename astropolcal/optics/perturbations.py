@@ -60,8 +60,9 @@ class Dependence:
     ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
     ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
-    stage was backwards; ``"move:STAGE"``, how far it was moved, in radian; ``"dataset:NAME"``, in
-    one dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset
+    stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
+    ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"dataset:NAME"``, in one
+    dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset
     only.
     """
 
@@ -71,8 +72,8 @@ class Dependence:
         if not isinstance(self.text, str) or not _FORMS.fullmatch(self.text):
             raise ParameterError(
                 f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
-                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE and dataset:NAME, each "
-                "also with /dataset:NAME after it"
+                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
+                "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME after it"
             )
 
     @property
@@ -95,7 +96,7 @@ class Dependence:
         """Name of the position that it follows, None where it is constant."""
         if self.kind in ("constant", "dataset"):
             return None
-        if self.kind == "harmonic":
+        if self.kind in ("harmonic", "state"):
             return self.parts[1]
         if self.kind in ("direction", "move"):
             return f"{self.parts[1]}_{self.kind}"
@@ -122,12 +123,14 @@ class Dependence:
             "frame": lambda: (x == int(self.parts[1])).astype(float),
             "direction": lambda: x,
             "move": lambda: x,
+            "state": lambda: x,
         }[self.kind]()
         return wave[None]
 
 
 _FORMS = re.compile(
-    r"(constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+)"
+    r"(constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+"
+    r"|state:\w+=[^/:]+)"
     r"(/dataset:.+)?|dataset:.+",
     re.DOTALL,
 )
@@ -166,8 +169,8 @@ class Perturbation(_BeamOptic, FrameOptic):
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
-        stage; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` after it. The ``mount`` has
-        to be what it follows.
+        stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"dataset:NAME"``; each also with
+        ``"/dataset:NAME"`` after it. The ``mount`` has to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`

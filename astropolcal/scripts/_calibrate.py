@@ -48,7 +48,8 @@ files FILE * Input  observation tables (ECSV)
     published calibrations do; by default they have the errors of the catalogue and of the mounting
 --nuisance KIND[:DATASET] ...  add what differs from dataset to dataset, with a prior: background,
     beam_gain, or lamp (q and u of an unpolarized internal source); for all datasets or for one
---observable NAME =normalized_double_difference  what is fitted (default: %(default)s)
+--observable NAME  what is fitted (default: normalized_double_difference; single differences of
+    tables without half-wave plate, and the intensity of single beams)
 --strategy HOW =joint  joint (default), two-step (the paper's fit of a polarized source), or
     sequential: polarized source, unpolarized source, stars, each step holding what came before
 --loss NAME =linear  linear (default: least squares), huber, cauchy or bisquare: data far off count
@@ -86,7 +87,8 @@ def run(arguments):
     check_suffix("-o", arguments.output, ".asdf")
     _check_start(arguments)
     # raises before any table is read
-    get_observable(arguments.observable)
+    if arguments.observable is not None:
+        get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
     # so that a first call without any data shows what comes out
     files = arguments.files or [_example(printer(arguments))]

@@ -177,7 +177,7 @@ def _table(path):
             "cube or product; this is none of them"
         )
     table = read_ecsv(path)
-    if _OBSERVED & set(table.colnames):
+    if _OBSERVED & set(table.colnames) or {"frame", "flux"} <= set(table.colnames):
         return _observations(path)
     return _wrapped(*_other_table(path, table))
 
@@ -186,11 +186,13 @@ def _observations(path):
     import astropy.units as u
 
     from astropolcal.observations import Observations
+    from astropolcal.observations.observables import default_observable
 
     # again, with all checks; the first look was for the columns only
     observations = Observations.read(path)
+    paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
-    pairs = observations.pairs()
+    pairs = observations.pairs() if paired else ()
     content = {
         "file": str(path),
         "instrument": observations.instrument,

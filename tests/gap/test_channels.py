@@ -38,6 +38,7 @@ def channels_of(right, left, var_right=1.0, var_left=1.0, covariance=0.0):
         variance_left=var_left * np.ones_like(right),
         covariance=covariance * np.ones_like(right),
         position=lambda name: np.linspace(0, 1, len(right)),
+        single_beam=False,
     )
     return Channels(SimpleNamespace(observations=table, valid=np.ones(right.T.shape, dtype=bool)))
 

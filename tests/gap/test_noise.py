@@ -27,7 +27,8 @@ ANGLES = {
 
 def channel(variance, valid=None):
     valid = np.ones((W, F), dtype=bool) if valid is None else valid
-    return SimpleNamespace(variance=np.broadcast_to(variance, (2, W, F)).copy(), valid=valid)
+    variance = np.broadcast_to(variance, (2, W, F)).copy()
+    return SimpleNamespace(variance=variance, valid=valid, groups=None, count=2)
 
 
 def draws(sigma, seed=1):

@@ -202,13 +202,13 @@ def test_not_a_table_in_memory():
 
 def test_all_missing_columns_are_named(table):
     table.remove_columns(["hwp", "bin", "flux_left"])
-    message = refuse(table, "missing columns bin, hwp, flux_left; it has frame, wavelength")
+    message = refuse(table, "missing columns bin, flux_left; it has frame, wavelength")
     assert "derotator" in message
 
 
 def test_a_single_missing_column(table):
-    table.remove_column("derotator")
-    refuse(table, "missing column derotator; it has ")
+    table.remove_column("bin")
+    refuse(table, "missing column bin; it has ")
 
 
 def test_a_table_without_rows(table):

@@ -40,6 +40,8 @@ def test_only_some_optics_stand_on_numbers():
         "FluxGain",
         "Perturbation",
         "PolarizedBackground",
+        "StateAnalyser",
+        "StateRetarder",
         "StrayLight",
     )
     for name, coordinate, sign in product(OPTICS, COORDINATES, ["", "-"]):

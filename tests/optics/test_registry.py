@@ -320,6 +320,23 @@ CASES = {
         right=GAIN,
         left=GAIN,
     ),
+    "StateAnalyser": case(
+        optics.StateAnalyser,
+        lambda x, efficiency, transmission: (
+            (1 - x) * np.eye(4) + x * transmission * wollaston("right")(efficiency)
+        ),
+        mount="beam=one",
+        position=st.sampled_from([0.0, 1.0]),
+        efficiency=SIGNED,
+        transmission=FRACTION,
+    ),
+    "StateRetarder": case(
+        optics.StateRetarder,
+        lambda x, retardance: mueller.linear_retarder(x * retardance),
+        mount="lcvr=A",
+        position=st.sampled_from([0.0, 1.0]),
+        retardance=DEGREES,
+    ),
     "StrayLight": case(
         optics.StrayLight,
         lambda x, amount: stray(amount * 3e4 / x),

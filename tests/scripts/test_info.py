@@ -283,7 +283,7 @@ def test_tables_are_known_by_their_columns(tmp_path, capsys):
 
 
 def test_a_bad_observation_table_is_not_described_as_another(tmp_path, capsys):
-    for missing in ["hwp", "flux_left", "wavelength"]:
+    for missing in ["bin", "flux_left", "wavelength"]:
         table = QTable(example_table())
         table.remove_column(missing)
         table.write(tmp_path / "run.ecsv", format="ascii.ecsv", overwrite=True)

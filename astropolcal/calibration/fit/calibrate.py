@@ -82,7 +82,7 @@ def calibrate(
     *,
     fitter=None,
     strategy="joint",
-    observable="normalized_double_difference",
+    observable=None,
     weights=None,
     ties=None,
     positions=None,
@@ -111,8 +111,10 @@ def calibrate(
         All parameters at once; or the paper's procedure for the polarized source; or
         the paper's order of datasets: polarized source, unpolarized source, stars, each
         step holding what the ones before have found.
-    observable : str or Observable
-        What is fitted; see `astropolcal.observations.OBSERVABLES`.
+    observable : str or Observable, optional
+        What is fitted; see `astropolcal.observations.OBSERVABLES`. By default normalized double
+        differences, of tables without a column ``hwp`` single ones, and of single beams the
+        intensity.
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
         Noise of the data, which sets their weights and the scale of all
         errors. None: one level for all data, from the residuals (the default,

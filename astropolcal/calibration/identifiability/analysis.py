@@ -198,9 +198,10 @@ def complete(finding, measurement, vector, whitened=None, level=1.0, *, view=Non
         # commanded angles repeat in many frames; a microradian is none
         round(float(angle), 6)
         for dataset in measurement.datasets
+        if "hwp" in dataset.observations.frames.colnames
         for angle in dataset.observations.position("hwp")
     }
-    finding.sampling = harmonic_words(np.array(sorted(angles)))
+    finding.sampling = harmonic_words(np.array(sorted(angles))) if angles else []
     finding.sampling += telescope_words(finding, measurement) + _settled_by_a_star(finding, view)
     finding.branches = mirror_branches(measurement, vector, view)
     finding.mirrors = [branch["words"] for branch in finding.branches]

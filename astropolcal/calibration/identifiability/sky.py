@@ -128,7 +128,7 @@ def _positions(wanted, settings, law):
         # a file of before does not say where the derotator stood
         stage: np.asarray(settings.get(stage) or np.linspace(0, np.pi, _MOST, endpoint=False))
         for stage in wanted
-        if stage not in ("hwp", *_TELESCOPE, *COORDINATES)
+        if stage not in ("hwp", *_TELESCOPE) and stage not in COORDINATES
     }
     altitude, parallactic = (grid.ravel() for grid in np.meshgrid(_ALTITUDES, _PARALLACTIC))
     on_sky = bool(set(_TELESCOPE) & set(wanted))

@@ -17,6 +17,7 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
 from astropolcal.observations.observables import OBSERVABLES
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.units import angle_to_rad
 
@@ -377,6 +378,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     """
     if null_model not in _NULL_MODELS:
         raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
+    _need_two_beams(measurement, "the null channel")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
     squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -398,6 +400,13 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
         "limit; it includes photon and read noise, flicker, and a null that the chain lacks"
     )
     return noise_of_cells(measurement, sigma, dof, "null channel", words)
+
+
+def _need_two_beams(measurement, what):
+    for part in measurement.datasets:
+        if part.observations.single_beam:
+            name = part.observations.name
+            raise FitError(f"{name}: {what} needs two beams per frame, it has one")
 
 
 def _null_scatter(part, vector, null_model):
@@ -434,7 +443,7 @@ def _predicted_differences(part, vector):
 
 
 def _null_design(observations, frames, null_model):
-    angle = observations.position("derotator")[frames]
+    angle = angle_or_zero(observations, "derotator")[frames]
     state = np.zeros(len(frames), dtype=int)
     if "flc_state" in observations.frames.colnames:
         column = np.asarray(observations.frames["flc_state"])
@@ -508,6 +517,7 @@ def noise_from_roughness(measurement, vector=None):
     >>> noise.method, bool(noise.dof[0] > 50)
     ('roughness', True)
     """
+    _need_two_beams(measurement, "roughness of differences")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_rough_frames(part, vector) for part in measurement.datasets]
     sigma_of_data = np.concatenate([sigma for sigma, _ in parts])

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.observations.quality import clusters, cycle_numbers, is_star, runs_of_frames
 
 __all__ = []
@@ -39,12 +40,13 @@ _RUNS = 8
 def leave_out_groups(measurement):
     """Return the group of each datum for cross-validation: its derotator angle, per dataset.
 
-    On sky the derotator turns slowly, so there a group is one of eight runs of consecutive cycles
-    of the half-wave plate, or one cycle where there are fewer.
+    On sky the derotator turns slowly, so there, and without one, a group is one of eight runs of
+    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
     """
     groups, first = [], 0
     for dataset in measurement.datasets:
-        if "parallactic" in dataset.positions:
+        turns = "derotator" in dataset.observations.frames.colnames
+        if "parallactic" in dataset.positions or not turns:
             group = _star_runs(dataset)
         else:
             group = clusters(dataset.observations.position("derotator")[dataset.frames[:, 0]])
@@ -101,7 +103,7 @@ def _members(measurement, groups, by):
     """Return name and largest number of data at one wavelength of every group."""
     found = []
     for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
-        angle = np.rad2deg(part.observations.position("derotator"))[part.frames[:, 0]]
+        angle = np.rad2deg(angle_or_zero(part.observations, "derotator"))[part.frames[:, 0]]
         own, bins = groups[where], measurement.bins[where]
         for k, label in enumerate(np.unique(own)):
             rows = own == label

@@ -163,7 +163,9 @@ class _Optics:
         """Return plate and derotator (None where there is none) and the path."""
         found = leaves(path)
         plate = next((o for o in found if o.stage == "hwp"), None)
-        turning = (o for o in found if o.stage not in (None, "hwp", *_SKY, *COORDINATES))
+        turning = (
+            o for o in found if o.stage not in (None, "hwp", *_SKY) and o.stage not in COORDINATES
+        )
         return plate, next(turning, None), path
 
     def values(self, chain):
@@ -194,7 +196,11 @@ class _Optics:
 def _behind_telescope(path):
     """Return the path from the half-wave plate on, or the first optic on a stage."""
     found = leaves(path)
-    own = [i for i, o in enumerate(found) if o.stage not in (None, *_SKY, *COORDINATES)]
+    own = [
+        i
+        for i, o in enumerate(found)
+        if o.stage not in (None, *_SKY) and o.stage not in COORDINATES
+    ]
     # the telescope is of the site, not of the instrument
     plate = [i for i in own if found[i].stage == "hwp"]
     return join(found[(plate or own or [0])[0] :])

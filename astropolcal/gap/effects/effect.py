@@ -692,8 +692,11 @@ class CellEffect(Effect):
         edited, ties = [], {}
         for i, chain in enumerate(chains):
             if self._in_dataset(context, i):
-                split = next(o.name for o in leaves(chain) if o.splits_light)
-                chain = insert_optic(chain, optic.copy(), **{side: split})
+                found = leaves(chain)
+                split = next((o.name for o in found if o.splits_light), None)
+                # of one beam the detector is behind the last optic
+                place = {side: split} if split else {"after": found[-1].name}
+                chain = insert_optic(chain, optic.copy(), **place)
                 # one detector: the same law for both beams
                 ties = {f"{self.label}.{key}": Tie(f"{self.label}.{free[0]}") for key in free[1:]}
             edited.append(chain)

@@ -15,7 +15,7 @@ __all__ = []
 #: Roles of which a chain may have several optics.
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
-_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
+_NO_STAGES = (None, "parallactic", "altitude")
 _BEHIND, _BEHIND_PLATE = "downstream of the derotator", "downstream of the half-wave plate"
 
 
@@ -62,8 +62,8 @@ class Where:
     def find(self, roles, chosen=None):
         """Return the ``Place`` in a chain, or None; no other where an optic was chosen."""
         if self.relation == "detector":
-            split = next((o for o in roles.leaves if o.splits_light), None)
-            return split and Place("detector", after=split.name)
+            last = _last(roles.leaves)
+            return last and Place("detector", after=last.name)
         if self.optic is None:
             there = {place.name: place for place in places(Train(roles.leaves))}
             return there.get(self.relation)
@@ -100,6 +100,12 @@ class Where:
         return Where("before", self.optic, self.is_role).cell_place(roles)
 
 
+def _last(found):
+    """Return the splitter of some optics, or the last one of a beam that is analysed."""
+    analysed = any(isinstance(o, (optics.LinearPolarizer, optics.StateAnalyser)) for o in found)
+    return next((o for o in found if o.splits_light), found[-1] if analysed else None)
+
+
 def is_held(parameter):
     """Return whether a parameter is fixed, or as good as that: known beforehand."""
     return bool(parameter.fixed or parameter.prior is not None)
@@ -110,9 +116,9 @@ class Roles:
     The optics of a chain by what they are for.
 
     There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
-    on a stage upstream of it; the derotators are retarders on a stage downstream of the plate,
-    regardless of its name; the telescope's mirrors stand between the rotation by the parallactic
-    angle and the plate.
+    on a stage upstream of it, or without it all but those on ``derotator``; the derotators are
+    retarders on a stage downstream of the plate, regardless of its name; the telescope's mirrors
+    stand between the rotation by the parallactic angle and the plate.
 
     Parameters
     ----------
@@ -180,11 +186,15 @@ class Roles:
 
     def _turning(self):
         """Return plates and derotators."""
-        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
+        found = [o for o in self._own if _retards(o) and o.stage not in _NO_STAGES]
+        found = [o for o in found if o.stage not in COORDINATES]
         names = [o.stage for o in found]
-        middle = names.index("hwp") if "hwp" in names else -1
         plates = [o for o in found if o.stage == "hwp"]
-        plates += found[: max(middle, 0)]
+        if plates:
+            plates += found[: names.index("hwp")]
+        else:
+            # without a half-wave plate whatever turns is the plate, but for a derotator
+            plates = [o for o in found if o.stage != "derotator"]
         behind = [o for o in found if not any(o is plate for plate in plates)]
         return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
 
@@ -235,7 +245,8 @@ def adapted(effects, chains):
     list of Effect
         An effect that acts on one kind of optic comes once for each such optic: under its own name
         for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
-        of what stands downstream of it name the half-wave plate.
+        of what stands downstream of it name the half-wave plate; where there is no such plate,
+        the words name the optic.
 
     Examples
     --------
@@ -249,9 +260,20 @@ def adapted(effects, chains):
     chains = list(chains)
     found = [one for effect in effects for one in effect.per_optic(chains)]
     found = [one for one in found if one.applies(chains)]
+    found = [_renamed(one, chains) for one in found]
     if any(Roles(chain).derotator is not None for chain in chains):
         return found
     return [_reworded(one) for one in found]
+
+
+def _renamed(effect, chains):
+    """Name the plate as its chain does, where none is on the stage of a half-wave plate."""
+    every = [o for chain in chains for o in Roles(chain).all("plate")]
+    if not every or any(o.stage == "hwp" for o in every) or effect.acts_on != "plate":
+        return effect
+    name = effect.optic or every[0].name
+    words = {"title": effect.title, "place": effect.place}
+    return effect.changed(**{k: v.replace("half-wave plate", name) for k, v in words.items()})
 
 
 def _reworded(effect):

@@ -1,0 +1,371 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Five polarimeters without a half-wave plate in pairs: simulated, calibrated, diagnosed, used."""
+
+import inspect
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from astropolcal import calibrate, optics
+from astropolcal.chain import insert_optic, join, stages
+from astropolcal.correction import ScienceFrames, correct, measurement_rows
+from astropolcal.exceptions import ObservationError
+from astropolcal.gap import diagnose
+from astropolcal.gap.report import summary
+from astropolcal.instruments import Instrument, SkyLaw
+from astropolcal.measurement import Measurement
+from astropolcal.observations import Observations
+from astropolcal.simulation import simulate
+from astropolcal.testing import check_instrument
+
+FREE = {"fixed": {"theta": False}, "bounds": {"theta": (-10, 10)}}
+
+
+class Bench(Instrument):
+    """A lamp behind a polarizer and a quarter-wave plate that turn, in front of an instrument."""
+
+    wavelength = [0.6, 0.7, 0.8] * u.um
+    sources = ("lamp", "star")
+    references = ("this test",)
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
+    calibrators = ("polarizer", "retarder")
+
+    def chain(self, source="lamp", optics_in=(), *, wavelength=None):
+        self.check_choices(source, optics_in)
+        plate = {"retardance": 85 * u.deg, "fixed": {"retardance": True}}
+        unit = {
+            "polarizer": optics.LinearPolarizer(mount="calibrator", name="calibrator"),
+            "retarder": optics.LinearRetarder(mount="retarder", name="retarder", **plate),
+        }
+        train = self.telescope_optics() if source == "star" else [unit[k] for k in self.calibrators]
+        return join([*train, *self.inner(self.grid(wavelength).size)])
+
+    def telescope_optics(self, behind=()):
+        return [optics.Rotator(mount="parallactic", name="parallactic")]
+
+    def setup(self, observations):
+        return self.source_of(observations), ()
+
+
+class Wheel(Bench):
+    """Three polarizers in a wheel, one beam, behind a mirror, as in HST/ACS."""
+
+    name, entrance, calibrators = "wheel", "mirror", ("polarizer",)
+
+    def inner(self, size):
+        mirror = optics.DiattenuatorRetarder(
+            diattenuation=np.full(size, 0.02), retardance=np.full(size, 170) * u.deg, name="mirror"
+        )
+        yield mirror
+        for angle in (0, 60, 120):
+            yield optics.StateAnalyser(
+                efficiency=0.95, theta=angle * u.deg, mount=f"filter=POL{angle}", name=f"pol{angle}"
+            )
+
+    def frames(self, turns):
+        return QTable(
+            {
+                "calibrator": np.repeat(turns, 3) * u.deg,
+                "filter": np.tile(["POL0", "POL60", "POL120"], len(turns)),
+                "group": np.repeat(np.arange(len(turns)), 3),
+            }
+        )
+
+
+class Rolls(Bench):
+    """Two Wollaston prisms, at 0 and 45 deg, one at a time, as in the Roman coronagraph."""
+
+    name, entrance, calibrators = "rolls", "mirror", ("polarizer",)
+
+    def inner(self, size):
+        yield optics.DiattenuatorRetarder(
+            diattenuation=np.full(size, 0.02), retardance=np.full(size, 160) * u.deg, name="mirror"
+        )
+        yield optics.WollastonPrism(
+            efficiency=np.full(size, 0.97), mount="prism", name="wollaston", **FREE
+        )
+
+    def frames(self, turns):
+        return QTable(
+            {
+                "calibrator": np.repeat(turns, 2) * u.deg,
+                "prism": np.tile([0, 45], len(turns)) * u.deg,
+            }
+        )
+
+
+class QuarterWave(Bench):
+    """Quarter-wave plate at arbitrary angles and a Wollaston prism, as in FORS2: full Stokes."""
+
+    name, entrance = "quarter", "qwp"
+
+    def inner(self, size):
+        yield optics.LinearRetarder(
+            retardance=np.full(size, 88) * u.deg, mount="qwp", name="qwp", **FREE
+        )
+        yield optics.WollastonPrism(efficiency=np.full(size, 0.98), name="wollaston")
+
+    def frames(self, turns):
+        n = 4 * len(turns)
+        return QTable(
+            {
+                "calibrator": np.repeat(turns, 4) * u.deg,
+                "retarder": np.repeat(37 * np.arange(len(turns)) % 180, 4) * u.deg,
+                "qwp": (13.7 + 39.1 * np.arange(n)) % 360 * u.deg,
+            }
+        )
+
+
+class Crystal(Bench):
+    """Liquid crystal with four voltages and a polarizer, one beam: full Stokes."""
+
+    name, entrance = "crystal", "lc1_A"
+    # those of IMaX (Martinez Pillet et al. 2011), the most efficient ones
+    states = {"A": (315, 305.3), "B": (315, 54.7), "C": (225, 125.3), "D": (225, 234.7)}
+
+    def inner(self, size):
+        for i, theta in enumerate((0, 45)):
+            for state, values in self.states.items():
+                yield optics.StateRetarder(
+                    retardance=values[i] * u.deg,
+                    theta=theta * u.deg,
+                    mount=f"lcvr={state}",
+                    name=f"lc{i + 1}_{state}",
+                )
+        yield optics.LinearPolarizer(name="analyser")
+
+    def frames(self, turns):
+        return QTable(
+            {
+                "calibrator": np.repeat(turns, 4) * u.deg,
+                "retarder": np.repeat(37 * np.arange(len(turns)) % 180, 4) * u.deg,
+                "lcvr": np.tile(list("ABCD"), len(turns)),
+                "group": np.repeat(np.arange(len(turns)), 4),
+            }
+        )
+
+
+class FourBeams(Bench):
+    """Half-wave plate and a double Wollaston prism with four beams at once, as in ALFOSC."""
+
+    name, entrance, calibrators = "fourbeams", "hwp", ("polarizer",)
+
+    def inner(self, size):
+        yield optics.LinearRetarder(
+            retardance=np.full(size, 172) * u.deg, mount="hwp", name="hwp", **FREE
+        )
+        for angle in (0, 45, 90, 135):
+            name = f"i{angle}"
+            yield optics.StateAnalyser(
+                efficiency=0.98, theta=angle * u.deg, mount=f"beam={name}", name=name
+            )
+
+    def frames(self, turns):
+        return QTable(
+            {
+                "calibrator": turns * u.deg,
+                "hwp": (11.3 * np.arange(len(turns))) % 180 * u.deg,
+            }
+        )
+
+
+KINDS = [Wheel(), Rolls(), QuarterWave(), Crystal(), FourBeams()]
+every = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+TURNS = np.linspace(3, 178, 24)
+
+
+def observed(kind, chain=None, seed=0, turns=TURNS, flux=3e5, **options):
+    return simulate(
+        kind.chain() if chain is None else chain,
+        kind.wavelength,
+        kind.frames(turns),
+        flux=flux,
+        seed=seed,
+        meta={"instrument": kind.name, "source": "lamp"},
+        name=kind.name,
+        **options,
+    )
+
+
+def truth_with_fault(kind):
+    """Return the chain with something wrong, and what the diagnosis calls it."""
+    chain = kind.chain()
+    if kind.name == "wheel":
+        chain["pol60"].theta = 61.5 * u.deg
+        # of three polarizers only their relative angles count
+        return chain, "state:filter=POL"
+    if kind.name == "rolls":
+        return chain | optics.BeamGain(imbalance=0.01, name="flat"), "beam_gain"
+    if kind.name == "fourbeams":
+        tilt = optics.HarmonicRetarder(cosine=2 * u.deg, harmonic=2, mount="hwp", name="tilt")
+        return insert_optic(chain, tilt, after="hwp"), "hwp_tilt"
+    chain["retarder"].retardance = 89 * u.deg
+    return chain, "hwp_retardance"
+
+
+def test_a_new_instrument_is_short():
+    shared = len(inspect.getsource(Bench).splitlines())
+    for kind in map(type, KINDS):
+        assert shared + len(inspect.getsource(kind).splitlines()) <= 60, kind
+
+
+@every
+def test_the_instrument_conforms(kind):
+    # the test instruments have neither site nor keywords
+    report = check_instrument(kind, skip=["mounts"], raises=False)
+    assert report, str(report)
+
+
+@every
+def test_noiseless_frames_are_predicted_and_the_derivative_is_that_of_differences(kind):
+    measurement = Measurement(kind.chain(), observed(kind, noise=False))
+    vector = measurement.vector()
+    np.testing.assert_allclose(measurement.residuals(vector), 0, atol=1e-9)
+    rng = np.random.default_rng(1)
+    there = vector + 0.01 * rng.normal(size=vector.size)
+    step = 1e-5 * rng.normal(size=vector.size)
+    change = measurement.predict(there + step) - measurement.predict(there - step)
+    np.testing.assert_allclose(change, 2 * step @ measurement.jacobian(there), atol=1e-11)
+
+
+@every
+def test_the_table_survives_a_file(kind, tmp_path):
+    table = observed(kind)
+    table.write(tmp_path / "run.ecsv")
+    again = Observations.read(tmp_path / "run.ecsv")
+    assert again.content_hash == table.content_hash
+    one, other = (Measurement(kind.chain(), each) for each in (table, again))
+    np.testing.assert_allclose(one.observed, other.observed)
+
+
+@pytest.mark.slow
+@every
+def test_pulls_are_one(kind):
+    pulls, truth = [], Measurement(kind.chain(), observed(kind)).vector()
+    for seed in range(40):
+        found = calibrate(
+            kind.chain(), observed(kind, seed=seed), weights="errors", cross_validate=False
+        )
+        live = found.live_measurement()
+        pulls.append((live.vector() - truth) / live.free.factors() / found.covariance.stds)
+    assert np.std(pulls) == pytest.approx(1, abs=0.1), np.std(pulls, axis=0)
+    assert np.mean(pulls) == pytest.approx(0, abs=0.2)
+
+
+@pytest.mark.slow
+@every
+def test_a_planted_fault_is_found_and_none_without_one(kind):
+    assert diagnose(kind.chain(), observed(kind, seed=3)).verdict == "none"
+    chain, name = truth_with_fault(kind)
+    found = diagnose(kind.chain(), observed(kind, chain, seed=3, flux=1e6))
+    words = summary(found)
+    assert "double diff" not in words.replace("in double diff.", "")
+    assert "half-wave" not in words or kind.name == "fourbeams"
+    assert found.verdict in ("named", "located")
+    assert name in found.causes[0].name
+    assert found.gap_after_percent < 0.3 * found.gap_before_percent
+
+
+@every
+def test_a_star_is_corrected(kind):
+    calibration = calibrate(
+        kind.chain(),
+        observed(kind, seed=2, flux=1e8),
+        weights="errors",
+        cross_validate=False,
+        instrument=kind.name,
+    )
+    truth, n = kind.on_sky(kind.chain()), 8
+    has_v = "retarder" in kind.calibrators
+    star = np.array([1, 0.02, -0.01, 0.005 * has_v])
+    frames = kind.frames(np.linspace(0, 170, n))
+    group = np.arange(len(frames)) * n // len(frames)
+    where = {s: frames[s] for s in frames.colnames if s not in ("calibrator", "retarder", "group")}
+    where["parallactic"] = np.linspace(-50, 60, n)[group] * u.deg
+    # clouds, which the frames of a group share
+    bright = 1 + 0.3 * np.cos(np.arange(n))[group]
+
+    def fluxes(**more):
+        rows = measurement_rows(truth, where | more, kind.wavelength)
+        return np.moveaxis(rows @ star * 1e6 * bright, 1, 2)
+
+    beams = [stage.partition("=")[2] for stage in stages(truth) if stage.startswith("beam=")]
+    if beams:
+        seen = {name: fluxes(beam=[name] * len(frames))[0] for name in beams}
+        science = ScienceFrames.from_arrays(seen, None, kind.wavelength, where)
+    elif "group" in frames.colnames:
+        seen = fluxes()[0]
+        science = ScienceFrames.from_arrays(seen, None, kind.wavelength, where, groups=group)
+    else:
+        science = ScienceFrames.from_arrays(*fluxes(), kind.wavelength, where)
+    sky = kind.on_sky(calibration.chains[0])
+    found = correct(calibration, science, chain=sky, components="IQUV" if has_v else "IQU")
+    np.testing.assert_allclose([found.q, found.u], [[0.02] * 3, [-0.01] * 3], atol=5e-5)
+    if has_v:
+        np.testing.assert_allclose(found.v, 0.005, atol=5e-5)
+
+
+# --- what does not fit ----------------------------------------------------------------------------
+
+
+def changed(observations, change):
+    """Return observations of a table that a function has changed."""
+    table = observations.to_table()
+    change(table)
+    return Observations.from_table(table, name="table")
+
+
+def state(column, old, new):
+    def change(table):
+        table[column] = [new if value == old else str(value) for value in table[column]]
+
+    return change
+
+
+def unknown_angle(table):
+    table["qwp"][table["frame"] == 3] = np.nan
+
+
+def test_what_the_table_lacks_or_has_too_much_is_named():
+    wheel, quarter, four = KINDS[0], KINDS[2], KINDS[4]
+    one, two = observed(wheel), observed(quarter)
+    lost = changed(two, lambda table: table.rename_column("qwp", "wave"))
+    strange = changed(one, state("filter", "POL60", "POL90"))
+    beam = changed(observed(four), state("beam", "i45", "i50"))
+    cases = [
+        (wheel, two, None, "has two beams a frame, the chain one; flux, or flux_NAME"),
+        (quarter, one, None, "has one beam a frame, the chain two; flux_right and flux_left"),
+        (wheel, one, "ratio", "observable ratio of one beam a frame; allowed is intensity"),
+        (quarter, two, "intensity", "observable intensity of two beams a frame"),
+        (four, observed(wheel), None, "no column 'hwp'; its angles are calibrator"),
+        (quarter, lost, None, "no column 'qwp'; its angles are calibrator, retarder, wave"),
+        (wheel, strange, None, "filter = POL90 in the table; the chain knows POL0, POL60, POL120"),
+        (four, beam, None, "beam = i50 in the table; the chain knows i0, i45, i90, i135"),
+        (quarter, changed(two, unknown_angle), None, "frame 3: qwp is not known"),
+    ]
+    for kind, observations, observable, message in cases:
+        with pytest.raises(ObservationError, match=message) as info:
+            Measurement(kind.chain(), observations, observable=observable)
+        assert "\n" not in str(info.value)
+
+
+def test_beams_in_columns_are_frames_of_one_group():
+    wide = QTable({"frame": [7, 9], "bin": [0, 0], "wavelength": [0.6, 0.6] * u.um})
+    for i, name in enumerate(("a", "b", "c")):
+        wide[f"flux_{name}"] = [10.0 + i, 20.0 + i] * u.adu
+        wide[f"flux_{name}_err"] = [1.0, 2.0] * u.adu
+    found = Observations.from_table(wide)
+    assert found.single_beam
+    assert found.n_frames == 6
+    assert found.frames["beam"].tolist() == ["a", "b", "c"] * 2
+    assert found.brightness_groups.tolist() == [0, 0, 0, 1, 1, 1]
+    assert found.flux_right[:, 0].tolist() == [10, 11, 12, 20, 21, 22]
+    assert not found.flux_left.any()
+    assert found.variance_right[3, 0] == 4
+    alone = wide["frame", "bin", "wavelength", "flux_a", "flux_a_err"]
+    assert Observations.from_table(alone).frames.colnames == ["frame"]
+    wide.remove_column("flux_b_err")
+    with pytest.raises(ObservationError, match="missing column flux_b_err"):
+        Observations.from_table(wide)
