@@ -40,6 +40,8 @@ KINDS = {
     "mechanism": 0.08,
     "absorbed": 0.04,
 }
+# a fault of a pair is drawn at most so many times until it can be seen
+_DRAWS = 20
 #: A fault whose signal-to-noise ratio stays below this cannot be seen.
 _INVISIBLE = 3.0
 # what a right answer carries of the signal, and what a wrong one does not
@@ -109,17 +111,19 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
     kinds = {"none": [], "pair": [bench.rng.choice(("cell", "listed")) for _ in range(2)]}
     known, faults, told = fault or {}, [], []
     for one in kinds.get(kind, [kind]):
-        drawn = Fault(bench, {"type": str(one), **known})
-        # an effect that is there already would be no other fault
-        while "effect" not in known and drawn.told.get("effect") in _effects(faults):
+        for _ in range(_DRAWS):
             drawn = Fault(bench, {"type": str(one), **known})
+            residual, fit = bench.scale(drawn, 1.0 if kind == "absorbed" else snr)
+            absorbed = drawn.snr < _INVISIBLE
+            # an effect that is there already is not another fault, and what cannot be seen alone
+            # may show through another one, by how much is not known
+            other = "effect" in known or drawn.told.get("effect") not in _effects(faults)
+            if kind != "pair" or (other and not absorbed):
+                break
         faults.append(drawn)
-    for one in faults:
-        residual, fit = bench.scale(one, 1.0 if kind == "absorbed" else snr)
-        absorbed = one.snr < _INVISIBLE
-        size = {"amplitude": one.amplitude, "snr": round(one.snr, 1), "absorbed": absorbed}
-        cells = {} if absorbed else one.cells(residual, fit)
-        told.append({**one.told, **size, "cells": cells})
+        size = {"amplitude": drawn.amplitude, "snr": round(drawn.snr, 1), "absorbed": absorbed}
+        cells = {} if absorbed else drawn.cells(residual, fit)
+        told.append({**drawn.told, **size, "cells": cells})
     case = {
         "kind": kind,
         "snr": min((one["snr"] for one in told if not one["absorbed"]), default=0.0),
