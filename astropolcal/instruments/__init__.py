@@ -12,6 +12,7 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
 from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
+from astropolcal.instruments.fors2 import FORS2
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.vampires import VAMPIRES
@@ -19,6 +20,7 @@ from astropolcal.words import did_you_mean
 
 __all__ = [
     "CHARIS",
+    "FORS2",
     "IRDIS",
     "VAMPIRES",
     "FileLayout",
@@ -135,5 +137,6 @@ def get(name):
 
 
 register(CHARIS)
+register(FORS2)
 register(IRDIS)
 register(VAMPIRES)

@@ -1,0 +1,57 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Instruments from public papers: what their chains measure of a star, and what calibrates them."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from astropolcal import calibrate, instruments
+from astropolcal.correction import measurement_rows
+from astropolcal.simulation import simulate
+
+
+def differences(chain, positions, wavelength, stokes):
+    """Return the normalized single differences of frames of a star, right minus left."""
+    right, left = measurement_rows(chain, positions, wavelength) @ stokes
+    return (right - left) / (right + left)
+
+
+def on_sky(name, source="polarized"):
+    """Return an instrument, its chain from the sky, and its first wavelength."""
+    instrument = instruments.get(name)
+    grid = instrument.wavelength[:1]
+    return instrument, instrument.on_sky(instrument.chain(source, wavelength=grid)), grid
+
+
+# --- FORS2
+
+
+def test_fors2_measures_angles_from_its_position_angle():
+    _, chain, grid = on_sky("fors2")
+    chain["hwp"].retardance = [180] * u.deg
+    aolp, pa = 50 * u.deg, 20 * u.deg
+    stokes = [1, *(0.1 * f((2 * aolp).to_value(u.rad)) for f in (np.cos, np.sin)), 0]
+    for plate in (0, 11, 45, 77.5) * u.deg:
+        positions = {"hwp": [plate.value] * u.deg, "parallactic": [pa.value] * u.deg}
+        expected = 0.1 * np.cos(4 * plate - 2 * (aolp - pa)) * 0.99
+        seen = differences(chain, positions, grid, stokes)
+        np.testing.assert_allclose(np.ravel(seen), expected, atol=1e-12)
+
+
+def test_fors2_is_calibrated_at_arbitrary_angles_of_the_plate():
+    fors2 = instruments.get("fors2")
+    truth = fors2.chain("polarized")
+    truth["hwp"].theta = [-3, -1, 2, 4] * u.deg
+    truth["hwp"].retardance = [172, 178, 177, 174] * u.deg
+    frames = QTable({"hwp": np.linspace(3, 177, 30) * u.deg})
+    meta = {"instrument": "FORS2", "source": "polarized"}
+    seen = simulate(truth, fors2.wavelength, frames, flux=1e8, seed=1, meta=meta)
+    (start,) = fors2.chains_for([seen])
+    found = calibrate(
+        start, seen, observable="normalized_single_difference", cross_validate=False
+    ).chains[0]
+    for key in ("theta", "retardance"):
+        want = getattr(truth["hwp"], key).value
+        np.testing.assert_allclose(getattr(found["hwp"], key).value, want, atol=0.1)
+    assert found["wollaston"].efficiency.value == pytest.approx(0.99, abs=1e-3)
