@@ -15,6 +15,7 @@ from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.fors2 import FORS2
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.roman import RomanCoronagraph
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
 
@@ -26,6 +27,7 @@ __all__ = [
     "FileLayout",
     "Instrument",
     "ReadOut",
+    "RomanCoronagraph",
     "SkyLaw",
     "add_nuisance",
     "get",
@@ -139,4 +141,5 @@ def get(name):
 register(CHARIS)
 register(FORS2)
 register(IRDIS)
+register(RomanCoronagraph)
 register(VAMPIRES)

@@ -11,10 +11,10 @@ Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1
 of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
 Gonzalez-Gaitan et al. 2020 (imaging in four filters).
 
-Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99, and what
-is polarized on the axis starts at 0. The zero of the plate depends on the wavelength; ESO's table
-of it is not included: it is free, 0 deg at the start. The sign of ``ESO ADA POSANG`` is taken as
-that of a position angle from north to east.
+Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99,
+and what is polarized on the axis starts at 0. The zero of the plate depends on the wavelength;
+the table of it by ESO is not included: it is free, 0 deg at the start. The sign of
+``ESO ADA POSANG`` is taken as that of a position angle from north to east.
 """
 
 import astropy.units as u

@@ -7,6 +7,7 @@ import pytest
 from astropy.table import QTable
 
 from astropolcal import calibrate, instruments
+from astropolcal.chain import remove_optic
 from astropolcal.correction import measurement_rows
 from astropolcal.simulation import simulate
 
@@ -55,3 +56,41 @@ def test_fors2_is_calibrated_at_arbitrary_angles_of_the_plate():
         want = getattr(truth["hwp"], key).value
         np.testing.assert_allclose(getattr(found["hwp"], key).value, want, atol=0.1)
     assert found["wollaston"].efficiency.value == pytest.approx(0.99, abs=1e-3)
+
+
+# --- Roman
+
+
+def test_roman_measures_q_and_u_one_after_the_other():
+    roman = instruments.get("Roman/CGI")
+    chain = remove_optic(roman.chain("target"), "star")
+    chain["mirrors"].retardance = [0, 0] * u.deg
+    positions = {"roll": [0, 0, 30, 30] * u.deg, "prism": [0, 45, 0, 45] * u.deg}
+    angle = np.deg2rad(2 * 30)
+    turned = [0.1 * np.cos(angle), 0.1 * np.sin(angle)]
+    seen = differences(chain, positions, roman.wavelength, [1, 0.1, 0, 0])
+    # the angle on the detector is that on the sky plus the roll
+    for row in seen:
+        np.testing.assert_allclose(row / 0.99, [0.1, 0, *turned], atol=1e-12)
+
+
+def test_roman_is_calibrated_by_standard_stars_at_three_rolls():
+    roman = instruments.get("roman")
+    sources = {"unpolarized standard": "", "polarized standard": "HD 7927"}
+    seen = []
+    for source, target in sources.items():
+        truth = roman.chain(source, target=target)
+        truth["telescope"].horizontal = [0.012, 0.007]
+        truth["telescope"].diagonal = [-0.004, 0.003]
+        truth["mirrors"].retardance = [25, 12] * u.deg
+        frames = QTable({"roll": np.repeat([-13, 13, 50], 2) * u.deg})
+        frames["prism"] = np.tile([0, 45], 3) * u.deg
+        meta = {"instrument": "roman", "source": source, "object": target}
+        seen.append(simulate(truth, roman.wavelength, frames, flux=1e9, seed=1, meta=meta))
+    found = calibrate(roman.chains_for(seen), seen, weights="errors", cross_validate=False)
+    for key, want in {"horizontal": [0.012, 0.007], "diagonal": [-0.004, 0.003]}.items():
+        value = getattr(found.chains[0]["telescope"], key).value
+        np.testing.assert_allclose(value, want, atol=1e-3)
+    errors = dict(zip(found.covariance.names, found.covariance.stds, strict=True))
+    error = next(std for name, std in errors.items() if name.startswith("mirrors.retardance"))
+    assert abs(found.chains[0]["mirrors"].retardance.value[0] - 25) < 4 * error < 20
