@@ -15,6 +15,7 @@ from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.fors2 import FORS2
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.nirc2 import NIRC2
 from astropolcal.instruments.roman import RomanCoronagraph
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
@@ -23,6 +24,7 @@ __all__ = [
     "CHARIS",
     "FORS2",
     "IRDIS",
+    "NIRC2",
     "VAMPIRES",
     "FileLayout",
     "Instrument",
@@ -141,5 +143,6 @@ def get(name):
 register(CHARIS)
 register(FORS2)
 register(IRDIS)
+register(NIRC2)
 register(RomanCoronagraph)
 register(VAMPIRES)

@@ -18,11 +18,12 @@ def differences(chain, positions, wavelength, stokes):
     return (right - left) / (right + left)
 
 
-def on_sky(name, source="polarized"):
+def on_sky(name):
     """Return an instrument, its chain from the sky, and its first wavelength."""
     instrument = instruments.get(name)
     grid = instrument.wavelength[:1]
-    return instrument, instrument.on_sky(instrument.chain(source, wavelength=grid)), grid
+    options = {key: grid for key in instrument.sky_options}
+    return instrument, instrument.on_sky(instrument.chain(wavelength=grid), **options), grid
 
 
 # --- FORS2
@@ -94,3 +95,32 @@ def test_roman_is_calibrated_by_standard_stars_at_three_rolls():
     errors = dict(zip(found.covariance.names, found.covariance.stds, strict=True))
     error = next(std for name, std in errors.items() if name.startswith("mirrors.retardance"))
     assert abs(found.chains[0]["mirrors"].retardance.value[0] - 25) < 4 * error < 20
+
+
+# --- NIRC2
+
+
+def test_nirc2_turns_q_and_u_as_its_pipeline_says():
+    """Q and U of ideal optics are turned by -2 PARANG + 2 EL + 2 ROTPDEST + 4 offset."""
+    nirc2, chain, grid = on_sky("nirc2")
+    for name in ("hwp", "derotator", "m3"):
+        chain[name].retardance = [180] * u.deg
+    chain["m3"].diattenuation = [0]
+    cycle = np.array([0, 45, 22.5, 67.5])
+    for parallactic, altitude, obrt, offset in ((0, 0, 0, 0), (13, 40, 25, 3), (-70, 66, 110, -8)):
+        positions = {"hwp": cycle - offset} | {
+            "parallactic": [parallactic] * 4,
+            "altitude": [altitude] * 4,
+            "derotator": [obrt] * 4,
+        }
+        positions = {stage: angles * u.deg for stage, angles in positions.items()}
+        for aolp in (0, 30):
+            stokes = [1, *(0.1 * f(np.deg2rad(2 * aolp)) for f in (np.cos, np.sin)), 0]
+            x = np.ravel(differences(chain, positions, grid, stokes))
+            measured = np.angle(complex(x[0] - x[1], x[2] - x[3]))
+            turned = -2 * parallactic + 2 * altitude + 4 * obrt + 4 * offset
+            expected = np.exp(1j * np.deg2rad(2 * aolp + turned))
+            np.testing.assert_allclose(np.exp(1j * measured), expected, atol=1e-9)
+    # with the field at rest the sky and the altitude drop out
+    f, g = nirc2.sky_law.derotator_law("field")
+    assert (4 * f - 2, 4 * g + 2) == (0, 0)
