@@ -15,6 +15,7 @@ from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.fors2 import FORS2
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.magaox import MagAOX
 from astropolcal.instruments.nirc2 import NIRC2
 from astropolcal.instruments.roman import RomanCoronagraph
 from astropolcal.instruments.vampires import VAMPIRES
@@ -28,6 +29,7 @@ __all__ = [
     "VAMPIRES",
     "FileLayout",
     "Instrument",
+    "MagAOX",
     "ReadOut",
     "RomanCoronagraph",
     "SkyLaw",
@@ -143,6 +145,7 @@ def get(name):
 register(CHARIS)
 register(FORS2)
 register(IRDIS)
+register(MagAOX)
 register(NIRC2)
 register(RomanCoronagraph)
 register(VAMPIRES)

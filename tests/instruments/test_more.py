@@ -9,6 +9,7 @@ from astropy.table import QTable
 from astropolcal import calibrate, instruments
 from astropolcal.chain import remove_optic
 from astropolcal.correction import measurement_rows
+from astropolcal.exceptions import InstrumentError
 from astropolcal.simulation import simulate
 
 
@@ -124,3 +125,23 @@ def test_nirc2_turns_q_and_u_as_its_pipeline_says():
     # with the field at rest the sky and the altitude drop out
     f, g = nirc2.sky_law.derotator_law("field")
     assert (4 * f - 2, 4 * g + 2) == (0, 0)
+
+
+# --- MagAO-X
+
+
+def test_magaox_sends_vertical_polarization_to_the_right_beam():
+    magaox = instruments.get("MagAO-X")
+    chain = remove_optic(magaox.chain("polarized"), "polarizer")
+    positions = {"hwp": [0, 45] * u.deg, "derotator": [0, 0] * u.deg}
+    seen = differences(chain, positions, magaox.wavelength, [1, 1, 0, 0])
+    assert seen.shape == (4, 2)
+    assert (seen[:, 0] < -0.98).all()
+    assert (seen[:, 1] > 0.98).all()
+
+
+def test_published_values_are_none():
+    """Their values are nominal: none may be taken for a published one."""
+    for name in ("fors2", "roman", "nirc2", "magaox"):
+        with pytest.raises(InstrumentError, match="no published values"):
+            instruments.get(name).published()
