@@ -4,8 +4,8 @@ VLT/FORS2, linear imaging and spectropolarimetry in the visible.
 
 FORS2 stands at the Cassegrain focus. Its adapter turns with the sky, so that the sky turns
 upstream of the instrument by the position angle of the instrument; the stage ``parallactic`` of
-the chain has this angle, and there is no derotator. Behind the collimator are a half-wave plate
-and a Wollaston prism.
+the chain has this angle, and there is no derotator. Downstream of the collimator are a half-wave
+plate and a Wollaston prism.
 
 Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1.5 % at the edges
 of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
@@ -68,7 +68,7 @@ class FORS2(Instrument):
 
     def chain(self, source="polarized", optics_in=(), *, wavelength=None, star="star", target=None):
         """
-        Return the chain of a polarizer in front of the instrument, or of a star.
+        Return the chain of a polarizer upstream of the instrument, or of a star.
 
         Free are, per wavelength, retardance and zero of the plate and the efficiency of the
         prism, and of stars what the collimator polarizes, which a polarizer hides.

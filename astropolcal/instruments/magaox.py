@@ -1,10 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Magellan/MagAO-X, visible polarimetry with two cameras behind a polarizing beam splitter.
+Magellan/MagAO-X, visible polarimetry with two cameras and a polarizing beam splitter.
 
-From its handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html, which calls
-itself a work in progress: a half-wave plate, a cube that sends horizontal polarization to camsci1 and
-vertical to camsci2, the difference camsci2 - camsci1, and the keyword ``PARANG``. So camsci2 is the
+From its handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html, a work
+in progress: a half-wave plate, a cube that sends horizontal polarization to camsci1 and vertical
+to camsci2, the difference camsci2 - camsci1, and the keyword ``PARANG``. So camsci2 is the
 right beam here.
 
 Not known from it, and assumed here: the plate stands upstream of the K-mirror, both count as at

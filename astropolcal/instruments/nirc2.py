@@ -67,7 +67,7 @@ class NIRC2(Instrument):
 
         Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the
         prism; the angles of plate and K-mirror for all wavelengths; and of stars the
-        diattenuation of the tertiary mirror, whose retardance a star does not tell.
+        diattenuation of the tertiary mirror, whose retardance is held.
 
         Parameters
         ----------

@@ -300,10 +300,12 @@ def test_optics_behind_the_plate_are_those_of_the_lamp():
     """The same objects are modelled, whichever light comes: names, stages and values."""
     for name in instruments.names():
         instrument = instruments.get(name)
-        inner = instrument.published()
+        if not instrument.has_telescope:
+            continue
+        inner = instrument.chain("polarized")
         sky = instrument.on_sky(inner)
         behind = leaves(inner)[1:]
-        assert set(stages(sky)) >= {"parallactic", "hwp", "derotator"}, name
+        assert set(stages(sky)) >= {"parallactic", "hwp", *stages(inner)}, name
         for old, new in zip(behind, leaves(sky)[-len(behind) :], strict=True):
             assert (old.name, old.mount) == (new.name, new.mount), name
             for key in old.param_names:
