@@ -58,6 +58,26 @@ OUTPUTS = {
     "efficiency": "efficiency cal.asdf",
     "published efficiency": "efficiency --instrument irdis",
 }
+# how the summary says verdict, accuracy, what is determined, what to do next and what was written
+VERDICT = r"^(Usable|NOT USABLE AS IT IS|NOT CONVERGED)"
+SKY = [VERDICT, r"^On sky      \S", r"^Determined  \d", r"^Not         \S", r"^Next        \S"]
+TOLD = [VERDICT, r"^Accuracy    \S", r"^Determined  \S", r"^Next        \S"]
+CAUSES = [
+    "^(The model (lacks|agrees)|Something in)",
+    r"is off by \d",
+    "probability|does not show",
+    r"^Next  +\S",
+]
+SUMMARIES = {
+    "calibrate run.ecsv -o again.asdf --json x.json": SKY,
+    "info cal.asdf --json x.json": SKY,
+    "sample cal.asdf run.ecsv --walkers 40 --steps 20 -o again.asdf --json x.json": SKY,
+    "diagnose gain.ecsv --effects beam_gain,hwp_diattenuation --json x.json": CAUSES,
+    "diagnose run.ecsv --derotator linear --effects hwp_tilt --json x.json": CAUSES,
+    f"{OUTPUTS['reduction']} --json x.json": TOLD,
+    f"{OUTPUTS['correction']} --json x.json": TOLD,
+}
+LINES = 24
 STARS = ["HD 293396", "HD 30675", "HD 212311", "HD 14069"]
 SAMPLES = "sample cal.asdf run.ecsv --parameters hwp.w_sio2 --walkers 8 --steps 40"
 
@@ -126,6 +146,28 @@ def test_output_fits_a_terminal():
         assert out.strip(), what
         assert_fits(out)
         assert_fits("\n".join(line for line in err.splitlines() if "warning:" not in line))
+
+
+@pytest.mark.slow
+def test_summary_says_five_things_in_24_lines():
+    for package in ("emcee", "arviz_stats"):
+        pytest.importorskip(package)
+    if not os.path.isdir("cubes"):
+        call(OUTPUTS["cubes"])
+    for words, told in SUMMARIES.items():
+        out = call(words)[0]
+        assert_fits(out)
+        # the prompt takes the last line
+        assert out.count("\n") < LINES, f"{words}: too high:\n{out}"
+        for item in [*told, r"^Written:    x\.json$"]:
+            assert re.search(item, out, re.MULTILINE), f"{words}: no {item!r} in\n{out}"
+        whole = call(f"{words} --full")[0].splitlines()
+        assert_fits("\n".join(whole))
+        both = CAUSES[:1] if told is CAUSES else told
+        for place, items in ((whole[:LINES], both), (whole[1 - LINES :], [*both, told[-1]])):
+            for item in items:
+                assert any(re.search(item, line) for line in place), f"{words} --full: no {item!r}"
+    assert call("info")[0].count("\n") < LINES
 
 
 def test_samples_fit_a_terminal():
