@@ -11,8 +11,10 @@ import contextlib
 import io
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import astropy.units as u
 import numpy as np
@@ -216,3 +218,23 @@ def test_nothing_moves_the_cursor_of_a_pipe():
         )
         assert done.stdout, words
         assert not re.search(rb"[\r\x1b\x08]", done.stdout + done.stderr), words
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of a group of processes")
+@pytest.mark.slow
+def test_interruption_of_several_processes_is_one_line():
+    call("simulate --cubes many --source star --hwp 0,45,22.5,67.5 --derotator 50,60,70,80,90"
+         " --altitude 70 --parallactic 20 --flux 2e6")  # fmt: skip
+    words = "reduce many --raw many/raw -o late.ecsv --source star --workers 2 --resume begun"
+    command = [sys.executable, "-m", "astropolcal.scripts.main", *words.split()]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # as a terminal does, to all processes of the command
+    process = subprocess.Popen(command, start_new_session=True, **options)
+    while process.poll() is None and not os.path.exists("begun"):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 130, err
+    lines = [line for line in err.splitlines() if "warning: " not in line]
+    assert (out, lines) == ("", ["astropolcal: interrupted"])
+    assert not os.path.exists("late.ecsv")
