@@ -438,7 +438,7 @@ def demodulation(chain, wavelength, frames, *, components="IQUV", variance=None)
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     frames : `~astropy.table.QTable`
-        One row a frame with the position or state of every stage, as
+        One row per frame with the position or state of every stage, as
         `~astropolcal.simulation.simulate` takes it.
     components : {"IQUV", "IQU"}
         What is solved for; without V it is taken as zero.

@@ -41,8 +41,8 @@ def test_one_converter_for_each_tag():
     of_converters = [tag for converter in get_converters() for tag in converter.tags]
     assert len(of_converters) == len(set(of_converters))
     assert {definition.tag_uri for definition in extension.tags} == set(of_converters)
-    # one an optic, and calibrations of all versions
-    assert len(get_converters()) == len(OPTIC_MODULES) + 1
+    # one for each optic, one for chains, and one for calibrations of all versions
+    assert len(get_converters()) == len(OPTIC_MODULES) + 2
 
 
 def test_types_are_those_that_are_there():

@@ -247,7 +247,7 @@ def test_folder_without_permission(writer, tmp_path):
 
 def test_what_is_no_name_of_a_file():
     for name in ["", ".", "a\0b"]:
-        with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
+        with pytest.raises(AstropolcalError, match="not the name of a file"), atomic_path(name):
             pass
 
 

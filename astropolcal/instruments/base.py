@@ -288,7 +288,7 @@ class Instrument(ABC):
     references : tuple of str
         Where the values come from.
     entrance : str
-        The first optic behind the internal source, which a star's light meets behind the
+        The first optic downstream of the internal source, which a star's light meets after the
         telescope.
     sky_law : SkyLaw
         How half-wave plate and derotator follow the sky.

@@ -272,6 +272,8 @@ def option(entry, types):
             settings["required"] = True
         elif word in ("?", "*", "+"):
             settings["nargs"] = word
+            if word == "*":
+                settings.setdefault("default", [])
         elif word == "...":
             several = {"action": "append", "default": []}
             settings |= {"action": "extend"} if "nargs" in settings else several

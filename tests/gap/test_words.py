@@ -56,7 +56,8 @@ def content(*causes, **changes):
     """What `to_dict` says of a diagnosis."""
     target = {"dolp_percent": 1.0, "s_p_percent": 0.05, "s_chi_deg": 0.25, "words": "so"}
     dataset = {"name": "lamp", "s_res_percent": 1.0, "s_cv_percent": None}
-    accuracy = {"datasets": [dataset], "targets": [target]}
+    own = {"observable": "normalized_double_difference"}
+    accuracy = own | {"datasets": [dataset], "targets": [target]}
     one = {
         "verdict": "named",
         "frames": [],

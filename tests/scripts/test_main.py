@@ -234,7 +234,7 @@ def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
         for action in files_of(command, (Input, Output)):
             for name in ("n" * 256, "a\0b"):
                 err = refused(capsys, words_of(command, {action.dest: name}))
-                assert "too long" in err or "no name of a file" in err, command
+                assert "too long" in err or "not the name of a file" in err, command
 
 
 @pytest.mark.filterwarnings("ignore")
