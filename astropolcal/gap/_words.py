@@ -434,6 +434,18 @@ def text(content, frames=(), written=()):
     return f"{summary}\n\n{_joined(parts)}"
 
 
+def short(content, ends):
+    """Return the lines of a terminal: what is found and its causes, then the given ones."""
+    causes, room = content["causes"], _SUMMARY - 2 - len(ends)
+    for most in (len(causes), _NAMED, 1):
+        lines = _joined([content["sentences"], _table_lines(causes, most)]).split("\n")
+        if len(lines) <= room:
+            break
+    else:
+        lines = [*lines[: room - 1], f"and {len(lines) - room + 1} more lines"]
+    return [*lines, "", *ends]
+
+
 def _joined(parts):
     return "\n\n".join("\n".join(_wrapped(part)) for part in parts if part)
 

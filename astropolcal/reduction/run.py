@@ -5,10 +5,12 @@ import hashlib
 import json
 import os
 import re
+import signal
+import threading
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import cycle
 from multiprocessing import get_all_start_methods, get_context
@@ -381,13 +383,18 @@ def _results(files, task, workers):
         return
     lost = []
     with _pool(workers) as pool:
-        # in the order in which they end
-        futures = {pool.submit(reduce_frame, path, **task): path for path in files}
-        for future in as_completed(futures):
-            try:
-                yield future.result()
-            except BrokenProcessPool:
-                lost.append(futures[future])
+        try:
+            with _interrupted_later():
+                futures = {pool.submit(reduce_frame, path, **task): path for path in files}
+            # in the order in which they end
+            for future in as_completed(futures):
+                try:
+                    yield future.result()
+                except BrokenProcessPool:
+                    lost.append(futures[future])
+        finally:
+            # who is interrupted does not wait for the files that nobody has begun
+            pool.shutdown(cancel_futures=True)
     # whichever file kills its process must not take the others with it
     for path in lost:
         with _pool(1) as pool:
@@ -402,9 +409,41 @@ def _pool(workers):
         context = get_context("forkserver")
         # imported once, not by each process
         context.set_forkserver_preload(["astropolcal.reduction.frames", "photutils.aperture"])
+        _start_server()
     else:
         context = get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context)
+    # an interruption from the keyboard goes to all processes; this one ends the others
+    ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    return ProcessPoolExecutor(workers, mp_context=context, **ignored)
+
+
+@contextmanager
+def _interrupted_later():
+    """Put off an interruption from the keyboard: processes that are half started complain."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came = []
+    before = signal.signal(signal.SIGINT, lambda *_: came.append(True)) or signal.SIG_DFL
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
+def _start_server():
+    """Start what the processes are forked from, so that no interruption ever reaches it."""
+    from multiprocessing import forkserver, resource_tracker
+
+    # first: its start unblocks the signal
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # --- what is said of the run -------------------------------------------------------

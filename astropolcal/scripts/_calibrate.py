@@ -8,7 +8,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
-from astropolcal.files import one_line
 from astropolcal.scripts._common import (
     check_suffix,
     edit_chains,
@@ -21,7 +20,6 @@ from astropolcal.scripts._common import (
     write_calibration,
 )
 from astropolcal.units import plain_number
-from astropolcal.words import counted
 
 HELP = "fit an instrument's chain of optics to observation tables"
 DESCRIPTION = """\
@@ -128,6 +126,7 @@ def _tell(arguments, calibration, targets, written):
     """Print the summary and what was written; of an unusable result something even if quiet."""
     from astropolcal.calibration.result.summary import summary
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines, verdict
+    from astropolcal.scripts._ending import written_calibration
 
     found = verdict(calibration, targets)
     if is_quiet(arguments):
@@ -135,7 +134,7 @@ def _tell(arguments, calibration, targets, written):
             words = f"NOT USABLE AS IT IS: {'; '.join(found.reasons)}"
             show(f"astropolcal: warning: {words}", file=sys.stderr)
         return
-    last = _written(arguments, written)
+    last = written_calibration(arguments, written)
     if arguments.full:
         # its end is what stays on the screen
         lines = [summary(calibration, targets, full=True), "", *found.words]
@@ -144,15 +143,6 @@ def _tell(arguments, calibration, targets, written):
         before = 0 if arguments.files else 2
         lines = compact_lines(calibration, found, HEIGHT - before - len(last))
     show("\n".join([*lines, *last]))
-
-
-def _written(arguments, written):
-    """Say in a few lines which files were written; figures are counted."""
-    figures = len(written) - sum(path in (arguments.output, arguments.json) for path in written)
-    named = [path for path in written if path in (arguments.output, arguments.json)]
-    named += [f"{counted(figures, 'figure')} in {arguments.plots}"] if figures else []
-    kept = [] if arguments.output else ["Not kept: -o cal.asdf writes the calibration to a file"]
-    return [f"Written:    {one_line(name, None)}" for name in named] + kept
 
 
 def _is_known(observations):

@@ -79,7 +79,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --plot FILE Output  figure of the result
 --workers N int  threads of dask
 --cluster ADDRESS  scheduler of dask.distributed
-@ json online quiet
+@ full json online quiet
 """
 # options that `correct` calls the same
 _PASSED_ON = (
@@ -171,7 +171,7 @@ def run(arguments):
     if arguments.json:
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
-        _report(summary, result.systematic)
+        _report(summary, result.systematic, arguments)
 
 
 def _check_options(arguments):
@@ -321,29 +321,73 @@ def _summary(result, star, arguments, n_frames):
     }
 
 
-def _report(summary, systematic):
+def _report(summary, systematic, arguments):
+    """Print how well the Stokes parameters are determined, the star, and the summary."""
+    from astropolcal.scripts._ending import ending, with_ending, written_lines
+
+    named = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
+    ends = ending(*_verdict(summary, systematic), written_lines(named))
+    show("\n".join(with_ending(_lines(summary, systematic), ends, arguments.full)))
+
+
+def _verdict(summary, systematic):
+    """Return verdict, accuracy, what is determined, and what to do next, of the star."""
+    star, n = summary["aperture"], len(summary["wavelength_nm"])
+    good = n - len(summary["poorly_determined"])
+    is_open = {
+        words: systematic is not None and systematic.is_open and not np.isfinite(star[key]).any()
+        for words, key in (("DoLP", "s_p_systematic"), ("AoLP", "s_chi_systematic"))
+    }
+    told = [words for words, applies in is_open.items() if applies]
+    kinds = ("statistical", "systematic")
+    degree, angle = (
+        " + ".join(
+            _middle(scale * star[f"{key}_{kind}"], ".2g", unit, none=none)
+            for kind, none in zip(
+                kinds, ("unknown", "open" if is_open[words] else "unknown"), strict=True
+            )
+        )
+        for words, key, unit, scale in (("DoLP", "s_p", " %", 100), ("AoLP", "s_chi", " deg", 1))
+    )
+    verdict, advice = "Usable", "astropolcal info tells what the product holds"
+    if not good:
+        verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
+        advice = "frames at more angles of the half-wave plate and of the field"
+    elif told:
+        verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(told)}"
+        advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
+    elif good < n:
+        verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
+    accuracy = f"DoLP {degree}, AoLP {angle} (statistical + systematic)"
+    return verdict, accuracy, f"{summary['components']} at {good} of {n} wavelengths", advice
+
+
+def _lines(summary, systematic):
+    """Return what was done, and the star within the aperture."""
     # not finite where nothing was determined
     condition = summary["condition"][np.isfinite(summary["condition"])]
     frames = counted(summary["n_frames"], "frame")
-    written, calibration = (one_line(summary[key], None) for key in ("output", "calibration"))
-    show(f"Written: {written} ({frames}, mode {summary['mode']})")
-    show(f"  calibration: {calibration}")
+    lines = [
+        f"{frames}, mode {summary['mode']}",
+        f"  calibration: {one_line(summary['calibration'], None)}",
+    ]
     if condition.size:
         limits = f"{min(condition):.3g} to {max(condition):.3g}"
-        show(f"  condition number of the solution for {summary['components']}: {limits}")
+        lines.append(f"  condition number of the solution for {summary['components']}: {limits}")
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
-        show(wrapped(line, indent=4))
+        lines += wrapped(line, indent=4).split("\n")
     aperture = summary["aperture"]
-    show(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
+    lines.append(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
     unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
     for name, unit, error, scale in (("dolp", " %", "s_p", 100), ("aolp", " deg", "s_chi", 1)):
         words = "degree" if name == "dolp" else "angle"
         shown = _middle(scale * aperture[name], ".2f" if scale == 100 else ".1f", unit, scale == 1)
-        show(f"    {words} of linear polarization: {shown}")
+        lines.append(f"    {words} of linear polarization: {shown}")
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
             values = scale * aperture[f"{error}_{kind}"]
-            show(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
+            lines.append(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
+    return lines
 
 
 def _middle(values, form, unit, turns=False, none="not known"):

@@ -37,6 +37,7 @@ examples:
 Several tables are used together. The effects are listed by --effects help.
 """
 _PAGES = (".html", ".htm")
+_HINT = "--full adds each cause with its sizes, and where the gap lies"
 # what the figure with both channels of the data shows
 _SPECTRUM = (
     "Gap of the fit at each wavelength before and after, with the noise. The verdict and the "
@@ -61,7 +62,7 @@ files FILE * Input  observation tables (ECSV); before them may stand a calibrati
     measure in which the choice has no part
 --report FILE.html Output  write a page with tables and figures
 --save CAL.asdf Output  calibrate with the effects that were found, and write the calibration
-@ json online quiet
+@ full json online quiet
 """
 
 
@@ -92,7 +93,30 @@ def run(arguments):
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
-    say(summary(diagnosis, written))
+    ends = _ending(content, written)
+    if arguments.full:
+        # its end is what stays on the screen
+        say("\n".join([summary(diagnosis), "", wrapped(content["sentences"][0]), *ends]))
+    else:
+        from astropolcal.gap._words import short
+
+        say("\n".join(short(content, [*ends, _HINT])))
+
+
+def _ending(content, written):
+    """Return what to do next, and the files that were written."""
+    from astropolcal.gap._words import exposure
+    from astropolcal.scripts._ending import written_lines
+
+    following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
+    found = {
+        "none": "calibrate with this model",
+        "named": "--save FILE.asdf calibrates with what was found",
+        "located": "--save FILE.asdf calibrates with what was found",
+    }
+    told = following or [found.get(content["verdict"], "more frames, at other angles")]
+    words = wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
+    return [*words, *written_lines(written)]
 
 
 class _Progress:

@@ -57,7 +57,7 @@ def run(arguments):
     elif Path(path).is_dir():
         lines, content = _library(path)
     elif Path(path).suffix.lower() == ".asdf":
-        lines, content = _calibration(path, arguments.full)
+        lines, content = _calibration(path, arguments)
     elif _is_fits(path):
         lines, content = _wrapped(*describe_fits(path))
     else:
@@ -83,15 +83,16 @@ def _installation():
     }
     lines = [f"astropolcal {version}"]
     for key in ("instruments", "optics", "observables"):
-        lines.append(f"  {key + ':':<13}" + ("\n" + " " * 15).join(content[key]))
+        lines.append(wrapped(f"  {key + ':':<13}{', '.join(content[key])}", indent=15))
     return lines, content
 
 
-def _calibration(path, full):
+def _calibration(path, arguments):
     from astropolcal.calibration import Calibration
     from astropolcal.calibration.result.validity import validity_of
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines
     from astropolcal.converters.calibration import content_hash
+    from astropolcal.scripts._ending import written_lines
 
     calibration = Calibration.read(path)
     # when it was made and for when it holds are two things
@@ -103,15 +104,17 @@ def _calibration(path, full):
         f"  valid for {held}",
         f"  sha256 {digest}",
     ]
-    for record in calibration.datasets if full else ():
+    for record in calibration.datasets if arguments.full else ():
         optics = ", ".join(f"{k}: {v}" for k, v in record.meta.items() if k not in _DULL)
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
     content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
     lines, content = _wrapped(lines, content)
-    if full:
-        return [*lines, "", calibration.summary(full=True)], content
-    height = HEIGHT - len("\n".join(lines).split("\n")) - 1
-    return [*compact_lines(calibration, calibration.verdict(), height), *lines, HINT], content
+    last, found = written_lines([arguments.json]), calibration.verdict()
+    if arguments.full:
+        # its end is what stays on the screen
+        return [calibration.summary(full=True), "", *lines, "", *found.words, *last], content
+    height = HEIGHT - len("\n".join(lines).split("\n")) - len(last) - 1
+    return [*compact_lines(calibration, found, height), *lines, *last, HINT], content
 
 
 def _library(folder):

@@ -6,6 +6,8 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
+
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
@@ -50,7 +52,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --workers N int  number of processes
 --resume FILE Continued  journal of what is done, to go on after a stop
 --quicklook DIR Folder  write figures to this folder
-@ json online quiet
+@ full json online quiet
 """
 
 
@@ -133,12 +135,42 @@ def _report(reduction, arguments, figures):
     doubts = Counter(reason for reasons in reduction.doubts.values() for reason in reasons)
     for why, count in doubts.items():
         show(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
-    say, summary = printer(arguments), reduction.summary()
-    say(
-        f"Written: {one_line(arguments.output, None)} ({counted(summary['n_frames'], 'frame')}, "
-        f"{summary['n_masked']} of {counted(summary['n_cells'], 'cell')} masked)"
+    printer(arguments)("\n".join(_words(reduction, arguments, figures)))
+
+
+def _words(reduction, arguments, figures):
+    """Return what is masked, and the summary."""
+    from astropolcal.scripts._ending import ending, with_ending, written_lines
+
+    summary, output = reduction.summary(), one_line(arguments.output, None)
+    n_masked, n_cells = summary["n_masked"], summary["n_cells"]
+    lost = n_masked == n_cells
+    verdict = "NOT USABLE AS IT IS: all cells are masked" if lost else "Usable"
+    n_left, n_doubtful = len(reduction.problems), len(reduction.doubts)
+    told = [f"{counted(n_left, 'file')} left out"] if n_left else []
+    told += [f"{counted(n_doubtful, 'file')} doubtful"] if n_doubtful else []
+    if told:
+        verdict += ("; " if lost else ": ") + ", ".join(told)
+    masked = f"{n_masked} of {counted(n_cells, 'cell')} masked"
+    ends = ending(
+        verdict,
+        _accuracy(reduction.table),
+        f"{counted(summary['n_frames'], 'frame')}, {masked}",
+        "astropolcal info FILE tells of a cube" if lost else f"astropolcal calibrate {output}",
+        written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
     )
-    for reason, count in summary["flags"].items():
-        say(f"  masked, {reason}: {counted(count, 'cell')}")
-    if figures:
-        say(f"Figures: {one_line(arguments.quicklook, None)} ({counted(len(figures), 'file')})")
+    flags = summary["flags"].items()
+    body = [f"  masked, {reason}: {counted(count, 'cell')}" for reason, count in flags]
+    return with_ending(body, ends, arguments.full)
+
+
+def _accuracy(table):
+    """Return the error of a beam's flux, median over what is known."""
+    if not {"flux_right", "flux_right_err"} <= set(table.colnames):
+        return "not known: the fluxes have no errors"
+    # without units, and NaN where a cell is masked
+    flux, error = (np.ma.filled(table[n].value, np.nan) for n in ("flux_right", "flux_right_err"))
+    known = error[np.isfinite(error) & (flux > 0)] / flux[np.isfinite(error) & (flux > 0)]
+    if not known.size:
+        return "not known: no flux has an error"
+    return f"errors of the fluxes {100 * np.median(known):.2g} % (median, one beam, one frame)"

@@ -11,7 +11,6 @@ from astropolcal.scripts._common import (
     check_suffix,
     printer,
     read_datasets,
-    say_written,
     show,
     wrapped,
     write_calibration,
@@ -49,7 +48,7 @@ files FILE + Input  the tables that it was made from (ECSV)
 --seed N int  makes the run repeatable
 --checkpoint FILE.h5 Continued  write the steps here while the run lasts
 --resume  go on from the checkpoint, if there is one
-@ plots json online quiet
+@ plots full json online quiet
 """
 # the samples come to what the calibration holds, and nothing of it is lost
 DEFAULTS = {"may_replace": {"output": "calibration"}}
@@ -82,8 +81,7 @@ def run(arguments):
     calibration.posterior = _sample(calibration, arguments)
     # first the files: a reader of our words may have gone in the meantime
     written = write_calibration(calibration, arguments, calibration.to_dict)
-    say(_words(calibration.posterior))
-    say_written(say, written)
+    say(_words(calibration, arguments, written))
 
 
 def _check_options(arguments):
@@ -142,7 +140,20 @@ def _sample(calibration, arguments):
         raise
 
 
-def _words(posterior):
+def _words(calibration, arguments, written):
+    """Return the run in words, a table of the parameters, and what the calibration is worth."""
+    from astropolcal.scripts._ending import shortened, with_ending, written_calibration
+
+    posterior, words = calibration.posterior, calibration.verdict().words
+    complaints = posterior.convergence.complaints(posterior.names)
+    if complaints:
+        words[0] = shortened(f"NOT CONVERGED: {complaints[0]}")
+        words[-1] = "Next        more --steps; with --checkpoint FILE.h5, --resume goes on from it"
+    ends = [*words, *written_calibration(arguments, written)]
+    return "\n".join(with_ending(_table(posterior), ends, arguments.full))
+
+
+def _table(posterior):
     """Return the run in words, and what is common to all wavelengths as a table."""
     parameters = posterior.report()["parameters"]
     # values of a wavelength end in [i]; hundreds of them do not fit a terminal
@@ -151,9 +162,9 @@ def _words(posterior):
     shown = common or parameters
     width = max(map(len, shown)) + 2
     lines = [wrapped(line, indent=2) for line in posterior.words().splitlines()]
-    lines += ["", "".join(f"{text:>13}" for text in _COLUMNS).rjust(width + 52)]
+    lines += ["", " " * width + "".join(f"{text:>11}" for text in _COLUMNS)]
     for name, entry in shown.items():
-        numbers = "".join(f"{entry[key]:z13.5f}" for key in _COLUMNS)
+        numbers = "".join(f" {entry[key]:z10.5f}" for key in _COLUMNS)
         lines.append(f"{name:<{width}}{numbers} {entry['unit']}".rstrip())
     lines.append("median, and the 68 % interval from lower to upper")
     rest = len(parameters) - len(shown)
@@ -162,4 +173,4 @@ def _words(posterior):
         lines.append(
             f"{counted(rest, 'value')} given per wavelength {are} in the file and in the JSON"
         )
-    return "\n".join(lines)
+    return lines

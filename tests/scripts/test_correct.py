@@ -408,9 +408,11 @@ def test_report_has_units(capsys):
         summary = {
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
+            "wavelength_nm": np.array([1600.0]),
             "aperture": aperture,
         }  # fmt: skip
-        _correct._report(summary, systematic)
+        outputs = {"output": "o.fits", "spectrum": None, "plot": None, "json": "-", "full": False}
+        _correct._report(summary, systematic, SimpleNamespace(**outputs))
         lines = capsys.readouterr().out.splitlines()
         assert "  condition number of the solution for IQU: 1.5 to 1.6" in lines, systematic
         assert "    degree of linear polarization: 0.99 %" in lines, (systematic, words)
@@ -418,6 +420,11 @@ def test_report_has_units(capsys):
         assert "    angle of linear polarization: 30.0 deg" in lines, (systematic, words)
         assert "      statistical error: 2 deg" in lines, (systematic, words)
         assert lines.count(f"      systematic error: {words}") == 2, (systematic, words)
+        verdict = lines[lines.index("") + 1]
+        is_open = words == "infinite"
+        told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
+        assert verdict == (told if is_open else "Usable"), (systematic, words)
+        assert lines[-1] == "Written:    o.fits", (systematic, words)
 
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"

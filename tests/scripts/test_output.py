@@ -11,8 +11,10 @@ import contextlib
 import io
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import astropy.units as u
 import numpy as np
@@ -58,6 +60,26 @@ OUTPUTS = {
     "efficiency": "efficiency cal.asdf",
     "published efficiency": "efficiency --instrument irdis",
 }
+# how the summary says verdict, accuracy, what is determined, what to do next and what was written
+VERDICT = r"^(Usable|NOT USABLE AS IT IS|NOT CONVERGED)"
+SKY = [VERDICT, r"^On sky      \S", r"^Determined  \d", r"^Not         \S", r"^Next        \S"]
+TOLD = [VERDICT, r"^Accuracy    \S", r"^Determined  \S", r"^Next        \S"]
+CAUSES = [
+    "^(The model (lacks|agrees)|Something in)",
+    r"is off by \d",
+    "probability|does not show",
+    r"^Next  +\S",
+]
+SUMMARIES = {
+    "calibrate run.ecsv -o again.asdf --json x.json": SKY,
+    "info cal.asdf --json x.json": SKY,
+    "sample cal.asdf run.ecsv --walkers 40 --steps 20 -o again.asdf --json x.json": SKY,
+    "diagnose gain.ecsv --effects beam_gain,hwp_diattenuation --json x.json": CAUSES,
+    "diagnose run.ecsv --derotator linear --effects hwp_tilt --json x.json": CAUSES,
+    f"{OUTPUTS['reduction']} --json x.json": TOLD,
+    f"{OUTPUTS['correction']} --json x.json": TOLD,
+}
+LINES = 24
 STARS = ["HD 293396", "HD 30675", "HD 212311", "HD 14069"]
 SAMPLES = "sample cal.asdf run.ecsv --parameters hwp.w_sio2 --walkers 8 --steps 40"
 
@@ -128,6 +150,28 @@ def test_output_fits_a_terminal():
         assert_fits("\n".join(line for line in err.splitlines() if "warning:" not in line))
 
 
+@pytest.mark.slow
+def test_summary_says_five_things_in_24_lines():
+    for package in ("emcee", "arviz_stats"):
+        pytest.importorskip(package)
+    if not os.path.isdir("cubes"):
+        call(OUTPUTS["cubes"])
+    for words, told in SUMMARIES.items():
+        out = call(words)[0]
+        assert_fits(out)
+        # the prompt takes the last line
+        assert out.count("\n") < LINES, f"{words}: too high:\n{out}"
+        for item in [*told, r"^Written:    x\.json$"]:
+            assert re.search(item, out, re.MULTILINE), f"{words}: no {item!r} in\n{out}"
+        whole = call(f"{words} --full")[0].splitlines()
+        assert_fits("\n".join(whole))
+        both = CAUSES[:1] if told is CAUSES else told
+        for place, items in ((whole[:LINES], both), (whole[1 - LINES :], [*both, told[-1]])):
+            for item in items:
+                assert any(re.search(item, line) for line in place), f"{words} --full: no {item!r}"
+    assert call("info")[0].count("\n") < LINES
+
+
 def test_samples_fit_a_terminal():
     for package in ("emcee", "h5py", "arviz_stats"):
         pytest.importorskip(package)
@@ -174,3 +218,23 @@ def test_nothing_moves_the_cursor_of_a_pipe():
         )
         assert done.stdout, words
         assert not re.search(rb"[\r\x1b\x08]", done.stdout + done.stderr), words
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of a group of processes")
+@pytest.mark.slow
+def test_interruption_of_several_processes_is_one_line():
+    call("simulate --cubes many --source star --hwp 0,45,22.5,67.5 --derotator 50,60,70,80,90"
+         " --altitude 70 --parallactic 20 --flux 2e6")  # fmt: skip
+    words = "reduce many --raw many/raw -o late.ecsv --source star --workers 2 --resume begun"
+    command = [sys.executable, "-m", "astropolcal.scripts.main", *words.split()]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # as a terminal does, to all processes of the command
+    process = subprocess.Popen(command, start_new_session=True, **options)
+    while process.poll() is None and not os.path.exists("begun"):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 130, err
+    lines = [line for line in err.splitlines() if "warning: " not in line]
+    assert (out, lines) == ("", ["astropolcal: interrupted"])
+    assert not os.path.exists("late.ecsv")

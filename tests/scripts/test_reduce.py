@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import astropy.units as u
 import pytest
+from astropy.table import QTable
 
 from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalError, InstrumentError
@@ -106,6 +107,7 @@ class Reduced:
         self.problems = {f"night/a{i:02d}.fits": ["no star", "old"] for i in range(n_problems)}
         self.doubts = doubts or {}
         self.flags, self.n_frames = flags or {}, n_frames
+        self.table = QTable({"flux_right": [2.0, 4] * u.ct, "flux_right_err": [0.02, 0.08] * u.ct})
 
     def summary(self):
         return {
@@ -115,24 +117,45 @@ class Reduced:
 
 
 def said(capsys, reduction, figures=(), **options):
-    arguments = {"output": "run.ecsv", "quiet": False, "json": None, "quicklook": "look"} | options
+    arguments = {
+        "output": "run.ecsv",
+        "quiet": False,
+        "json": None,
+        "quicklook": "look",
+        "full": False,
+    }
+    arguments |= options
     _report(reduction, SimpleNamespace(**arguments), figures)
     return capsys.readouterr()
 
 
-def test_run_without_fault_is_one_line(capsys):
-    assert said(capsys, Reduced()) == ("Written: run.ecsv (2 frames, 0 of 8 cells masked)\n", "")
-    assert said(capsys, Reduced(n_frames=1)).out.startswith("Written: run.ecsv (1 frame, 0 of 4 c")
+def test_run_without_fault_is_the_summary(capsys):
+    out, err = said(capsys, Reduced())
+    assert out.splitlines() == [
+        "Usable",
+        "Accuracy    errors of the fluxes 1.5 % (median, one beam, one frame)",
+        "Determined  2 frames, 0 of 8 cells masked",
+        "Next        astropolcal calibrate run.ecsv",
+        "Written:    run.ecsv",
+    ]
+    assert err == ""
+    assert "\nDetermined  1 frame, 0 of 4 c" in said(capsys, Reduced(n_frames=1)).out
+
+
+def test_what_is_lost_is_in_the_verdict(capsys):
+    for reduction, words in [
+        (Reduced(2, doubts={"a": [DOUBT]}), "Usable: 2 files left out, 1 file doubtful"),
+        (Reduced(flags={"edge": 8}), "NOT USABLE AS IT IS: all cells are masked"),
+    ]:
+        assert words in said(capsys, reduction).out.splitlines(), words
 
 
 def test_masked_cells_and_figures_are_counted(capsys):
     out = said(capsys, Reduced(flags={"saturated": 3, "edge": 1}), ["a.png"]).out
-    assert out.splitlines() == [
-        "Written: run.ecsv (2 frames, 4 of 8 cells masked)",
-        "  masked, saturated: 3 cells",
-        "  masked, edge: 1 cell",
-        "Figures: look (1 file)",
-    ]
+    lines = out.splitlines()
+    assert lines[:2] == ["  masked, saturated: 3 cells", "  masked, edge: 1 cell"]
+    assert "Determined  2 frames, 4 of 8 cells masked" in lines
+    assert lines[-1] == "Written:    1 figure in look"
 
 
 def test_what_is_left_out_is_listed_up_to_a_limit(capsys):

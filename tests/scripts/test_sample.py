@@ -156,7 +156,7 @@ def test_words_and_table_on_the_terminal(sampled):
     assert lower - 0.01 < fitted < upper + 0.01
     assert row[5] == "mm"
     assert "1 value given per wavelength is in the file" in text
-    assert f"Written: {sampled / 'out.asdf'}" in text
+    assert f"Written:    {sampled / 'out.asdf'}" in text
 
 
 @pytest.mark.slow
