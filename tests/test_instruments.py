@@ -430,16 +430,13 @@ ALLOWED = {
     ("gap/effects/library.py", "dichroic"): "place of an effect, in a chain with or without one",
     ("reduction/tables.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
-    ("scripts/_common.py", "m3"): "option of the command line, and of two chains",
-    ("scripts/_challenge.py", "charis"): DEFAULT,
     ("scripts/_correct.py", "charis"): DEFAULT,
     ("scripts/_efficiency.py", "charis"): DEFAULT,
-    ("scripts/_efficiency.py", "examples:"): "help of the command line",
-    ("scripts/_reduce.py", "charis"): DEFAULT,
-    ("scripts/_simulate.py", "charis"): DEFAULT,
 }
 # arguments of argparse whose texts may cite an instrument
 HELP = {"help", "epilog", "description", "metavar"}
+# constants that hold the options of a command as its help shows them, and examples
+TEXTS = {"OPTIONS", "EXAMPLES", "DESCRIPTION", "_SHARED", "MODEL"}
 
 
 def _private_names():
@@ -459,12 +456,10 @@ def _not_code(tree):
     found = [n.body[0].value for n in ast.walk(tree) if isinstance(n, kinds) and
              n.body and isinstance(n.body[0], ast.Expr)]  # fmt: skip
     found += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg in HELP]
-    # what an option means, and the texts of the options that several commands have
-    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and len(n.args) > 1]
-    found += [n.args[1] for n in calls if getattr(n.func, "id", None) == "add"]
+    # the texts of options: of a command, and those that several commands have
     named = [n for n in ast.walk(tree) if isinstance(n, ast.Assign)]
-    shared = [n.value for n in named if getattr(n.targets[0], "id", None) == "_SHARED"]
-    found += [value for table in shared for value in getattr(table, "values", ())]
+    texts = [n.value for n in named if getattr(n.targets[0], "id", None) in TEXTS]
+    found += [value for text in texts for value in getattr(text, "values", (text,))]
     return {id(inner) for node in found for inner in ast.walk(node)}
 
 
