@@ -206,15 +206,19 @@ def _possible(base, best, scans):
         if best.model.is_physical(one.name):
             continue
         others = {other.name for other in best.chosen}
+        found = []
         for rival in _distinct(scans[one.name].candidates, _FITTED[0]):
             if rival.name in others or rival.evidence < ENOUGH:
                 continue
             chosen = [rival if other is one else other for other in best.chosen]
             model = base.with_effects([o.recipe for o in chosen], like=best.model)
             if model.is_physical(rival.name):
-                scans[rival.name] = scans[one.name]
-                best = _State(model, chosen, best.evidence + rival.evidence - one.evidence)
-                break
+                evidence = best.evidence + rival.evidence - one.evidence
+                found.append((model.fit.chi2, rival.name, _State(model, chosen, evidence)))
+        if found:
+            # derivatives promise little where a cause was impossible: the fits tell which is best
+            _, name, best = min(found, key=lambda item: item[0])
+            scans[name] = scans[one.name]
     return best
 
 
@@ -457,12 +461,16 @@ def _exchanged(base, best, library, first, say, cells):
                 # so many that none is sure: what each can be told from is all that is asked
                 continue
             rivals = _rivals_beside(found, one, library)
-            if others and (not rivals or rivals[0].evidence < ENOUGH):
+            # of many causes none is sure: the best rival is enough, and all stay
+            few = len(best.chosen) <= _MERGED[1]
+            if few and others and (not rivals or rivals[0].evidence < ENOUGH):
                 # the others do what it did
                 model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
-                best, like = _State(model, others, best.evidence - one.evidence), None
-                continue
-            for fresh in rivals:
+                lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2)
+                if lost < ENOUGH * max(1.0, best.model.mean_square):
+                    best, like = _State(model, others, best.evidence - one.evidence), None
+                    continue
+            for fresh in rivals if few else rivals[:1]:
                 if (fresh.name, fresh.degree) == (one.name, one.degree):
                     break
                 if fresh.name in {other.name for other in others}:
