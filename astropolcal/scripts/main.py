@@ -100,7 +100,11 @@ def main(argv=None):
     >>> from astropolcal.scripts.main import main
     >>> main(["info", "--instruments"])
     charis
+    fors2
     irdis
+    magaox
+    nirc2
+    roman
     vampires
     0
     """

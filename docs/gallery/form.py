@@ -11,7 +11,7 @@ import string
 import astropy.units as u
 import numpy as np
 
-from astropolcal.optics import FrameOptic
+from astropolcal.optics import COORDINATES, FrameOptic
 from astropolcal.units import canonical_factor
 
 _DRAWS = 9
@@ -42,13 +42,16 @@ def _evaluated(optic):
         drawn = _drawn(optic, rng)
         one = optic.with_parameters(**{"theta": 0 * u.deg, **drawn})
         x = rng.uniform(0.2, 0.8) * 1.5 * getattr(optic, "reference", 1.0)
-        angle = optic.stage not in ("sequence", "flc_state") and not hasattr(optic, "reference")
+        # the matrix of a state is that in the frames that have it
+        in_state = moves and "=" in optic.stage
+        x = 1.0 if in_state else x
+        angle = optic.stage not in COORDINATES and not hasattr(optic, "reference")
         position = (x * u.rad if angle else x) if moves else None
         matrices.append(np.asarray(one.mueller(1.6 * u.um, position)).reshape(-1, 4, 4)[0])
         for key, value in drawn.items():
             number = getattr(value, "value", value) * canonical_factor(getattr(optic, key).unit)
             values.setdefault(_symbol(key), []).append(number)
-        if moves:
+        if moves and not in_state:
             values.setdefault("x", []).append(x / getattr(optic, "reference", 1.0))
     return np.array(matrices), {key: np.array(numbers) for key, numbers in values.items()}
 
