@@ -147,7 +147,9 @@ def _positions(chain, frames, fluxes):
     if fluxes is not None:
         known["previous_flux"] = np.roll(fluxes, 1) / np.maximum(fluxes, 1e-3 * _FLUX)
         known["previous_flux"][0] = 1.0
-    # any other stage goes through half a turn
+    # a state is that of the second half, as with the liquid crystal; any other stage goes through
+    # half a turn
+    known |= {name: known["flc_state"] for name in stages(chain) if "=" in name}
     return {name: known.get(name, 180 * share * u.deg) for name in stages(chain)}
 
 
