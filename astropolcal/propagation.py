@@ -154,7 +154,7 @@ class Propagator:
             return Sweep(self, values).fluxes
         common, frame = _at(self._common, values, 0.0)
         arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
-        # what stands still meets the light of all frames as two rows per wavelength
+        # what is static meets the light of all frames as two rows per wavelength
         rows = np.concatenate([row for row, _ in arms], axis=1)
         rows, phase = _inward(common[self._meeting :], rows, arms[0][1])
         light, fresh = _behind(common[: self._meeting], self.source, keep=False)

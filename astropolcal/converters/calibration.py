@@ -393,7 +393,7 @@ def _check_shared(chains, free):
 
 def _check_covariance(covariance, free):
     _check_names("covariance", covariance.names, free.names)
-    # a parameter with one value a wavelength has as many rows of the covariance
+    # a parameter with one value per wavelength has as many rows of the covariance
     for name, unit, expected in zip(free.names, covariance.units, free.units, strict=True):
         if unit != expected:
             raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")

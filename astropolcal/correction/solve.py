@@ -137,7 +137,7 @@ class Estimator:
     # both (n_wavelengths, n_components); what each takes from a V that is taken as zero
     determined: np.ndarray
     leakage: np.ndarray
-    # the poorly determined combinations in words, one a wavelength; else ""
+    # the poorly determined combinations in words, one per wavelength; else ""
     weak: list
     max_condition: float = _MAX_CONDITION
     # of the frames, (n_wavelengths, n_frames), and of the fluxes, (2, n_wavelengths, n_frames)

@@ -26,7 +26,7 @@ __all__ = []
 # sizes of the prior, in units of the usual one
 _SIZES = (0.1, 1.0, 10.0)
 # laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
-# None for one value a wavelength
+# None for one value per wavelength
 _DEGREES, _FREER = (0, 2), (4, None)
 # so many named effects stand in the same chain: each sees the light through all the others
 _TOGETHER = 20

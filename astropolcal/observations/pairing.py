@@ -181,7 +181,7 @@ class _Setting:
             distance = _apart(self.derotator[first], self.derotator[second])
             close = distance <= self.derotator_tolerance
             first, second = first[close], second[close]
-            # a derotator that drifts pairs neighbours; one that stands still is better
+            # a derotator that drifts pairs neighbours; one that is static is better
             drift = distance[close] > 0.5 * self.derotator_tolerance
         forward = self.phase[first] < self.phase[second]
         plus, minus = np.where(forward, (first, second), (second, first))

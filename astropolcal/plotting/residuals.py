@@ -123,7 +123,7 @@ class DataGrid:
 
     def _one_series(self, angle, member, state):
         angles = [degrees(value) for value in np.median(angle[:, member], axis=1)]
-        # where the states of a modulator make the difference the plate stands still
+        # where the states of a modulator make the difference the plate is static
         still = state and len(set(angles)) == 1
         plate = angles[0] if still else f" {MINUS} ".join(angles)
         label = f"{plate}, {state}" if state else plate

@@ -17,7 +17,7 @@ __all__ = []
 RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
-# a parameter that moves by less than this share along an open direction stands still
+# a parameter that moves by less than this share along an open direction is static
 STILL = 1e-5
 
 

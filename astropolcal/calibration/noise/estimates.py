@@ -622,7 +622,7 @@ def _roughness(residual, valid, basis):
     left = left - (left @ basis) @ basis.T
     # white noise of unit variance has second differences of variance 1 + 4 + 1
     second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
-    # what stands still at a wavelength, as its brightness, is no noise
+    # what is constant at a wavelength, as its brightness, is not noise
     second = second - np.median(second, axis=1, keepdims=True)
     keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
     # projection takes the freedom of its columns from the scatter

@@ -120,7 +120,7 @@ _PLATE_EFFECTS = [
         "harmonics 2 and 4 of the plate angle, smooth in wavelength", _THART,
         **_ON_PLATE, category="parameter",
     ),
-    # one value a wavelength, for two layers and any smooth law may be too stiff
+    # one value per wavelength, for two layers and any smooth law may be too stiff
     _effect(
         "hwp_retardance_free", "retardance of the half-wave plate that no smooth law describes",
         _PLATE, "retardance_h", _NO_RETARDER, "retardance", _size(1, 30, u.deg),
@@ -223,7 +223,7 @@ _DEROTATOR_EFFECTS = [
         )
         for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)
     ),
-    # for internal sources the derotator stands still during an exposure: bench data would tie the
+    # for internal sources the derotator is static during an exposure: bench data would tie the
     # lag to a rate that they do not have
     _effect(
         "derotator_motion",
