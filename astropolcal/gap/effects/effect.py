@@ -209,7 +209,7 @@ class Context:
             return found
         # a constant over the wavelengths is the orientation of the optic, which is known by itself
         if wanted is None:
-            # one value per wavelength, less their mean; singular vectors would be any basis of these
+            # values per wavelength, less their mean; singular vectors would be any basis of these
             return helmert(len(found)).T
         return found[:, 1:]
 
