@@ -288,7 +288,7 @@ class Probe:
     # ---- tables and headers
 
     def check_mounts(self):
-        layout = self.instrument.files
+        layout = self.instrument.files or self.instrument.headers
         known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
         for source, chain in self.chains():
             angles = [s for s in stages(chain) if s not in COORDINATES]
@@ -299,7 +299,8 @@ class Probe:
             require(placed, f"{source}: a star needs the site of the telescope")
 
     def check_headers(self):
-        keywords, layout = self.instrument.keywords, self.instrument.files
+        keywords = self.instrument.keywords
+        layout = self.instrument.files or self.instrument.headers
         if not keywords and layout is None:
             raise Absent("it has no keywords")
         every = dict(keywords) | (dict(layout.keywords) if layout else {})

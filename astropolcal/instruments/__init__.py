@@ -12,11 +12,17 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
 from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
+from astropolcal.instruments.fastpdi import FastPDI
 from astropolcal.instruments.fors2 import FORS2
+from astropolcal.instruments.gpi import GPI
+from astropolcal.instruments.hiciao import HiCIAO
+from astropolcal.instruments.ircs import IRCS
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.magaox import MagAOX
+from astropolcal.instruments.naco import NaCo
 from astropolcal.instruments.nirc2 import NIRC2
+from astropolcal.instruments.reach import REACH
 from astropolcal.instruments.roman import RomanCoronagraph
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
@@ -142,10 +148,19 @@ def get(name):
     )
 
 
-register(CHARIS)
-register(FORS2)
-register(IRDIS)
-register(MagAOX)
-register(NIRC2)
-register(RomanCoronagraph)
-register(VAMPIRES)
+for _cls in (
+    CHARIS,
+    FORS2,
+    FastPDI,
+    GPI,
+    HiCIAO,
+    IRCS,
+    IRDIS,
+    MagAOX,
+    NIRC2,
+    NaCo,
+    REACH,
+    RomanCoronagraph,
+    VAMPIRES,
+):
+    register(_cls)

@@ -285,6 +285,8 @@ class Instrument(ABC):
         Optics that are in the beam only sometimes.
     files : FileLayout or None
         How the instrument's FITS files look; None if they cannot be reduced here.
+    headers : FileLayout or None
+        How headers of its frames are read where its files cannot be reduced here.
     references : tuple of str
         Where the values come from.
     entrance : str
@@ -308,13 +310,11 @@ class Instrument(ABC):
     >>> from astropolcal import optics
     >>> from astropolcal.instruments import Instrument
     >>> class Simple(Instrument):
-    ...     name = "simple"
+    ...     name, sources = "simple", ("polarized",)
     ...     def chain(self, source="polarized", optics_in=(), *, wavelength=None):
     ...         return (optics.LinearPolarizer(name="polarizer")
     ...                 | optics.LinearRetarder(mount="hwp", name="hwp")
     ...                 | optics.WollastonPrism(name="wollaston"))
-    ...     def setup(self, observations):
-    ...         return "polarized", ()
     >>> Simple().chain().submodel_names
     ('polarizer', 'hwp', 'wollaston')
     """
@@ -325,7 +325,7 @@ class Instrument(ABC):
     keywords = {}
     sources = ()
     optional_optics = ()
-    files = None
+    files = headers = None
     references = ()
     sky_options = ()
     entrance = "hwp"
@@ -353,16 +353,18 @@ class Instrument(ABC):
         `~astropy.modeling.CompoundModel`
         """
 
-    @abstractmethod
     def setup(self, observations):
         """
         Return ``source`` and ``optics_in`` of a dataset, from its table's meta.
+
+        Here the source that they state, and no optional optics.
 
         Raises
         ------
         InstrumentError
             If the table does not say.
         """
+        return self.source_of(observations), ()
 
     def check_choices(self, source, optics_in=(), **choices):
         """

@@ -39,7 +39,8 @@ _EFFICIENCY = [1.0, 0.992, 0.9953, 0.9816, 0.97, 0.9905, 0.9892, 0.9903, 0.9908,
 _PUBLISHED_SIO2, _PUBLISHED_MGF2 = 1.653, 1.291
 _PUBLISHED_MISALIGNMENT = {"calibration_polarizer": 90.03, "derotator": -0.02, "hwp": -0.04}
 
-_BOUNDS = {
+#: Bounds of the derotator's retardances, by their name.
+BOUNDS = {
     # every sign and mirror branch of the retardances
     "physical": {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)},
     # 0 to 360 deg in the published signs, turned to ours
@@ -191,15 +192,12 @@ class CHARIS(Instrument):
         >>> chain["derotator"].retardance.shape
         (22,)
         """
-        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(_BOUNDS))}
+        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(BOUNDS))}
         self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
         grid = self.grid(wavelength)
         train = subaru.entrance(source, grid, star, target, subaru.tertiary_mirror(m3, grid))
-        # the published retardances, in our sign, are where a fit starts
-        nm = CHARIS.wavelength.to_value(u.nm)
-        start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
         train.append(subaru.two_layer_plate(**subaru.misaligned(0)))
-        train.append(subaru.derotator(derotator, start, _BOUNDS[bounds]))
+        train.append(subaru.derotator(derotator, derotator_start(grid), BOUNDS[bounds]))
         if "dichroic" in optics_in:
             # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
@@ -298,6 +296,12 @@ class CHARIS(Instrument):
             return {}
         present = None if time is None else _switcher_by(time.utc.isot[:10])
         return {} if present is None else {"nbs": present}
+
+
+def derotator_start(grid):
+    """Return the published horizontal retardances in our sign, where a fit starts."""
+    nm = CHARIS.wavelength.to_value(u.nm)
+    return -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
 
 
 def _stated(meta, name, key, words):

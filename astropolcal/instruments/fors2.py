@@ -21,17 +21,22 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join
-from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.telescope import STARS, misaligned, star_source
-from astropolcal.observations.pointings import location_of
+from astropolcal.instruments.base import SkyLaw
+from astropolcal.instruments.layout import header_map
+from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
+from astropolcal.instruments.telescope import PARANAL
 
 __all__ = ["FORS2"]
 
 
-class FORS2(Instrument):
+class FORS2(Polarimeter):
     """
     VLT/FORS2 with its half-wave plate at any angles, and its Wollaston prism.
+
+    Its polarized source is a polarizer upstream of the instrument, such as the prism with which
+    ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
+    and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
+    hides.
 
     References
     ----------
@@ -56,68 +61,25 @@ class FORS2(Instrument):
         "parallactic": "ESO ADA POSANG",
         "altitude": "ESO TEL ALT",
     }
+    headers = header_map(keywords)
     references = (
         "Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581",
         "Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545",
         "Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379",
     )
-    sources = ("polarized", *STARS)
     entrance = "collimator"
+    site = PARANAL
     #: The plate stays where it is put: it turns with the instrument.
     sky_law = SkyLaw(plate=(0, 0), derotator={})
 
-    def chain(self, source="polarized", optics_in=(), *, wavelength=None, star="star", target=None):
-        """
-        Return the chain of a polarizer upstream of the instrument, or of a star.
-
-        Free are, per wavelength, retardance and zero of the plate and the efficiency of the
-        prism, and of stars what the collimator polarizes, which a polarizer hides.
-
-        Parameters
-        ----------
-        source : str
-            ``"polarized"``: light of a polarizer upstream of the instrument, such as the prism
-            with which ESO measured the zero of the plate. Or a kind of star.
-        optics_in : sequence of str
-            Nothing is optional here.
-        wavelength : `~astropy.units.Quantity`, optional
-            By default four filters; in spectropolarimetry the bins of the spectrum.
-        star, target : str
-            Name of the source optic of a star, and of the star in the catalogue.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-        """
-        self.check_choices(source, optics_in)
-        grid = self.grid(wavelength)
+    def inner(self, source, optics_in, grid):
+        """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
         zero = np.zeros(grid.size)
         collimator = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="collimator")
-        if source == "polarized":
-            train = [optics.LinearPolarizer(name="polarizer")]
-            collimator.horizontal.fixed = collimator.diagonal.fixed = True
-        else:
-            train = [star_source(source, grid, star, target), *self.telescope_optics()]
-        plate = {"theta": zero * u.deg, "retardance": np.full(grid.size, 178) * u.deg}
-        held = misaligned(0, 15)
-        # linear polarization cannot tell 180 + x from 180 - x
-        held["bounds"] |= {"retardance": (150, 180)}
-        train += [
-            collimator,
-            optics.LinearRetarder(mount="hwp", name="hwp", **plate, **held),
-            optics.WollastonPrism(efficiency=zero + 0.99, name="wollaston"),
-        ]
-        return join(train)
+        collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
+        plate = turning_retarder("hwp", 178, grid, most=15, theta=zero * u.deg)
+        return [collimator, plate, wollaston(grid)]
 
-    def telescope_optics(self, behind=()):
+    def telescope_optics(self, behind=(), *, wavelength=None):
         """Return the turning of the sky; M1 and M2 do not polarize on the axis."""
         return [optics.Rotator(mount="parallactic", name="parallactic")]
-
-    def setup(self, observations):
-        """Return the source from the table's meta, and no optional optics."""
-        return self.source_of(observations), ()
-
-    @property
-    def location(self):
-        """Site of the telescope, an `~astropy.coordinates.EarthLocation`."""
-        return location_of((-70.4045, -24.6268, 2648.0))

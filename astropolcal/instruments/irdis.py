@@ -24,7 +24,13 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
-from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
+from astropolcal.instruments.telescope import (
+    INTERNAL,
+    PARANAL,
+    STARS,
+    misaligned,
+    star_source,
+)
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
@@ -329,10 +335,6 @@ def _mirror(name, coating, index):
     )
 
 
-# longitude, latitude (deg) and height (m) of the telescope in the headers
-_SITE = (-70.4045, -24.6268, 2648.0)
-
-
 class IRDIS(Instrument):
     """
     VLT/SPHERE/IRDIS in dual-beam polarimetric imaging.
@@ -492,10 +494,6 @@ class IRDIS(Instrument):
             check_all_filters(behind)
         return telescope(filters_at(self.grid(wavelength)), coating_of(coating, date))
 
-    def setup(self, observations):
-        """Return the source from the table's meta, and no optional optics."""
-        return self.source_of(observations), ()
-
     def particulars(self, observations):
         """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
@@ -510,7 +508,7 @@ class IRDIS(Instrument):
     @property
     def location(self):
         """Site of the telescope, an `~astropy.coordinates.EarthLocation`."""
-        return location_of(_SITE)
+        return location_of(PARANAL)
 
     def frame_table(self, headers):
         """

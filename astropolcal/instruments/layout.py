@@ -101,9 +101,9 @@ class FileLayout:
         Column to further keywords, in which it is looked up in turn.
     units : dict of str to str
         Column to the unit of its keyword; degree where none is given.
-    transforms : dict of str to (float, float)
+    transforms : dict of str to (float, float) or dict
         Column to (factor, offset): value = factor * header + offset, in the
-        unit of the keyword.
+        unit of the keyword. Or to the value of each word that the keyword may have.
     raw_columns : tuple of str
         Columns looked up in the header of the raw frame where the cube lacks them.
     identities : tuple of str
@@ -285,6 +285,23 @@ class FileLayout:
         return [path for path in files if str(Path(path)) not in lefts]
 
 
+def header_map(keywords, transforms=(), **times):
+    """Return a layout that reads headers alone, of files whose cubes are not known."""
+    keywords = (
+        {
+            "mjd": "MJD-OBS",
+            "date": "DATE-OBS",
+            "right_ascension": "RA",
+            "declination": "DEC",
+            "object": "OBJECT",
+            "instrument": "INSTRUME",
+        }
+        | keywords
+        | times
+    )
+    return FileLayout(keywords, (1, 1, 1), units={"mjd": "d"}, transforms=dict(transforms))
+
+
 #: Columns that are angles of a stage.
 ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 #: Columns that are text, whatever they look like.
@@ -352,8 +369,12 @@ def _read(header, keyword):
 
 def convert(column, value, layout, target):
     """Return a value of a header as a float in a unit, or raise TypeError or ValueError."""
-    factor, offset = layout.transforms.get(column, (1.0, 0.0))
-    unit = unit_of(column, layout)
+    law, unit = layout.transforms.get(column, (1.0, 0.0)), unit_of(column, layout)
+    if isinstance(law, dict):
+        if str(value).strip() not in law:
+            raise ValueError(f"{value!r}; allowed are {', '.join(law)}")
+        return law[str(value).strip()] * unit.to(target)
+    factor, offset = law
     return (factor * plain_number(value) + offset) * unit.to(target)
 
 

@@ -3,7 +3,7 @@
 Coronagraph of the Nancy Grace Roman Space Telescope, linear polarimetry in bands 1 and 4.
 
 One of two Wollaston prisms is in the beam, clocked by 45 deg, so that q and u are measured one
-after the other (Groff et al. 2020); nothing modulates. Rolls of the spacecraft turn the sky. The
+after the other (Groff et al.); nothing modulates. Rolls of the spacecraft turn the sky. The
 centres of the bands, the keywords ``ROLL`` and ``DPAMNAME``, and the sign of the roll (the angle of
 polarization on the detector is that on the sky plus the roll) are those of the public pipeline
 corgidrp, https://github.com/roman-corgi/corgidrp.
@@ -19,14 +19,15 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join
-from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.telescope import star_source
+from astropolcal.instruments.base import SkyLaw
+from astropolcal.instruments.layout import header_map
+from astropolcal.instruments.polarimeter import Polarimeter, wollaston
+from astropolcal.instruments.telescope import misaligned, star_source
 
 __all__ = ["RomanCoronagraph"]
 
 
-class RomanCoronagraph(Instrument):
+class RomanCoronagraph(Polarimeter):
     """
     Coronagraph of the Roman Space Telescope with its two Wollaston prisms.
 
@@ -34,10 +35,14 @@ class RomanCoronagraph(Instrument):
     it is POL45. Its sources are not called stars, as there is no site of the telescope whose sky
     turns: "unpolarized standard", "polarized standard" and "target".
 
+    Free are, per band, the diattenuation of all that is upstream of the prisms, its retardance,
+    which lowers the signal of one prism, and the efficiency of the prisms; and their common
+    orientation.
+
     References
     ----------
-    Groff et al. 2020, "Roman Space Telescope CGI: prism and polarizer characterization modes",
-    Proc. SPIE 11443.
+    Groff et al., "Roman Space Telescope CGI: prism and polarizer characterization modes", Proc.
+    SPIE.
 
     Examples
     --------
@@ -51,64 +56,40 @@ class RomanCoronagraph(Instrument):
     aliases = ("Roman/CGI", "CGI")
     wavelength = [573.8, 825.5] * u.nm
     keywords = {"roll": "ROLL", "prism": "DPAMNAME"}
+    headers = header_map(keywords, transforms={"prism": {"POL0": 0.0, "POL45": 45.0}})
     references = (
-        "Groff et al. 2020, Proc. SPIE 11443, prism and polarizer characterization modes",
+        "Groff et al., Proc. SPIE, Roman Space Telescope CGI: prism and polarizer "
+        "characterization modes",
         "corgidrp, https://github.com/roman-corgi/corgidrp",
     )
     sources = ("unpolarized standard", "polarized standard", "target")
+    sky_options = ()
     entrance = "roll"
     #: Nothing follows the sky.
     sky_law = SkyLaw(plate=(0, 0), derotator={})
+    # a chain is of a source in the sky; there is no other that a telescope could be put before
+    has_telescope = False
 
-    def chain(self, source="target", optics_in=(), *, wavelength=None, star="star", target=None):
-        """
-        Return the chain of a standard star or a target.
-
-        Free are, per band, the diattenuation of all that is upstream of the prisms, its
-        retardance, which lowers the signal of one prism, and the efficiency of the prisms; and
-        their common orientation.
-
-        Parameters
-        ----------
-        source : str
-            ``"unpolarized standard"``, ``"polarized standard"`` or ``"target"``.
-        optics_in : sequence of str
-            Nothing is optional here.
-        wavelength : `~astropy.units.Quantity`, optional
-            By default the centres of bands 1 and 4.
-        star, target : str
-            Name of the source optic, and of the star in the catalogue of standards.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-        """
-        self.check_choices(source, optics_in)
-        grid = self.grid(wavelength)
-        zero = np.zeros(grid.size)
+    def light(self, source, grid, star, target):
+        """Return a standard star or a target."""
         kind = "star" if source == "target" else f"{source} star"
         light = star_source(kind, grid, star, target)
         if source == "polarized standard" and not target:
             # a start: of a star without polarization nothing tells the efficiencies
-            light.q = zero + 0.03
-        held = {"fixed": {"theta": False}, "bounds": {"theta": (-5, 5)}}
-        return join(
-            [
-                light,
-                optics.Rotator(mount="-roll", name="roll"),
-                optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="telescope"),
-                optics.LinearRetarder(
-                    retardance=(zero + 10) * u.deg, bounds={"retardance": (0, 90)}, name="mirrors"
-                ),
-                optics.WollastonPrism(
-                    efficiency=zero + 0.99, mount="prism", name="wollaston", **held
-                ),
-            ]
-        )
+            light.q = np.full(grid.size, 0.03)
+        return [light]
 
-    def setup(self, observations):
-        """Return the source from the table's meta, and no optional optics."""
-        return self.source_of(observations), ()
+    def inner(self, source, optics_in, grid):
+        """Return the turning of the sky, what is upstream of the prisms, and the prisms."""
+        zero = np.zeros(grid.size)
+        return [
+            optics.Rotator(mount="-roll", name="roll"),
+            optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="telescope"),
+            optics.LinearRetarder(
+                retardance=(zero + 10) * u.deg, bounds={"retardance": (0, 90)}, name="mirrors"
+            ),
+            wollaston(grid, mount="prism", **misaligned(0)),
+        ]
 
     def particulars(self, observations):
         """Return the names of a star, ``object`` in the meta: of its source, in the catalogue."""

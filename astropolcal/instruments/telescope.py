@@ -104,12 +104,12 @@ def published_mirror(name="m3"):
     return optics.PowerLawMirror(name=name, **_PUBLISHED)
 
 
-def telescope(mirror):
+def telescope(mirror, altitude="-altitude"):
     """Return the optics from the sky to the half-wave plate of an alt-azimuth telescope."""
     return [
         optics.Rotator(mount="parallactic", name="parallactic"),
         mirror,
-        optics.Rotator(mount="-altitude", name="altitude"),
+        optics.Rotator(mount=altitude, name="altitude"),
     ]
 
 
@@ -265,7 +265,9 @@ def star_options(observations):
     return {"star": f"star_{words}", "target": target}
 
 
-#: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
+#: Longitude, latitude (deg) and height (m) of the VLT, as in its headers.
+PARANAL = (-70.4045, -24.6268, 2648.0)
+#: And of the Subaru Telescope.
 SITE = (-155.4761, 19.8255, 4139.0)
 
 # 't Hart et al. 2021, thicknesses of the half-wave plate in mm

@@ -223,19 +223,20 @@ def _relay(size):
     return relay
 
 
-def _liquid_crystal(size):
+def liquid_crystal(size, switching=43):
+    """Return a liquid crystal of half a wave, whose switching angle (deg) is known to 2 deg."""
     settings = subaru.misaligned(0, most=20)
     settings["bounds"] |= {"retardance": (90, 270), "switching_angle": (30, 60)}
     crystal = optics.FerroelectricLiquidCrystal(
         retardance=np.full(size, 180.0) * u.deg,
-        switching_angle=43 * u.deg,
+        switching_angle=switching * u.deg,
         mount="flc_state",
         name="flc",
         **settings,
     )
     crystal.retardance.prior, crystal.theta.prior = subaru._normal(180, 15), subaru._normal(0, 2)
     # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
-    crystal.switching_angle.prior = subaru._normal(43, 2)
+    crystal.switching_angle.prior = subaru._normal(switching, 2)
     return crystal
 
 
@@ -363,7 +364,7 @@ class VAMPIRES(Instrument):
         train.append(_half_wave_plate(grid, plate))
         train += [_derotator(grid, derotator), _relay(grid.size)]
         if "flc" in optics_in:
-            train.append(_liquid_crystal(grid.size))
+            train.append(liquid_crystal(grid.size))
         return join([*train, _splitter(grid.size), _cameras(grid.size)])
 
     def telescope_optics(self, behind):
@@ -416,7 +417,7 @@ class VAMPIRES(Instrument):
         ``flc_state``.
         """
         source = self.source_of(observations, _SOURCES)
-        return source, ("flc",) if _is_modulated(observations) else ()
+        return source, ("flc",) if is_modulated(observations) else ()
 
     def meta_without(self, names):
         """Return what a liquid crystal leaves: no states by which frames are paired."""
@@ -440,7 +441,8 @@ class VAMPIRES(Instrument):
         return {"fold_mirror": {"gold at 45°": gold}}
 
 
-def _is_modulated(observations):
+def is_modulated(observations):
+    """Return whether a table says that the liquid crystal was in the beam."""
     # what the table says goes before what its columns suggest
     stated = observations.meta.get("flc")
     if stated is not None:

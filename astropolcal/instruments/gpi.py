@@ -1,0 +1,99 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Gemini South/GPI, near-infrared dual-beam polarimetry at the straight Cassegrain focus.
+
+It turns with the telescope, so that the sky turns upstream of it by the parallactic angle, and
+there is no derotator. The half-wave plate is downstream of the adaptive optics, the Wollaston
+prism behind the lenslets (Perrin et al. 2015). What polarizes is all upstream of the plate:
+Wiktorowicz et al. (2014) measured how unpolarized light leaves it in the band H. Millar-Blanchaer
+et al. (2016) find it to be the same at all wavelengths within their errors.
+
+Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99. The
+keyword ``WPANGLE`` of the plate, and ``PAR_ANG``, are those that public code reads; the direction
+and the zero in which the plate is counted are not known: its angle is free within 30 deg.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import replace_optic
+from astropolcal.instruments.base import SkyLaw
+from astropolcal.instruments.layout import header_map
+from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
+from astropolcal.instruments.telescope import STARS
+
+__all__ = ["GPI"]
+
+# Wiktorowicz et al. 2014: Q, U and V of unpolarized light that leaves telescope and optics
+_POLARIZANCE = (-0.00037, 0.004338, -0.0664)
+
+
+class GPI(Polarimeter):
+    """
+    Gemini Planet Imager with half-wave plate and Wollaston prism, observing stars.
+
+    Free are, per wavelength, the linear diattenuation of all that is upstream of the plate, the
+    retardance of the plate and the efficiency of the prism; and the angle of the plate.
+
+    References
+    ----------
+    Wiktorowicz et al. 2014, Proc. SPIE 9147, arXiv:1407.2505.
+    Perrin et al. 2015, ApJ 799, 182, arXiv:1407.2495.
+    Millar-Blanchaer et al. 2016, Proc. SPIE 9908, 990836, arXiv:1609.08691.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> gpi = instruments.get("gpi")
+    >>> [optic.name for optic in gpi.chain("star")]
+    ['star', 'parallactic', 'telescope_and_ao', 'hwp', 'wollaston']
+    >>> (100 * gpi.published()["telescope_and_ao"].mueller()[1:, 0]).round(4).tolist()
+    [-0.037, 0.4338, -6.64]
+    """
+
+    name = "gpi"
+    aliases = ("Gemini/GPI",)
+    # nominal centres of Y, J, H, K1 and K2
+    wavelength = [1.05, 1.24, 1.65, 2.05, 2.26] * u.um
+    keywords = {"hwp": "WPANGLE", "parallactic": "PAR_ANG"}
+    headers = header_map(keywords)
+    references = (
+        "Wiktorowicz et al. 2014, Proc. SPIE 9147, arXiv:1407.2505",
+        "Perrin et al. 2015, ApJ 799, 182, arXiv:1407.2495",
+        "Millar-Blanchaer et al. 2016, Proc. SPIE 9908, 990836, arXiv:1609.08691",
+    )
+    sources = STARS
+    entrance = "telescope_and_ao"
+    site = (-70.7366, -30.2407, 2722.0)
+    #: The plate does not follow the sky.
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
+
+    def inner(self, source, optics_in, grid):
+        """Return what is upstream of the plate, the plate and the prism."""
+        q, u_ = (np.full(grid.size, value) for value in _POLARIZANCE[:2])
+        upstream = optics.VectorDiattenuator(horizontal=q, diagonal=u_, name="telescope_and_ao")
+        return [upstream, turning_retarder("hwp", 178, grid, most=30), wollaston(grid)]
+
+    def telescope_optics(self, behind=(), *, wavelength=None):
+        """Return the turning of the sky; what the telescope polarizes is published as one."""
+        return [optics.Rotator(mount="parallactic", name="parallactic")]
+
+    def published(self):
+        """
+        Return the chain of a star with the published polarization, of circular light too.
+
+        A diattenuator with that polarizance has a known matrix (Lu & Chipman 1996).
+        """
+        vector = np.array(_POLARIZANCE)
+        size = np.linalg.norm(vector)
+        root, axis = np.sqrt(1 - size**2), vector / size
+        matrix = np.eye(4)
+        matrix[0, 1:] = matrix[1:, 0] = vector
+        matrix[1:, 1:] = root * np.eye(3) + (1 - root) * np.outer(axis, axis)
+        upstream = optics.MuellerElement.from_matrix(matrix, name="telescope_and_ao")
+        return replace_optic(self.chain("star"), "telescope_and_ao", upstream)
+
+    def published_meta(self):
+        """Return the meta of a table taken with the chain of `published`."""
+        return {"instrument": "gpi", "source": "star"}

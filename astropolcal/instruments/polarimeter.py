@@ -1,0 +1,155 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What most instruments share: a chain of source or star, telescope, and what is downstream of them.
+
+An instrument at a telescope of its own gives `Polarimeter.inner`, the optics from its entrance
+on; what stands behind Subaru's telescope, half-wave plate and derotator is a `SubaruPolarimeter`
+and gives what is `SubaruPolarimeter.behind` them.
+"""
+
+from abc import abstractmethod
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import join
+from astropolcal.instruments import telescope as shared
+from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.charis import BOUNDS, derotator_start
+from astropolcal.instruments.layout import header_map
+from astropolcal.observations.pointings import location_of
+
+__all__ = []
+
+
+class Polarimeter(Instrument):
+    """
+    An instrument whose chain is a source, or a star and the telescope, and its own optics.
+
+    Attributes
+    ----------
+    site : tuple of float
+        Longitude and latitude (deg) and height (m) of the telescope; empty without a site.
+    """
+
+    sources = ("polarized", *shared.STARS)
+    sky_options = ("wavelength",)
+    site = ()
+
+    def chain(self, source=None, optics_in=(), *, wavelength=None, star="star", target=None):
+        """
+        Return the chain of a source upstream of the instrument or of a star, to be calibrated.
+
+        Parameters
+        ----------
+        source : str, optional
+            One of ``sources``, by default the first: ``"polarized"`` is a polarizer upstream of
+            the instrument, ``"unpolarized"`` a lamp without one, all others are stars.
+        optics_in : sequence of str
+            Which of ``optional_optics`` are in the beam.
+        wavelength : `~astropy.units.Quantity`, optional
+            Grid of what is free at each wavelength, by default the usual one.
+        star, target : str
+            Name of the source optic of a star, and of the star in the catalogue.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Raises
+        ------
+        InstrumentError
+            If a choice is unknown.
+        """
+        source = self.sources[0] if source is None else source
+        self.check_choices(source, optics_in)
+        grid = self.grid(wavelength)
+        light = self.light(source, grid, star, target)
+        return join([*light, *self.inner(source, optics_in, grid)])
+
+    def light(self, source, grid, star, target):
+        """Return the polarizer, or a star and the telescope."""
+        if source == "polarized":
+            return [optics.LinearPolarizer(name="polarizer")]
+        light = shared.star_source(source, grid, star, target)
+        return [light, *self.telescope_optics(wavelength=grid)]
+
+    @abstractmethod
+    def inner(self, source, optics_in, grid):
+        """Return the optics from the entrance of the instrument on."""
+
+    def telescope_optics(self, behind=(), *, wavelength=None):
+        """Return the telescope, whose tertiary mirror is bare aluminium."""
+        return shared.telescope(aluminium(self.grid(wavelength)))
+
+    @property
+    def location(self):
+        """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
+        return location_of(self.site) if self.site else None
+
+
+class SubaruPolarimeter(Polarimeter):
+    """
+    What stands behind Subaru's tertiary mirror, half-wave plate and derotator, as CHARIS does.
+
+    Sources are those of the calibration unit upstream of the plate, and stars. Free are what is
+    free of CHARIS, from the same starts.
+    """
+
+    sources = (*shared.INTERNAL, *shared.STARS)
+    sky_options = ()
+    site = shared.SITE
+    changes = shared.CHANGES
+    keywords = {
+        "hwp": "RET-ANG1",
+        "hwp_true": "RET-POS1",
+        "derotator": "D_IMRANG",
+        "altitude": "ALTITUDE",
+    }
+    headers = header_map(keywords, mjd="MJD", time="UT")
+
+    def light(self, source, grid, star, target):
+        """Return the internal source, or a star and the telescope."""
+        mirror = shared.tertiary_mirror("free", grid)
+        return shared.entrance(source, grid, star, target, mirror)
+
+    def inner(self, source, optics_in, grid):
+        """Return the half-wave plate, the derotator and what is behind them."""
+        plate = shared.two_layer_plate(**shared.misaligned(0))
+        turning = shared.derotator("elliptical", derotator_start(grid), BOUNDS["physical"])
+        return [plate, turning, *self.behind(optics_in, grid)]
+
+    def behind(self, optics_in, grid):
+        """Return the optics downstream of the derotator, here a Wollaston prism."""
+        return [optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston")]
+
+    def telescope_optics(self, behind=(), *, wavelength=None):
+        """Return the telescope with the tertiary mirror that is published."""
+        return shared.telescope(shared.published_mirror())
+
+
+def aluminium(grid):
+    """Return a tertiary mirror whose diattenuation, at first that of aluminium, is free."""
+    metal = optics.MetalMirror(material="aluminium")
+    return optics.DiattenuatorRetarder(
+        diattenuation=metal.diattenuation(grid),
+        retardance=metal.retardance(grid),
+        name="m3",
+        fixed={"retardance": True},
+        bounds={"diattenuation": (-0.1, 0.1)},
+    )
+
+
+def turning_retarder(stage, retardance, grid, *, bounds=(150, 180), sign="", most=10, **more):
+    """Return a retarder on a stage, free in its angle and, per wavelength, its retardance (deg)."""
+    held = shared.misaligned(0, most)
+    # linear polarization cannot tell 180 + x from 180 - x of a half-wave plate
+    held["bounds"] |= {"retardance": bounds}
+    values = np.full(grid.size, float(retardance)) * u.deg
+    return optics.LinearRetarder(retardance=values, mount=sign + stage, name=stage, **held, **more)
+
+
+def wollaston(grid, **settings):
+    """Return a prism of nominal efficiency, free per wavelength."""
+    return optics.WollastonPrism(efficiency=np.full(grid.size, 0.99), name="wollaston", **settings)
