@@ -146,9 +146,6 @@ def model_error(fit, lam, n=3):
 # ---- pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors ----
 
 
-_TELESCOPE = ("parallactic", "altitude")
-
-
 def match_wavelengths(grid, chain, wavelength):
     """Return the wavelengths, and the bin of each; None where the law gives all."""
     if wavelength is None:
@@ -265,15 +262,9 @@ def from_first_stage(chain, wanted=None):
 def split_chain(chain):
     """Return the optics upstream of the first stage of the instrument, and the others."""
     found = leaves(chain)
-    # up to there it is the telescope or the calibration source
-    start = next(
-        (
-            i
-            for i, leaf in enumerate(found)
-            if leaf.stage not in (None, *_TELESCOPE) and leaf.stage not in COORDINATES
-        ),
-        0,
-    )
+    # up to there it is the telescope, which turns the sky, or the calibration source
+    fixed = (i for i, leaf in enumerate(found) if leaf.stage and not leaf.rotates_frame)
+    start = next((i for i in fixed if found[i].stage not in COORDINATES), 0)
     return found[:start], found[start:]
 
 

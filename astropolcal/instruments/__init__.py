@@ -29,15 +29,11 @@ from astropolcal.words import did_you_mean
 
 __all__ = [
     "CHARIS",
-    "FORS2",
     "IRDIS",
-    "NIRC2",
     "VAMPIRES",
     "FileLayout",
     "Instrument",
-    "MagAOX",
     "ReadOut",
-    "RomanCoronagraph",
     "SkyLaw",
     "add_nuisance",
     "get",

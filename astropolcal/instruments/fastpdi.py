@@ -17,9 +17,9 @@ published value at 1.16 um.
 import astropy.units as u
 
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
-from astropolcal.instruments.vampires import is_modulated, liquid_crystal
+from astropolcal.instruments.vampires import VAMPIRES, liquid_crystal
 
-__all__ = ["FastPDI"]
+__all__ = []
 
 
 class FastPDI(SubaruPolarimeter):
@@ -49,12 +49,10 @@ class FastPDI(SubaruPolarimeter):
         "'t Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833, for plate and derotator",
     )
     optional_optics = ("flc",)
+    # what tables say of a liquid crystal is the same
+    setup, meta_without = VAMPIRES.setup, VAMPIRES.meta_without
 
     def behind(self, optics_in, grid):
         """Return the liquid crystal, where it is in, and the beam splitter."""
         crystal = [liquid_crystal(grid.size, switching=45)] if "flc" in optics_in else []
         return [*crystal, *super().behind(optics_in, grid)]
-
-    def setup(self, observations):
-        """Return the source, and whether the liquid crystal is in, ``flc`` in the meta."""
-        return self.source_of(observations), ("flc",) if is_modulated(observations) else ()

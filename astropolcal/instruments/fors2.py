@@ -26,7 +26,7 @@ from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 from astropolcal.instruments.telescope import PARANAL
 
-__all__ = ["FORS2"]
+__all__ = []
 
 
 class FORS2(Polarimeter):

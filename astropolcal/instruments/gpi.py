@@ -23,7 +23,7 @@ from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 from astropolcal.instruments.telescope import STARS
 
-__all__ = ["GPI"]
+__all__ = []
 
 # Wiktorowicz et al. 2014: Q, U and V of unpolarized light that leaves telescope and optics
 _POLARIZANCE = (-0.00037, 0.004338, -0.0664)

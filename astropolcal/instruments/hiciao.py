@@ -18,7 +18,7 @@ from astropolcal import optics
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.instruments.telescope import telescope
 
-__all__ = ["HiCIAO"]
+__all__ = []
 
 
 class HiCIAO(SubaruPolarimeter):

@@ -15,7 +15,7 @@ import astropy.units as u
 
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 
-__all__ = ["IRCS"]
+__all__ = []
 
 
 class IRCS(SubaruPolarimeter):

@@ -372,7 +372,7 @@ def convert(column, value, layout, target):
     law, unit = layout.transforms.get(column, (1.0, 0.0)), unit_of(column, layout)
     if isinstance(law, dict):
         if str(value).strip() not in law:
-            raise ValueError(f"{value!r}; allowed are {', '.join(law)}")
+            raise ValueError(f"allowed are {', '.join(law)}")
         return law[str(value).strip()] * unit.to(target)
     factor, offset = law
     return (factor * plain_number(value) + offset) * unit.to(target)

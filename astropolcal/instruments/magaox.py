@@ -22,7 +22,7 @@ from astropolcal.instruments.base import SkyLaw
 from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 
-__all__ = ["MagAOX"]
+__all__ = []
 
 
 class MagAOX(Polarimeter):

@@ -31,7 +31,7 @@ from astropolcal.instruments.polarimeter import (
 )
 from astropolcal.instruments.telescope import PARANAL, STARS
 
-__all__ = ["NaCo"]
+__all__ = []
 
 _STEP = 360 / 4096
 

@@ -26,7 +26,7 @@ from astropolcal.instruments.polarimeter import (
 )
 from astropolcal.instruments.telescope import telescope
 
-__all__ = ["NIRC2"]
+__all__ = []
 
 
 class NIRC2(Polarimeter):

@@ -15,7 +15,7 @@ import astropy.units as u
 
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 
-__all__ = ["REACH"]
+__all__ = []
 
 
 class REACH(SubaruPolarimeter):

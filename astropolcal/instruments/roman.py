@@ -24,7 +24,7 @@ from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, wollaston
 from astropolcal.instruments.telescope import misaligned, star_source
 
-__all__ = ["RomanCoronagraph"]
+__all__ = []
 
 
 class RomanCoronagraph(Polarimeter):

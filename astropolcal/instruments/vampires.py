@@ -417,7 +417,7 @@ class VAMPIRES(Instrument):
         ``flc_state``.
         """
         source = self.source_of(observations, _SOURCES)
-        return source, ("flc",) if is_modulated(observations) else ()
+        return source, ("flc",) if _is_modulated(observations) else ()
 
     def meta_without(self, names):
         """Return what a liquid crystal leaves: no states by which frames are paired."""
@@ -441,8 +441,7 @@ class VAMPIRES(Instrument):
         return {"fold_mirror": {"gold at 45°": gold}}
 
 
-def is_modulated(observations):
-    """Return whether a table says that the liquid crystal was in the beam."""
+def _is_modulated(observations):
     # what the table says goes before what its columns suggest
     stated = observations.meta.get("flc")
     if stated is not None:

@@ -325,7 +325,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
             stage: smeared(angle, motion(observations, angle, duty), nodes, when)
             for stage, angle in found.items()
         }
-    if "hwp" not in observations.frames.colnames:
+    if not {"hwp", "hwp_true"} & set(observations.frames.colnames):
         return found
     follows = tracked(0.0, found["parallactic"], found["altitude"], law)
     return found | {"hwp": offset + follows}

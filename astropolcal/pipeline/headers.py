@@ -52,7 +52,7 @@ def describe(header, instrument=None, stated=()):
         found = _recognized(header)
     else:
         found = instruments.get(instrument) if isinstance(instrument, str) else instrument
-    layout = found.files
+    layout = found.files or found.headers
     if layout is None:
         return {"instrument": found.name}
     # what is stated by the user, or is the identity itself, is no contradiction
@@ -78,7 +78,7 @@ def _recognized(header):
     # each instrument looks under its own keyword, so that all of them are asked
     for name in instruments.names():
         instrument = instruments.get(name)
-        layout = instrument.files
+        layout = instrument.files or instrument.headers
         told = None if layout is None else _text(_look_up(header, "instrument", layout))
         if told is None:
             continue
@@ -111,13 +111,14 @@ class FrameAngles:
     """The angles of frames from their headers, as the instrument's layout of files reads them."""
 
     def __init__(self, headers, instrument):
-        if instrument.files is None:
+        layout = instrument.files or instrument.headers
+        if layout is None:
             raise InstrumentError(f"{instrument.name}: no map of header keywords; give positions")
         if not headers:
             raise ObservationError("no header: at least one frame is needed")
         self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
         self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
-        self._layout = layout = instrument.files
+        self._layout = layout
         self.n_frames = len(headers)
         table = QTable({"frame": np.arange(self.n_frames)})
         for column in (c for c in layout.keywords if c not in _OTHERS):
@@ -164,12 +165,11 @@ class FrameAngles:
         for i, value in enumerate(values):
             try:
                 angle = convert(column, value, layout, u.deg)
-            except (TypeError, ValueError):
-                if column not in ANGLES:
+            except (TypeError, ValueError) as error:
+                if column not in (*ANGLES, *layout.transforms):
                     return np.array([str(value).strip() for value in values])
-                raise ObservationError(
-                    f"frame {i}: {keyword} = {value!r}, a number is needed"
-                ) from None
+                needed = "a number is needed" if column in ANGLES else error
+                raise ObservationError(f"frame {i}: {keyword} = {value!r}, {needed}") from None
             if not low <= angle <= high:
                 raise ObservationError(
                     f"frame {i}: {keyword} = {value}, allowed are {low:g} to {high:g} deg"
@@ -235,8 +235,9 @@ def telescope_optics(calibration):
     """Return the optics of a calibrated telescope, from the sky on; None if there are none."""
     for chain in calibration.chains:
         outer, _ = split_chain(chain)
-        # in front of the parallactic angle stands the star itself, which is no telescope
-        start = next((i for i, leaf in enumerate(outer) if leaf.stage == "parallactic"), None)
+        # upstream of the turning of the sky stands the star itself, which is no telescope
+        turns = (i for i, leaf in enumerate(outer) if leaf.stage and leaf.rotates_frame)
+        start = next(turns, None)
         if start is not None:
             return outer[start:]
     return None

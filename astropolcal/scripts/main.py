@@ -100,10 +100,16 @@ def main(argv=None):
     >>> from astropolcal.scripts.main import main
     >>> main(["info", "--instruments"])
     charis
+    fastpdi
     fors2
+    gpi
+    hiciao
+    ircs
     irdis
     magaox
+    naco
     nirc2
+    reach
     roman
     vampires
     0

@@ -9,7 +9,8 @@ from astropy.table import QTable
 from astropolcal import calibrate, instruments
 from astropolcal.chain import remove_optic
 from astropolcal.correction import measurement_rows
-from astropolcal.exceptions import InstrumentError
+from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.pipeline.headers import FrameAngles
 from astropolcal.simulation import simulate
 
 
@@ -140,8 +141,111 @@ def test_magaox_sends_vertical_polarization_to_the_right_beam():
     assert (seen[:, 1] > 0.98).all()
 
 
+# --- GPI
+
+
+def test_gpi_measures_the_published_polarization_of_an_unpolarized_star():
+    """Wiktorowicz et al. 2014; the plate that is off half a wave adds circular light."""
+    gpi = instruments.get("gpi")
+    chain = remove_optic(gpi.published(), "star")
+    chain["hwp"].retardance = np.full(5, 180) * u.deg
+    for plate, expected in (([0, 45], -0.037), ([22.5, 67.5], 0.4338)):
+        for parallactic in (0, 30):
+            positions = {"hwp": plate * u.deg, "parallactic": [parallactic] * 2 * u.deg}
+            x = differences(chain, positions, gpi.wavelength, [1, 0, 0, 0])
+            seen = 50 * (x[:, 0] - x[:, 1]) / chain["wollaston"].efficiency.value
+            np.testing.assert_allclose(seen, expected, atol=1e-4)
+    chain["hwp"].retardance = np.full(5, 170) * u.deg
+    positions = {"hwp": [0, 45] * u.deg, "parallactic": [0, 0] * u.deg}
+    x = differences(chain, positions, gpi.wavelength, [1, 0, 0, 0])
+    assert np.all(np.abs(x[:, 0] - x[:, 1]) > 0.01)
+
+
+# --- NaCo
+
+
+def test_naco_keeps_the_sky_at_its_position_angle():
+    """As long as M3 is ideal the parallactic angle drops out, and the position angle counts."""
+    naco, grid = instruments.get("naco"), instruments.get("naco").wavelength
+    chain = remove_optic(naco.chain("star"), "star")
+    chain["m3"].diattenuation, chain["m3"].retardance = np.zeros(3), np.full(3, 180) * u.deg
+    chain["hwp"].retardance = np.full(3, 180) * u.deg
+    seen = []
+    for parallactic, position_angle, aolp in ((0, 0, 20), (50, 0, 20), (-70, 33, 53)):
+        stokes = [1, *(0.1 * f(np.deg2rad(2 * aolp)) for f in (np.cos, np.sin)), 0]
+        positions = {"hwp": np.array([0, 22.5])} | {
+            "parallactic": [parallactic] * 2,
+            "position_angle": [position_angle] * 2,
+        }
+        positions = {stage: angles * u.deg for stage, angles in positions.items()}
+        seen.append(differences(chain, positions, grid, stokes))
+    np.testing.assert_allclose(seen[1:], [seen[0]] * 2, atol=1e-12)
+
+
+# --- behind Subaru's plate and derotator
+
+
+def test_what_stands_behind_the_same_plate_and_derotator_is_calibrated_with_it():
+    """Plate and derotator are those of CHARIS, with the same starts and free parameters."""
+    charis = instruments.get("charis")
+    for name in ("ircs", "hiciao", "fastpdi", "reach"):
+        instrument = instruments.get(name)
+        grid = instrument.wavelength
+        for source in instrument.sources:
+            ours, theirs = (i.chain(source, (), wavelength=grid) for i in (instrument, charis))
+            for optic in theirs[:-1]:
+                one = ours[optic.name]
+                for key in optic.param_names:
+                    mine, other = getattr(one, key), getattr(optic, key)
+                    np.testing.assert_array_equal(mine.value, other.value)
+                    assert (mine.fixed, mine.bounds) == (other.fixed, other.bounds)
+            if "star" not in source:
+                sky = [leaf.name for leaf in instrument.on_sky(ours)]
+                assert sky == [leaf.name for leaf in charis.on_sky(theirs)]
+
+
+def test_fast_pdi_takes_the_liquid_crystal_from_its_table():
+    fast = instruments.get("fastpdi")
+    chain = fast.chain("polarized", ["flc"])
+    frames = QTable({"hwp": np.repeat([0, 45, 22.5, 67.5], 4) * u.deg})
+    frames["derotator"] = np.tile([40, 40, 80, 80], 4) * u.deg
+    frames["flc_state"] = np.tile([0, 1], 8)
+    meta = {"instrument": "Fast-PDI", "source": "polarized"}
+    seen = simulate(chain, fast.wavelength, frames, flux=1e8, seed=1, meta=meta)
+    (built,) = fast.chains_for([seen])
+    assert [leaf.name for leaf in built] == [leaf.name for leaf in chain]
+
+
+# --- headers
+
+
+def test_headers_give_the_angles_of_frames():
+    """Without a layout of files the keywords of a frame are enough for its matrix."""
+    cases = {
+        "roman": ({"ROLL": 13.0, "DPAMNAME": "POL45"}, {"roll": 13, "prism": 45}),
+        "fors2": ({"ESO INS RETA2 POSANG": 22.5, "ESO ADA POSANG": 5.0}, {"hwp": 22.5}),
+        "magaox": ({"HWPTRACK ACTUAL ANGLE": 9.0, "STAGEK POS": 7.0}, {"hwp": 9, "derotator": 7}),
+        "nirc2": ({"PCUPR": 45.0, "OBRT": 3.0}, {"hwp": 45, "derotator": 3}),
+        "naco": ({"ESO INS ADC1 ENC": 1024 - 205, "ESO ADA POSANG": 8.0}, {"hwp": 90}),
+        "gpi": ({"WPANGLE": 67.5}, {"hwp": 67.5}),
+        "ircs": ({"RET-ANG1": 0.0, "RET-POS1": 11.0, "D_IMRANG": 4.0}, {"hwp": 11}),
+    }
+    pointing = {"PARANG": 30.0, "ESO TEL PARANG START": 30.0, "ESO TEL ALT": 60.0}
+    pointing |= {"DATE-OBS": "2023-02-25T01:00:00", "RA": 80.0, "DEC": -30.0}
+    pointing |= {"ALTITUDE": 60.0, "EL": 60.0, "UT": "01:00:00"}
+    for name, (header, expected) in cases.items():
+        instrument = instruments.get(name)
+        chain = instrument.chain(instrument.sources[-1])
+        found = instrument.positions(FrameAngles([header | pointing], instrument), chain)
+        for stage, angle in expected.items():
+            assert np.rad2deg(found[stage]) == pytest.approx(angle), (name, stage)
+    roman = instruments.get("roman")
+    with pytest.raises(ObservationError, match="DPAMNAME = 'POL9', allowed are POL0, POL45"):
+        FrameAngles([{"ROLL": 13.0, "DPAMNAME": "POL9"}], roman)
+
+
 def test_published_values_are_none():
     """Their values are nominal: none may be taken for a published one."""
-    for name in ("fors2", "roman", "nirc2", "magaox"):
+    for name in ("fors2", "roman", "nirc2", "magaox", "naco", "ircs", "hiciao", "fastpdi", "reach"):
         with pytest.raises(InstrumentError, match="no published values"):
             instruments.get(name).published()
