@@ -72,7 +72,10 @@ def _rotate(matrix, theta):
 
 def _linear_retarder(retardance):
     """Return a linear retarder for floats in radian."""
-    return _diattenuator_retarder(0.0, retardance)
+    matrix = blank(retardance)
+    matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
+    fill_phase_block(matrix, np.cos(retardance), np.sin(retardance))
+    return matrix
 
 
 def _diattenuator_retarder(diattenuation, retardance):
@@ -326,7 +329,7 @@ def fill_phase_block(matrix, c, s):
     """Fill the U, V block with [[c, s], [-s, c]], in place."""
     matrix[..., 2, 2] = matrix[..., 3, 3] = c
     matrix[..., 2, 3] = s
-    matrix[..., 3, 2] = -np.asarray(s)
+    np.negative(s, out=matrix[..., 3, 2])
 
 
 def diattenuation_slope(diattenuation, c, s):

