@@ -45,9 +45,6 @@ class Bench(Instrument):
     def telescope_optics(self, behind=()):
         return [optics.Rotator(mount="parallactic", name="parallactic")]
 
-    def setup(self, observations):
-        return self.source_of(observations), ()
-
 
 class Wheel(Bench):
     """Three polarizers in a wheel, one beam, behind a mirror, as in HST/ACS."""

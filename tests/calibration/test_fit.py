@@ -6,7 +6,13 @@ import json
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, LMLSQFitter, TRFLSQFitter
+from astropy.modeling.fitting import (
+    DogBoxLSQFitter,
+    LevMarLSQFitter,
+    LMLSQFitter,
+    NonFiniteValueError,
+    TRFLSQFitter,
+)
 
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import search_branches
@@ -367,14 +373,19 @@ def test_when_branches_are_searched(few, monkeypatch):
         assert bool(calls) == searches
 
 
-def test_fitter_that_breaks_is_a_fit_error(few):
-    class Broken(TRFLSQFitter):
-        def __call__(self, *args, **kwargs):
-            raise ValueError("x0 is infeasible")
-
+def test_fitter_that_breaks_is_a_fit_error_of_one_line(few):
     chain, _, data = few
-    with pytest.raises(FitError, match="Broken failed: x0 is infeasible"):
-        calibrate(chain, data, fitter=Broken())
+    for error in (ValueError("x0 is infeasible"), NonFiniteValueError("not\nfinite")):
+
+        class Broken(TRFLSQFitter):
+            def __call__(self, *args, error=error, **kwargs):
+                raise error
+
+        with pytest.raises(
+            FitError, match=r"Broken failed: (x0 is infeasible|not finite)$"
+        ) as info:
+            calibrate(chain, data, fitter=Broken())
+        assert "\n" not in str(info.value)
 
 
 # --- the result ------------------------------------------------------------------------------

@@ -60,6 +60,7 @@ from astropolcal.calibration.uncertainty.covariance import (
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
+from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.parameters import ROUNDING
 from astropolcal.units import to_unit
@@ -313,8 +314,9 @@ def _fit(measurement, weighting, fitter):
                 maxiter=_MAX_EVALUATIONS,
                 inplace=True,
             )
-        except (ValueError, np.linalg.LinAlgError) as error:
-            raise FitError(f"{type(fitter).__name__} failed: {error}") from error
+        except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+            said = one_line(str(error))
+            raise FitError(f"{type(fitter).__name__} failed: {said}") from error
     measurement.stand_at(canonical.vector())
     info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
     said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]

@@ -182,6 +182,8 @@ def _fit_without(measurement, vector, out, weights):
     model = measurement.canonical()
     model.stand_at(vector)
     noise = Problem(model, assumed(model, weights)).noise
+    # as many data as parameters tell no noise, against which a prior could weigh
+    noise = noise if np.isfinite(noise) else 0.0
     index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
     with warnings.catch_warnings():
         # a fit that stops early still gives an honest, if poorer, prediction
