@@ -304,6 +304,20 @@ def test_a_star_is_corrected(kind):
         np.testing.assert_allclose(found.v, 0.005, atol=5e-5)
 
 
+def test_polarization_on_sky_is_told_of_angles_without_a_half_wave_plate():
+    """And with a hundred times the light it is known ten times as well."""
+    for kind in (KINDS[1], KINDS[2]):
+        claims = []
+        for flux in (1e6, 1e8):
+            seen = observed(kind, seed=2, flux=flux)
+            found = calibrate(kind.chain(), seen, weights="errors", cross_validate=False)
+            (claim,) = [one for one in found.fit["sky_accuracy"] if one["dolp_percent"] == 30]
+            assert "one sequence of frames" in claim["words"]
+            claims.append(np.mean(claim["s_p_percent"]))
+        assert claims[0] / claims[1] == pytest.approx(10, rel=0.5), kind.name
+        assert 0 < claims[1] < 0.1
+
+
 # --- what does not fit ----------------------------------------------------------------------------
 
 

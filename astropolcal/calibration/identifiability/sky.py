@@ -4,7 +4,8 @@ What open directions and mirror branches do to the polarization measured on sky.
 
 A standard observation is cycles of the half-wave plate at a few positions of telescope and
 derotator, each solved by itself for I, Q and U from normalized double differences, as
-`~astropolcal.correction.correct` does it. The data that were fitted may not change, and yet the q
+`~astropolcal.correction.correct` does it. Without a half-wave plate it is the sequence of frames that
+was calibrated, solved for I, Q and U from their fluxes. The data that were fitted may not change, and yet the q
 and u that the same optics give of the sky do. Rotation and gain are the same for all degrees of
 polarization; instrumental polarization that is subtracted wrongly is not, and matters the more the
 fainter the polarization is.
@@ -34,6 +35,8 @@ _CYCLE = np.deg2rad([0.0, 45.0, 22.5, 67.5])
 _MODULATOR, _STATES = "flc_state", (0.0, 1.0)
 # so many settings; the angles of a stage are taken in steps of 4, which has no divisor with it
 _MOST, _STRIDE = 9, 4
+# frames of a sequence without a half-wave plate: kept of those calibrated, and in a setting
+_KEPT, _LONGEST = 64, 16
 # as for `correct`: a setting that determines q and u worse is left out
 _MAX_CONDITION = 30.0
 
@@ -63,8 +66,17 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
 
 
 def settings_of(measurement):
-    """Return a few of the angles at which each stage but plate and telescope stood, in radian."""
-    angles = {}
+    """Return a few of the angles at which each stage but plate and telescope stood, in radian.
+
+    Without a half-wave plate they are those of the frames, so that states go together.
+    """
+    angles, stood = {}, [dataset.positions for dataset in measurement.datasets]
+    if not any("hwp" in positions for positions in stood):
+        shared = set.intersection(*map(set, stood)) - {*_TELESCOPE, *COORDINATES}
+        each = [[np.round(p[s], 6).ravel() for s in sorted(shared)] for p in stood]
+        frames = np.hstack([np.vstack(one) for one in each]) if shared else np.zeros((0, 0))
+        frames = _spread_out(np.unique(frames, axis=1).T, _KEPT).T
+        return {stage: angle.tolist() for stage, angle in zip(sorted(shared), frames, strict=True)}
     for dataset in measurement.datasets:
         for stage, angle in dataset.positions.items():
             if stage not in ("hwp", *_TELESCOPE):
@@ -75,12 +87,12 @@ def settings_of(measurement):
     }
 
 
-def _spread_out(values):
-    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, _MOST)).astype(int))]
+def _spread_out(values, most=_MOST):
+    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, most)).astype(int))]
 
 
 def view_of_measurement(measurement, vector, name=None):
-    """Return the view of the sky that a measurement has at some values, None without a plate."""
+    """Return the view of the sky that a measurement has at some values, None if there is none."""
     chains = measurement.put_back(vector)
     metas = [dataset.observations.meta for dataset in measurement.datasets]
     free, settings = measurement.free.of_chains(chains), settings_of(measurement)
@@ -88,7 +100,7 @@ def view_of_measurement(measurement, vector, name=None):
 
 
 def view_of_calibration(calibration):
-    """Return the view of the sky that a calibration has, None without a half-wave plate."""
+    """Return the view of the sky that a calibration has, None if there is none."""
     settings = calibration.fit.get("sky_settings")
     if settings is None and calibration.measurement is not None:
         settings = settings_of(calibration.measurement)
@@ -111,7 +123,9 @@ def _view(chains, free, lam, metas, name, settings):
         except ChainError:
             return None
     if "hwp" not in stages(chain):
-        return None
+        placed = _sequence(stages(chain), settings)
+        view = placed and SkyView(chain, telescope, free, lam, placed)
+        return view if view and view.good.any() else None
     law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
     stated = [meta.get("tracking") for meta in metas if meta.get("tracking") in law.modes]
     mode = stated[0] if stated else next(iter(law.modes), None)
@@ -120,6 +134,28 @@ def _view(chains, free, lam, metas, name, settings):
     view = SkyView(chain, telescope, free, lam, placed, site)
     # optics that never determine q and u say nothing of the sky
     return view if view.good.any() else None
+
+
+def _sequence(wanted, settings):
+    """Return the positions of all stages in the frames of a sequence, None if they are not known.
+
+    They are repeated for each pointing of the telescope.
+    """
+    own = [stage for stage in wanted if stage not in (*_TELESCOPE, *COORDINATES)]
+    # devices with states have no angles
+    if not own or not {*own} <= {*settings} or any("=" in stage for stage in wanted):
+        return None
+    if len({len(settings[stage]) for stage in own}) > 1:
+        return None
+    frames = np.unique(np.transpose([settings[stage] for stage in own]), axis=0)
+    frames = _spread_out(frames, _LONGEST)
+    altitude, parallactic = (grid.ravel() for grid in np.meshgrid(_ALTITUDES, _PARALLACTIC))
+    count = altitude.size if set(_TELESCOPE) & set(wanted) else 1
+    placed = dict(zip(own, np.tile(frames, (count, 1)).T, strict=True))
+    placed |= {"altitude": np.repeat(altitude, len(frames))}
+    placed |= {"parallactic": np.repeat(parallactic, len(frames))}
+    placed |= {stage: np.zeros(1) for stage in wanted if stage in COORDINATES}
+    return {stage: placed[stage] for stage in wanted}, count
 
 
 def _positions(wanted, settings, law):
@@ -160,7 +196,8 @@ class SkyView:
         self._model = Rows(chain, lam, self.placed, free)
         # beams first, then wavelengths, settings, frames of a setting, and I, Q and U
         self._rows = self._by_setting(self._model)
-        self._gain, self.good = _solve(self._rows)
+        self.has_plate = "hwp" in self.placed
+        self._gain, self.good = _solve(self._rows, self.has_plate)
 
     def _by_setting(self, model):
         rows = model.rows(n=3)
@@ -192,18 +229,20 @@ class SkyView:
 
     def against(self, chain):
         """Return what another chain finds of what this one measures, less the truth."""
-        gain, good = _solve(self._by_setting(Rows(chain, self.lam, self.placed)))
+        gain, good = _solve(self._by_setting(Rows(chain, self.lam, self.placed)), self.has_plate)
         both = self.good & good
         found = np.einsum("wskbf,bwsfc->wskc", gain, self._rows) - np.eye(3)
         return np.where(both[..., None, None], found, np.nan)
 
 
-def _solve(rows):
+def _solve(rows, paired):
     """Return what turns fluxes into I, Q and U in each setting, and which are well determined."""
     n_frames = rows.shape[3]
-    # beams and frames of a setting become half differences and half sums of its pairs
-    minus, plus = (np.kron(np.eye(n_frames // 2), [[1, sign]]) for sign in (-1, 1))
-    combine = np.concatenate([np.hstack([minus, -minus]), np.hstack([plus, plus])]) / 2
+    combine = np.eye(2 * n_frames)
+    if paired:
+        # beams and frames of a setting become half differences and half sums of its pairs
+        minus, plus = (np.kron(np.eye(n_frames // 2), [[1, sign]]) for sign in (-1, 1))
+        combine = np.concatenate([np.hstack([minus, -minus]), np.hstack([plus, plus])]) / 2
     beams = np.moveaxis(rows, 0, 2)
     channels = combine @ beams.reshape(*beams.shape[:2], -1, 3)
     singular = np.linalg.svd(channels, compute_uv=False)

@@ -204,7 +204,8 @@ def _made_of(calibration, view):
     count = view.good.shape[1]
     return (
         f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
-        f"{view.telescope}; one cycle of the half-wave plate"
+        f"{view.telescope}; "
+        + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
         + (f", rms over {count} settings" if count > 1 else "")
     )
 
