@@ -351,11 +351,11 @@ def test_file_holds_and_gives_the_same_numbers(tmp_path):
     assert np.isfinite(target_accuracies(again)[0]["s_p"]).all()
 
 
-def test_impossible_targets_are_refused_and_no_plate_says_nothing(alone):
+def test_impossible_targets_are_refused_and_no_angles_say_nothing(alone):
     for target in ((2.0, None), (np.nan, None), (0.5, 1 * u.um), ([0.1, 0.2], None)):
         with pytest.raises(ParameterError):
             target_accuracies(alone, [target])
-    fixed = optics.LinearRetarder(retardance=80 * u.deg, mount="derotator", name="derotator")
+    fixed = optics.LinearRetarder(retardance=80 * u.deg, name="bench")
     train = join([optics.LinearPolarizer(name="polarizer"), fixed, optics.WollastonPrism(name="w")])
     other = replace(alone, chains=[train], settings=alone.settings | {"instrument": None})
     assert target_accuracies(other) == []

@@ -4,11 +4,11 @@ What open directions and mirror branches do to the polarization measured on sky.
 
 A standard observation is cycles of the half-wave plate at a few positions of telescope and
 derotator, each solved by itself for I, Q and U from normalized double differences, as
-`~astropolcal.correction.correct` does it. Without a half-wave plate it is the sequence of frames that
-was calibrated, solved for I, Q and U from their fluxes. The data that were fitted may not change, and yet the q
-and u that the same optics give of the sky do. Rotation and gain are the same for all degrees of
-polarization; instrumental polarization that is subtracted wrongly is not, and matters the more the
-fainter the polarization is.
+`~astropolcal.correction.correct` does it. Without a half-wave plate it is the sequence of frames
+that was calibrated, solved for I, Q and U from their fluxes. The data that were fitted may not
+change, and yet the q and u that the same optics give of the sky do. Rotation and gain are the same
+for all degrees of polarization; instrumental polarization that is subtracted wrongly is not, and
+matters the more the fainter the polarization is.
 """
 
 import warnings
