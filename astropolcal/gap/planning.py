@@ -20,7 +20,6 @@ from scipy.linalg import cho_factor, cho_solve
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._words import listed
 from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
 from astropolcal.gap.problem import OPEN, GapProblem
@@ -28,6 +27,7 @@ from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.simulation import simulate
+from astropolcal.words import listed
 
 __all__ = []
 

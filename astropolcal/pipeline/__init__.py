@@ -1,7 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrations at work: library, headers, system Mueller matrices, export, history."""
 
+from astropolcal.pipeline.courses import courses
 from astropolcal.pipeline.export import mueller_table, write_mueller
+from astropolcal.pipeline.health import health, write_health
 from astropolcal.pipeline.history import Change, changes, parameter_history, restart
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
@@ -13,9 +15,12 @@ __all__ = [
     "LoadedCalibration",
     "SystemMueller",
     "changes",
+    "courses",
+    "health",
     "load",
     "mueller_table",
     "parameter_history",
     "restart",
+    "write_health",
     "write_mueller",
 ]
