@@ -1,12 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrations at work: library, headers, system Mueller matrices, export, history."""
 
-from astropolcal.pipeline.courses import courses
 from astropolcal.pipeline.export import mueller_table, write_mueller
-from astropolcal.pipeline.health import health, write_health
 from astropolcal.pipeline.history import Change, changes, parameter_history, restart
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
+from astropolcal.pipeline.monitoring import health, write_health
+from astropolcal.pipeline.timeline import courses
 
 __all__ = [
     "Change",

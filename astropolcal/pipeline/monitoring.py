@@ -11,8 +11,8 @@ from astropolcal.calibration.result.validity import instrument_of
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
-from astropolcal.pipeline.courses import COURSES, courses, moment_of
 from astropolcal.pipeline.library import Library
+from astropolcal.pipeline.timeline import COURSES, courses, moment_of
 from astropolcal.words import counted, listed
 
 __all__ = ["health", "write_health"]
@@ -61,6 +61,7 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.pipeline import Library, health
@@ -69,6 +70,7 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
     >>> table = simulate(chain, charis.wavelength, frames, seed=1, meta={"date": "2025-03-01"})
+    >>> Path("runs").mkdir()
     >>> _ = Library("runs").add(calibrate(chain, table, instrument="charis"))
     >>> (group,) = health("runs", now="2027-01-01")["groups"]
     >>> print(group["alarms"][0])

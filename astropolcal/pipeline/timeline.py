@@ -86,7 +86,7 @@ def courses(calibrations, parameters=None, *, events=()):
     ...                      meta={"date": f"202{i + 5}-03-01"})
     ...     years.append(calibrate(chain, table, cross_validate=False))
     >>> found = courses(years, ["hwp"])
-    >>> found["course"][0], found["change"][0].round(2).tolist()
+    >>> str(found["course"][0]), found["change"][0].round(2).tolist()
     ('steps', [0.0, 1.0, 0.0])
     """
     named = named_by_date(calibrations)
