@@ -2,7 +2,7 @@
 """
 Subaru/SCExAO/Fast-PDI, near-infrared polarimetry with a fast camera.
 
-Half-wave plate and derotator are those in front of CHARIS. The public pipeline fastpdi_dpp,
+Half-wave plate and derotator are those of CHARIS. The public pipeline fastpdi_dpp,
 https://github.com/scexao-org/fastpdi_dpp, has a polarizing beam splitter, a liquid crystal that
 may be out of the beam, and the bands Y, J and H. The constants in its model carry the names of
 filters of VAMPIRES and are not taken.
@@ -52,7 +52,7 @@ class FastPDI(SubaruPolarimeter):
     # what tables say of a liquid crystal is the same
     setup, meta_without = VAMPIRES.setup, VAMPIRES.meta_without
 
-    def behind(self, optics_in, grid):
+    def camera(self, optics_in, grid):
         """Return the liquid crystal, where it is in, and the beam splitter."""
         crystal = [liquid_crystal(grid.size, switching=45)] if "flc" in optics_in else []
-        return [*crystal, *super().behind(optics_in, grid)]
+        return [*crystal, *super().camera(optics_in, grid)]

@@ -4,7 +4,7 @@ Gemini South/GPI, near-infrared dual-beam polarimetry at the straight Cassegrain
 
 It turns with the telescope, so that the sky turns upstream of it by the parallactic angle, and
 there is no derotator. The half-wave plate is downstream of the adaptive optics, the Wollaston
-prism behind the lenslets (Perrin et al. 2015). What polarizes is all upstream of the plate:
+prism downstream of the lenslets (Perrin et al. 2015). What polarizes is all upstream of the plate:
 Wiktorowicz et al. (2014) measured how unpolarized light leaves it in the band H. Millar-Blanchaer
 et al. (2016) find it to be the same at all wavelengths within their errors.
 

@@ -2,9 +2,10 @@
 """
 Subaru/HiCIAO, near-infrared polarimetric differential imaging, decommissioned.
 
-Half-wave plate and derotator are those in front of CHARIS. Hashimoto (slides of the SEEDS project
+Half-wave plate and derotator are those of CHARIS. Hashimoto (slides of the SEEDS project
 on its polarimetric calibration) gives bare silver with n = 0.3 + 11.7i at 1.6 um for the tertiary
 mirror, which makes 0.3 % of polarization, and three silver mirrors with silica for the derotator.
+The silver of the tables here, another film, makes 0.55 % in H.
 The keywords of plate, derotator and altitude are those that public code reads of its frames.
 
 Not known, and nominal here: the efficiency of its Wollaston prism (0.985), and what the adaptive
@@ -36,7 +37,7 @@ class HiCIAO(SubaruPolarimeter):
     >>> hiciao = instruments.get("hiciao")
     >>> mirror = hiciao.on_sky(hiciao.chain("polarized"))["m3"]
     >>> (100 * mirror.diattenuation(hiciao.wavelength)).round(2)
-    array([0.45, 0.33, 0.24])
+    array([0.65, 0.55, 0.5 ])
     """
 
     name = "hiciao"

@@ -1,8 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Subaru/IRCS, near-infrared dual-beam imaging and spectropolarimetry behind the adaptive optics.
+Subaru/IRCS, near-infrared dual-beam imaging and spectropolarimetry with adaptive optics.
 
-Half-wave plate and derotator are those in front of CHARIS, in the wave plate unit of the Nasmyth
+Half-wave plate and derotator are those of CHARIS, in the wave plate unit of the Nasmyth
 platform. Its plate for 2 to 5 um (described in a paper of the polarimetric mode of IRCS in the
 thermal infrared, with efficiencies of 90 to 98 %) is another one and not included.
 

@@ -2,19 +2,21 @@
 """
 VLT/NaCo, near-infrared dual-beam polarimetry at a Nasmyth focus, decommissioned.
 
-The adapter turns the whole instrument behind the tertiary mirror M3, so that there is no derotator
-in the beam. Half-wave plate and Wollaston prism are in the instrument, upstream of the plate M3 and
-the mirrors of the adaptive optics. Witzel et al. (2011) find up to 4 % of instrumental polarization
-in Ks, from bare aluminium on M3 and what is behind it, and an angle of the plate of 13.2 deg off
-the header until autumn 2009; a measurement in Proc. SPIE 9147, 87 (2014) finds 1.8 +/- 0.5 deg.
+The adapter turns the whole instrument downstream of the tertiary mirror M3, so that there is no
+derotator in the beam. Half-wave plate and Wollaston prism are in the instrument, upstream of the
+plate M3 and the mirrors of the adaptive optics. Witzel et al. (2011) find up to 4 % of
+instrumental polarization in Ks, from bare aluminium on M3 and what is downstream of it, and an
+angle of the plate of 13.2 deg off the header until autumn 2009; a measurement in Proc. SPIE 9147,
+87 (2014) finds 1.8 +/- 0.5 deg.
 
 ``ESO INS ADC1 ENC`` is the encoder of the plate, 4096 steps a turn from 205 steps below zero
 (NACO manual, as the public pipeline PIPPIN reads it, https://github.com/samderegt/PIPPIN-NACO).
 ``ESO ADA POSANG`` is the position angle of the instrument.
 
 Not known, and assumed or nominal here: the signs of these angles, the retardance of the plate
-(178 deg), the efficiency of the prism (0.99). The mirrors behind M3, which do not turn against
-the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not included.
+(178 deg), the efficiency of the prism (0.99). The mirrors downstream of M3, which do not turn
+against the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not
+included.
 """
 
 import astropy.units as u
@@ -40,7 +42,7 @@ class NaCo(Polarimeter):
     """
     VLT/NaCo with half-wave plate and Wollaston prism, observing stars.
 
-    Free are, per wavelength, the diattenuation of M3, that of the mirrors behind it, the
+    Free are, per wavelength, the diattenuation of M3, that of the mirrors downstream of it, the
     retardance of the plate and the efficiency of the prism; and the angle of the plate, within
     20 deg, as it was once 13 deg off.
 

@@ -3,8 +3,8 @@
 What most instruments share: a chain of source or star, telescope, and what is downstream of them.
 
 An instrument at a telescope of its own gives `Polarimeter.inner`, the optics from its entrance
-on; what stands behind Subaru's telescope, half-wave plate and derotator is a `SubaruPolarimeter`
-and gives what is `SubaruPolarimeter.behind` them.
+on; what shares Subaru's telescope, half-wave plate and derotator is a `SubaruPolarimeter`
+and gives its `SubaruPolarimeter.camera`.
 """
 
 from abc import abstractmethod
@@ -91,7 +91,7 @@ class Polarimeter(Instrument):
 
 class SubaruPolarimeter(Polarimeter):
     """
-    What stands behind Subaru's tertiary mirror, half-wave plate and derotator, as CHARIS does.
+    What stands downstream of Subaru's tertiary mirror, half-wave plate and derotator.
 
     Sources are those of the calibration unit upstream of the plate, and stars. Free are what is
     free of CHARIS, from the same starts.
@@ -115,12 +115,12 @@ class SubaruPolarimeter(Polarimeter):
         return shared.entrance(source, grid, star, target, mirror)
 
     def inner(self, source, optics_in, grid):
-        """Return the half-wave plate, the derotator and what is behind them."""
+        """Return the half-wave plate, the derotator and the camera."""
         plate = shared.two_layer_plate(**shared.misaligned(0))
         turning = shared.derotator("elliptical", derotator_start(grid), BOUNDS["physical"])
-        return [plate, turning, *self.behind(optics_in, grid)]
+        return [plate, turning, *self.camera(optics_in, grid)]
 
-    def behind(self, optics_in, grid):
+    def camera(self, optics_in, grid):
         """Return the optics downstream of the derotator, here a Wollaston prism."""
         return [optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston")]
 

@@ -2,7 +2,7 @@
 """
 Subaru/SCExAO/REACH, spectrograph IRD at high resolution, fed by single-mode fibres.
 
-Half-wave plate and derotator are those in front of CHARIS. The public pipeline pyird,
+Half-wave plate and derotator are those of CHARIS. The public pipeline pyird,
 https://github.com/prvjapan/pyird, has the spectra of its single-mode fibres in Y, J and H.
 
 Nothing was found in public about its polarimetry. Assumed here: two fibres with the two
