@@ -54,9 +54,11 @@ def write_calibration(calibration, path, overwrite=False):
     """Write a calibration to an ASDF file, which appears complete or not at all."""
     path = check_new(path, overwrite, CalibrationFileError)
     with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
-        content = _to_bytes(calibration)
+        buffer = io.BytesIO()
+        with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+            file.write_to(buffer)
     with atomic_path(path, error=CalibrationFileError) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(buffer.getvalue())
 
 
 def read_calibration(path):
@@ -65,29 +67,14 @@ def read_calibration(path):
     with _speaking_of(path, "damaged"):
         content = path.read_bytes()
         # cheap checks first: most broken files are truncated or something else
-        _check_ends(content)
+        if not content.startswith(_BEGIN):
+            raise CalibrationFileError("not an ASDF file")
+        if not content.endswith(_END):
+            raise CalibrationFileError("truncated: the end of the file is missing")
         _check_tree(content)
-        return _from_bytes(content)
-
-
-# ---- to and from bytes -------------------------------------------------------------
-
-
-def _to_bytes(calibration):
-    buffer = io.BytesIO()
-    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
-        file.write_to(buffer)
-    return buffer.getvalue()
-
-
-def _from_bytes(content):
-    with (
-        _strict_asdf(),
-        asdf.open(
-            io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
-        ) as file,
-    ):
-        return file[_KEY]
+        options = {"lazy_load": False, "memmap": False, "validate_checksums": True}
+        with _strict_asdf(), asdf.open(io.BytesIO(content), **options) as file:
+            return file[_KEY]
 
 
 @contextmanager
@@ -122,13 +109,6 @@ def _register(config):
 
 
 # ---- what is refused before ASDF opens the file ------------------------------------
-
-
-def _check_ends(content):
-    if not content.startswith(_BEGIN):
-        raise CalibrationFileError("not an ASDF file")
-    if not content.endswith(_END):
-        raise CalibrationFileError("truncated: the end of the file is missing")
 
 
 def _check_tree(content):
@@ -229,10 +209,7 @@ def _speaking_of(path, words, prefix="", reads=True):
         except CalibrationFileError as error:
             raise CalibrationFileError(f"{path}: {prefix}{one_line(error, 500)}") from error
         except ValidationError as error:
-            raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
-
-
-def _where(error):
-    """Return what a schema objects to, and at which place of the file."""
-    place = ".".join(str(part) for part in error.absolute_path)
-    return f"invalid at {one_line(place)}: {one_line(error.message)}"
+            # what a schema objects to, and at which place of the file
+            place = one_line(".".join(map(str, error.absolute_path)))
+            words = f"invalid at {place}: {one_line(error.message)}"
+            raise CalibrationFileError(f"{path}: {prefix}{words}") from error

@@ -204,26 +204,11 @@ def _plain(table):
 
 def _hdus(table):
     """Return the table as FITS."""
-    columns = []
-    for name in table.colnames:
-        column = table[name]
-        array = np.asarray(getattr(column, "value", column))
-        unit = getattr(column, "unit", None)
-        # FITS: 32-bit integers and 64-bit floats
-        code = "J" if array.dtype.kind in "iu" else "D"
-        size = int(np.prod(array.shape[1:], dtype=int))
-        # TDIM counts the fastest axis first, numpy the slowest
-        dim = f"({','.join(str(n) for n in array.shape[:0:-1])})" if array.ndim > 1 else None
-        columns.append(
-            fits.Column(
-                name=name.upper(),
-                format=f"{size}{code}" if size > 1 else code,
-                unit=None if unit is None else unit.to_string("fits"),
-                dim=dim,
-                array=array,
-            )
-        )
-    hdu = fits.BinTableHDU.from_columns(columns, name="MUELLER")
+    columns = QTable(table, names=[name.upper() for name in table.colnames], meta={})
+    for name in ("FRAME", "BIN"):
+        columns[name] = columns[name].astype(np.int32)
+    hdu = fits.table_to_hdu(columns)
+    hdu.name = "MUELLER"
     for i, column in enumerate(hdu.columns.names, start=1):
         hdu.header.comments[f"TTYPE{i}"] = _COLUMNS.get(column, "position of the stage")[:47]
     for key, (value, comment) in table.meta.items():
