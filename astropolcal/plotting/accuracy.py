@@ -29,7 +29,6 @@ from astropolcal.plotting._style import (
     looks,
     nanometres,
     scale_axis,
-    style,
     wavelength_label,
 )
 
@@ -109,9 +108,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     count = len(records) + len(others)
     grids = [r.accuracy for r in records] + [entry["wavelength_nm"] for entry in standards]
     one_panel = len(records) > 1 and not curves and all(len(lam) == 1 for lam in grids)
-    with style():
-        size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
-        figure = canvas(figure, *size)
+    size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
+    with canvas(figure, *size) as figure:
         # one scale, so that datasets can be compared by eye
         share = {"sharex": True, "sharey": True, "squeeze": False}
         panels = figure.subplots(1 if one_panel else count, 1, **share)[:, 0]
@@ -265,8 +263,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
     if not tables:
         raise ObservationError("the chain has no half-wave plate: no accuracy for targets")
     parts = paper_accuracies(calibration, targets[:1])
-    with style():
-        figure = canvas(figure, 8.5, 11)
+    with canvas(figure, 8.5, 11) as figure:
         panels = figure.subplots(3, 1, sharex=True)
         handles = _draw_parts(panels[0], parts[0]) if parts else []
         lines = _draw_targets(panels[1], tables, "s_p")
@@ -384,8 +381,7 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             raise ObservationError("the calibration was checked with no star: nothing to draw")
         entry = calibration.fit["stars"][-1]
     values = {key: np.asarray(value) for key, value in entry.items() if isinstance(value, list)}
-    with style():
-        figure = canvas(figure, 12, 6.4)
+    with canvas(figure, 12, 6.4) as figure:
         panels = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
         for (top, bottom), quantity in zip(panels.T, _QUANTITIES, strict=True):
             _draw_star(top, bottom, values, *quantity)

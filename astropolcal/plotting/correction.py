@@ -19,7 +19,6 @@ from astropolcal.plotting._style import (
     nanometres,
     note,
     plain_numbers,
-    style,
     wavelength_label,
 )
 
@@ -82,8 +81,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
     limit = _top(np.abs([panels[name] for name in _POLARIZED]))
-    with style():
-        figure = canvas(figure, 12.5, 8.2)
+    with canvas(figure, 12.5, 8.2) as figure:
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             _panel(figure, axes, name, image, corrected, limit)
@@ -186,8 +184,7 @@ def plot_spectrum(corrected, *, figure=None):
     if corrected.stokes.ndim != 2:
         raise ParameterError("these are images; take an aperture, or draw them with plot_images")
     nm = nanometres(corrected.wavelength)
-    with style():
-        figure = canvas(figure, 9.0, 9.5)
+    with canvas(figure, 9.0, 9.5) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.3))
         for name in corrected.components[1:].lower():
             _values(top, nm, corrected, name)

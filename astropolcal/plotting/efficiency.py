@@ -18,7 +18,6 @@ from astropolcal.plotting._style import (
     legend_outside,
     looks,
     nanometres,
-    style,
     wavelength_label,
 )
 
@@ -62,8 +61,7 @@ def plot_polarimetric_efficiency(
     # without an altitude axis there is no pointing to map
     turns, maps = has_derotator(chain), "altitude" in at
     panels = (2 if turns else int(not maps)) + maps
-    with style():
-        fig = canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2)
+    with canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2) as fig:
         axes = list(fig.subplots(1, panels, squeeze=False)[0])
         if turns:
             values = asked(derotator=_DEROTATOR * u.deg, **at)
@@ -93,8 +91,7 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
     offset = table["offset"].to_value(u.deg)
     # markers tell the lines apart without colour; at all offsets they would be a band
     every = max(1, len(offset) // 12)
-    with style():
-        fig = canvas(figure, 6.5, 5.2)
+    with canvas(figure, 6.5, 5.2) as fig:
         ax = fig.subplots()
         for (color, marker), name in zip(looks(2), ("mean", "least"), strict=True):
             ax.plot(offset, table[name], color=color, marker=marker, markevery=every, label=name)
@@ -221,8 +218,7 @@ def plot_comparison(members, *, title=None, figure=None):
     """
     table = members if isinstance(members, QTable) else compare(members)
     labels = list(dict.fromkeys(str(label) for label in table["label"]))
-    with style():
-        fig = canvas(figure, 11.5, 8.2)
+    with canvas(figure, 11.5, 8.2) as fig:
         axes = fig.subplots(2, 2, sharex=True).ravel()
         handles = [
             _draw_member(axes, table[table["label"] == label], label, *look)
@@ -316,8 +312,7 @@ def plot_observability(seen, *, total=None, figure=None):
     # UTC, before the first dark hour of the first star
     midnight = np.floor(seen[0].table["time"][0].mjd)
     stars = list(zip(seen, looks(len(seen)), strict=True))
-    with style():
-        figure = canvas(figure, 8.0, 6.4)
+    with canvas(figure, 8.0, 6.4) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
         for star, look in stars:
             hours = (star.table["time"].mjd - midnight) * 24

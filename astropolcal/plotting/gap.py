@@ -31,7 +31,6 @@ from astropolcal.plotting._style import (
     name_groups,
     rms,
     scale_axis,
-    style,
     wavelength_label,
 )
 
@@ -109,8 +108,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     2
     """
     datasets, channels = _datasets(diagnosis), diagnosis.nominal.problem.channels
-    with style():
-        figure = canvas(figure, 10, 1.6 + 3.3 * len(datasets))
+    with canvas(figure, 10, 1.6 + 3.3 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 2, sharex=True, squeeze=False)
         for row, channel, dataset in zip(panels, channels, datasets, strict=True):
             name, _, nm, before, after = dataset
@@ -166,8 +164,7 @@ def plot_gap_frames(diagnosis, *, figure=None):
     'frame'
     """
     datasets = _datasets(diagnosis)
-    with style():
-        figure = canvas(figure, 9, 1.4 + 2.5 * len(datasets))
+    with canvas(figure, 9, 1.4 + 2.5 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 1, squeeze=False)[:, 0]
         for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=True):
             thirds = [part for part in np.array_split(np.argsort(nm), 3) if part.size]
@@ -234,8 +231,7 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     gaps = [(before[c], after[c]) for *_, before, after in datasets]
     sizes = np.concatenate([gap.ravel() for pair in gaps for gap in pair])
     limit, clipped = color_limit(sizes, _COVERED)
-    with style():
-        figure = canvas(figure, 12, 1.5 + 3.2 * len(datasets))
+    with canvas(figure, 12, 1.5 + 3.2 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 2, sharey="row", squeeze=False)
         for row, pair, (name, observations, nm, *_) in zip(panels, gaps, datasets, strict=True):
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
@@ -313,8 +309,7 @@ def plot_cause_map(diagnosis, *, figure=None):
     rows = _cause_map(diagnosis)
     shown = [k for k in _FAMILIES if k != _OTHER or any(k in row for row in rows.values())]
     table = np.array([[row.get(k, (0.0, ""))[0] for k in shown] for row in rows.values()])
-    with style():
-        figure = canvas(figure, 5.4, 1.6 + 0.5 * len(rows))
+    with canvas(figure, 5.4, 1.6 + 0.5 * len(rows)) as figure:
         axes = figure.subplots()
         # one hue from white to dark: it is the same for all kinds of colour vision, and in print
         axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
@@ -412,8 +407,7 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
     nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
-    with style():
-        figure = canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2))
+    with canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
         for axes, name in zip(grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
                 _curve_panel(axes, diagnosis, effect)

@@ -32,7 +32,6 @@ from astropolcal.plotting._style import (
     legend_outside,
     looks,
     nanometres,
-    style,
     wavelength_label,
 )
 from astropolcal.words import counted, did_you_mean
@@ -406,8 +405,7 @@ def _draw_all(figure, calibration, title, panels, draw):
     """Draw panels, two a row where there are more than two, with one legend for all."""
     columns = 2 if len(panels) > 2 else 1
     height = 2.0 + 3.1 * -(-len(panels) // columns)
-    with style():
-        figure = canvas(figure, 11.9 if columns == 2 else 8.5, height)
+    with canvas(figure, 11.9 if columns == 2 else 8.5, height) as figure:
         axes, lowest = grid(figure, len(panels), columns, sharex=True)
         for one, panel, look in zip(axes, panels, looks(len(panels)), strict=True):
             draw(one, panel, look)
@@ -481,8 +479,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     reference = _published(calibration) if reference is None else reference
     retards = any("retardance" in table.colnames for table in tables)
     rows = ["diattenuation", "retardance"][: 1 + retards]
-    with style():
-        figure = canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows))
+    with canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows)) as figure:
         # mirrors side by side on one scale
         panels = figure.subplots(len(rows), len(names), sharex=True, sharey="row", squeeze=False)
         for column, table in zip(panels.T, tables, strict=True):
@@ -604,9 +601,8 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
             f"{len(own)} parameters to draw; allowed are 1 to {_MOST_PANELS}, choose with "
             "parameters="
         )
-    with style():
-        columns = min(len(own), 2)
-        fig = canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6)
+    columns = min(len(own), 2)
+    with canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6) as fig:
         axes, lowest = grid(fig, len(own), columns, sharex=True)
         for ax, (name, rows) in zip(axes, own.items(), strict=True):
             _draw_history(ax, rows, name, _MOST_LINES if shown is None else shown)

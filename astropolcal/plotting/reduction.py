@@ -16,7 +16,6 @@ from astropolcal.plotting._style import (
     grid,
     legend_outside,
     save,
-    style,
 )
 from astropolcal.reduction.frames import open_cube
 from astropolcal.reduction.photometry import BEAMS
@@ -68,8 +67,7 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
     k, at = _slice(reduction, wavelength)
     columns = min(4, len(chosen))
     rows = -(-len(chosen) // columns)
-    with style():
-        figure = canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2)
+    with canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2) as figure:
         axes, lowest = grid(figure, len(chosen), columns, sharex=True, sharey=True)
         gaps = [_draw_frame(*panel, reduction, k) for panel in zip(axes, chosen, strict=True)]
         for panel in lowest:
@@ -181,8 +179,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
     k, at = _slice(reduction, wavelength)
     star = reduction.source == "star"
     clock, label = _clock(reduction.frames)
-    with style():
-        figure = canvas(figure, 9.0, 11.0 if star else 6.0)
+    with canvas(figure, 9.0, 11.0 if star else 6.0) as figure:
         axes = figure.subplots(5 if star else 2, 1, sharex=True)
         _draw_fluxes(axes[0], axes[1], reduction, clock, k)
         if star:

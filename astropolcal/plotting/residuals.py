@@ -27,7 +27,6 @@ from astropolcal.plotting._style import (
     name_groups,
     nanometres,
     rms,
-    style,
 )
 from astropolcal.propagation import Propagator
 
@@ -247,12 +246,11 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     drawn = DataGrid(calibration, dataset)
     bins = drawn.spread_bins(_PANELS) if wavelengths is None else drawn.nearest_bins(wavelengths)
     series = drawn.series()
-    with style():
-        columns = min(2, len(bins))
-        rows = -(-len(bins) // columns)
-        # as high as a legend of all settings beside the panels, and a title above it
-        height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
-        figure = canvas(figure, 3.0 + 4.4 * columns, height)
+    columns = min(2, len(bins))
+    rows = -(-len(bins) // columns)
+    # as high as a legend of all settings beside the panels, and a title above it
+    height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
+    with canvas(figure, 3.0 + 4.4 * columns, height) as figure:
         pairs = _panels(figure, len(bins), rows, columns)
         fine = _fine(drawn.abscissa[0])
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
@@ -383,9 +381,11 @@ def plot_residuals(calibration, *, figure=None):
     Datasets of one wavelength each are bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
-    draw = _draw_bars if all(grid.wavelength.size == 1 for grid in grids) else _draw_maps
-    with style():
-        figure = draw(figure, grids)
+    count = len(grids)
+    bars = all(grid.wavelength.size == 1 for grid in grids)
+    height = 2.2 + 1.4 * max(count, 2) if bars else 0.8 + 5.4 * count
+    with canvas(figure, 10.5, height) as figure:
+        (_draw_bars if bars else _draw_maps)(figure, grids)
         names = [grid.part.observations.name for grid in grids]
         heading(figure, calibration, f"Residuals of the {grids[0].quantity}", names)
     return figure
@@ -394,7 +394,6 @@ def plot_residuals(calibration, *, figure=None):
 def _draw_maps(figure, grids):
     scales, shared = _scales(grids)
     n = len(grids)
-    figure = canvas(figure, 10.5, 0.8 + 5.4 * n)
     spec = figure.add_gridspec(2 * n, 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * n)
     for i, (grid, (limit, clipped)) in enumerate(zip(grids, scales, strict=True)):
         main = figure.add_subplot(spec[2 * i + 1, 0])
@@ -407,7 +406,6 @@ def _draw_maps(figure, grids):
             color_bar(figure, drawn, [main, above, right], clipped, ", own scale\n")
     if shared:
         color_bar(figure, drawn, figure.axes, clipped)
-    return figure
 
 
 def _scales(grids):
@@ -422,7 +420,6 @@ def _scales(grids):
 
 def _draw_bars(figure, grids):
     """Draw the residuals at one wavelength, a panel per dataset, all with the same scale."""
-    figure = canvas(figure, 10.5, 2.2 + 1.4 * max(len(grids), 2))
     panels = figure.subplots(len(grids), 1, sharey=True, squeeze=False)[:, 0]
     below = None
     for axes, grid in list(zip(panels, grids, strict=True))[::-1]:
@@ -447,7 +444,6 @@ def _draw_bars(figure, grids):
     figure.supylabel(f"observed {MINUS} model (%); grey: masked", fontsize=11)
     size = max(100 * _HEADROOM * max(np.nanmax(np.abs(grid.residual)) for grid in grids), 1e-12)
     panels[0].set_ylim(-size, size)
-    return figure
 
 
 def _draw_dataset(main, above, right, grid, limit):
