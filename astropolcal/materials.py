@@ -303,12 +303,12 @@ class BrendelBormannLaw:
     drude: tuple
     resonances: tuple = ()
 
-    def _permittivity_um(self, wavelength_um):
-        """Return the complex permittivity at wavelengths in micrometre, unchecked."""
+    def _index_um(self, wavelength_um):
+        """Return n + ik at wavelengths in micrometre, unchecked."""
         omega = _EV_UM / np.asarray(wavelength_um, dtype=float)
         strength, width = self.drude
         total = 1.0 - strength * self.plasma**2 / (omega * (omega + 1j * width))
-        return total + sum(self._resonance(omega, *terms) for terms in self.resonances)
+        return np.sqrt(total + sum(self._resonance(omega, *terms) for terms in self.resonances))
 
     def _resonance(self, omega, strength, width, centre, spread):
         # pipelines that load a calibration need no scipy, unless a metal is in it
@@ -318,10 +318,6 @@ class BrendelBormannLaw:
         scale = np.sqrt(2) * spread
         shape = wofz((a - centre) / scale) + wofz((a + centre) / scale)
         return 0.5j * np.sqrt(np.pi) * strength * self.plasma**2 / (a * scale) * shape
-
-    def _index_um(self, wavelength_um):
-        """Return n + ik at wavelengths in micrometre, unchecked."""
-        return np.sqrt(self._permittivity_um(wavelength_um))
 
 
 class TabulatedLaw:

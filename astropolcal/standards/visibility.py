@@ -261,18 +261,11 @@ def _prior(width, star_error):
 
 def _covariance(columns):
     """Return the covariance of least squares; infinite where nothing is determined."""
-    # all right vectors are there even if one frame gives fewer rows than columns; with more rows
-    # the full matrix of left ones would have the square of their number
-    short = columns.shape[0] < columns.shape[1]
-    _, size, directions = np.linalg.svd(columns, full_matrices=short)
-    # one frame gives two rows for three or more columns: the missing singular values are zero
-    size = np.concatenate([size, np.zeros(columns.shape[1] - len(size))])
-    good = size > _RANK * size.max()
-    half = directions[good] / size[good, None]
-    covariance = half.T @ half
+    inverse = np.linalg.pinv(columns, rcond=_RANK)
+    covariance = inverse @ inverse.T
     # a parameter that takes part in an open direction has an infinite error, not that of a
-    # pseudo-inverse; null vectors are exact to about the root of the rank tolerance
-    lost = np.any(np.abs(directions[~good]) > np.sqrt(_RANK), axis=0)
+    # pseudo-inverse: the projector on what is determined shortens it
+    lost = np.diagonal(inverse @ columns) < 1 - _RANK
     covariance[lost, :] = covariance[:, lost] = np.inf
     return covariance
 
