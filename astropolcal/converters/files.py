@@ -54,11 +54,9 @@ def write_calibration(calibration, path, overwrite=False):
     """Write a calibration to an ASDF file, which appears complete or not at all."""
     path = check_new(path, overwrite, CalibrationFileError)
     with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
-        buffer = io.BytesIO()
-        with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
-            file.write_to(buffer)
+        content = _to_bytes(calibration)
     with atomic_path(path, error=CalibrationFileError) as temporary:
-        temporary.write_bytes(buffer.getvalue())
+        temporary.write_bytes(content)
 
 
 def read_calibration(path):
@@ -72,9 +70,27 @@ def read_calibration(path):
         if not content.endswith(_END):
             raise CalibrationFileError("truncated: the end of the file is missing")
         _check_tree(content)
-        options = {"lazy_load": False, "memmap": False, "validate_checksums": True}
-        with _strict_asdf(), asdf.open(io.BytesIO(content), **options) as file:
-            return file[_KEY]
+        return _from_bytes(content)
+
+
+# ---- to and from bytes -------------------------------------------------------------
+
+
+def _to_bytes(calibration):
+    buffer = io.BytesIO()
+    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+        file.write_to(buffer)
+    return buffer.getvalue()
+
+
+def _from_bytes(content):
+    with (
+        _strict_asdf(),
+        asdf.open(
+            io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
+        ) as file,
+    ):
+        return file[_KEY]
 
 
 @contextmanager
