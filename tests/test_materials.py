@@ -10,13 +10,10 @@ from hypothesis import strategies as st
 from astropolcal import materials
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.materials import (
-    AL2O3,
-    ALUMINIUM,
     FUSED_SILICA,
     GOLD,
     MGF2,
     QUARTZ,
-    SI3N4,
     SILVER,
     BrendelBormannLaw,
     IsotropicMaterial,
@@ -30,6 +27,7 @@ from astropolcal.materials import (
 )
 
 MATERIALS = [QUARTZ, MGF2]
+AL2O3, SI3N4, ALUMINIUM = map(get_material, ("Al2O3", "Si3N4", "aluminium"))
 METALS = [SILVER, GOLD, ALUMINIUM]
 FILMS = [FUSED_SILICA, AL2O3, SI3N4]
 EVERY = [*MATERIALS, *METALS, *FILMS]
