@@ -104,7 +104,11 @@ def _meta(calibration, light, n_frames, n_bins, assumed):
     """Return keyword to (value, comment)."""
     from astropolcal.version import version
 
-    held = calibration.validity
+    held, sets = calibration.validity, calibration.validity.optics_in
+    if calibration.optics_in is not None:
+        sets = [calibration.optics_in]
+    optics = ",".join(sets[0]) or "none" if sets is not None and len(sets) == 1 else None
+    reference = "Q = N-S, U = NE-SW" if light == "sky" else "instrument"
     entries = {
         "INSTRUME": (held.instrument, "instrument that was calibrated"),
         "CALMODE": (held.mode, "mode of the calibration"),
@@ -112,26 +116,15 @@ def _meta(calibration, light, n_frames, n_bins, assumed):
         "CALHASH": (calibration.content_hash, ""),
         "CALFROM": (held.valid_from, "it holds from this moment (UTC)"),
         "CALUNTIL": (held.valid_until, "it holds until this moment (UTC)"),
-        "CALOPTIC": (_optics(calibration), "optional optics in the beam"),
+        "CALOPTIC": (optics, "optional optics in the beam"),
         "CALASSUM": (",".join(assumed) or None, "optics not calibrated, published values"),
         "MUELLIGH": (light, "light enters: sky or internal source"),
-        "MUELREF": (_reference(light), "frame of the incident Stokes parameters"),
+        "MUELREF": (reference, "frame of the incident Stokes parameters"),
         "NFRAMES": (n_frames, "number of frames"),
         "NBINS": (n_bins, "number of wavelengths"),
         "CREATOR": (f"astropolcal {version}", ""),
     }
     return {key: entry for key, entry in entries.items() if entry[0] is not None}
-
-
-def _optics(calibration):
-    sets = calibration.validity.optics_in
-    if calibration.optics_in is not None:
-        return ",".join(calibration.optics_in) or "none"
-    return None if sets is None or len(sets) != 1 else ",".join(sets[0]) or "none"
-
-
-def _reference(light):
-    return "Q = N-S, U = NE-SW" if light == "sky" else "instrument"
 
 
 def write_mueller(table, path, overwrite=False):

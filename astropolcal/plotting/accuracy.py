@@ -151,15 +151,13 @@ def _reference(label, pair):
     try:
         wavelength, accuracy = pair
         lam, value = st.nanometres(wavelength), np.atleast_1d(accuracy.to_value(u.percent))
+        if lam.shape != value.shape:
+            raise ValueError(f"it has {lam.size} wavelengths but {value.size} accuracies")
     except (AttributeError, TypeError, ValueError, u.UnitConversionError) as error:
         raise ParameterError(
             f"reference {label!r} must be a pair (wavelength, accuracy) of quantities, "
             f"the second in percent: {error}"
         ) from None
-    if lam.shape != value.shape:
-        raise ParameterError(
-            f"reference {label!r} has {lam.size} wavelengths but {value.size} accuracies"
-        )
     return lam, value
 
 

@@ -90,7 +90,8 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
             levels=1 - np.exp([-0.5, -2.0, -4.5]),
             fill_contours=True,
             plot_datapoints=False,
-            bins=_bins(len(samples)),
+            # enough samples in each to draw contours
+            bins=int(np.clip(np.sqrt(len(samples)) / 3, 12, 50)),
             color=BLUE,
             max_n_ticks=4,
             hist_kwargs={"linewidth": 1.5},
@@ -98,11 +99,6 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         marks = None if marks is None else marks - shifts
         _finish_corner(figure, posterior, columns, samples - shifts, marks)
     return figure
-
-
-def _bins(n_samples):
-    """Return how many bins a side leave enough samples in each to draw contours."""
-    return int(np.clip(np.sqrt(n_samples) / 3, 12, 50))
 
 
 def _columns(posterior, parameters, most):

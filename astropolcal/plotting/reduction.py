@@ -177,7 +177,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
         axes[-1].set_xlabel(label)
         figure.suptitle(f"The run at {at}")
         figure.align_ylabels()
-        st.legend_outside(figure, _run_handles(reduction, k), columns=4)
+        st.legend_outside(figure, list(st.legend_entries(axes[:2]).values()), columns=4)
     return figure
 
 
@@ -204,20 +204,22 @@ def _draw_fluxes(top, below, reduction, clock, k):
     flux = _cells(reduction, k, "flux")
     error = np.sqrt(_cells(reduction, k, "variance"))
     for beam, name in enumerate(BEAMS):
-        top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **_look(name))
+        look = _look(name) | {"label": f"{name} beam"}
+        top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **look)
     top.set_ylabel(f"flux ({reduction.frames[0].unit})")
     total = flux.sum(axis=0)
     # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2
     scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
     single = (flux[0] - flux[1]) / total
-    below.errorbar(clock, single, scatter, fmt="D", color=st.GREEN, ms=5, lw=0, elinewidth=1.2)
+    look = {"fmt": "D", "color": st.GREEN, "ms": 5, "lw": 0, "elinewidth": 1.2}
+    below.errorbar(clock, single, scatter, label="single difference", **look)
     below.axhline(0.0, color="0.6", lw=0.8)
     below.set_ylabel(f"(right {st.MINUS} left) /\n(right + left)")
     failed = clock[np.isnan(flux[0])]
     for axes in (top, below) if failed.size else ():
         # at the foot of the panel, whatever the fluxes are
         look = {"color": st.BLACK, "transform": axes.get_xaxis_transform()}
-        axes.plot(failed, np.full(failed.size, 0.05), "x", **look)
+        axes.plot(failed, np.full(failed.size, 0.05), "x", label="masked frame", **look)
 
 
 def _look(name):
@@ -235,16 +237,6 @@ def _draw_places(panels, reduction, clock, k):
             if key != "fwhm" and np.isfinite(values).any():
                 values = values - np.nanmedian(values)
             panel.plot(clock, values, **_look(name))
-
-
-def _run_handles(reduction, k):
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], label=f"{name} beam", **_look(name)) for name in BEAMS]
-    handles.append(Line2D([], [], color=st.GREEN, marker="D", ls="", label="single difference"))
-    if any(frame.photometry.reasons[k] for frame in reduction.frames):
-        handles.append(Line2D([], [], color=st.BLACK, marker="x", ls="", label="masked frame"))
-    return handles
 
 
 def save_quicklook(reduction, folder):

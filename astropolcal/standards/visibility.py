@@ -12,6 +12,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
 from astropolcal.standards.catalogues import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
@@ -231,32 +232,21 @@ def telescope_information(
         raise ParameterError(f"there are {psi.size} parallactic angles and {turn.size} altitudes")
     columns = _design(psi, turn, offset) / _positive(frame_error, "frame_error")
     if star_error is not None:
-        columns = np.vstack([columns, _prior(columns.shape[1], star_error)])
+        # a star known beforehand is two more measurements, of its q and u
+        known = np.eye(2, columns.shape[1]) / _positive(star_error, "star_error")
+        columns = np.vstack([columns, known])
     return TelescopeInformation(_NAMES[: columns.shape[1]], _covariance(columns))
 
 
 def _design(psi, turn, offset):
     """Return the derivatives of all q' and u' by the parameters, shape (2 n, 3 or 5)."""
     # in the frame of the instrument; the turn itself changes no information
-    star, mirror = _rotation(psi - turn), _rotation(-turn)[..., :1]
+    star, mirror = (rotation_matrix(a * u.rad)[..., 1:3, 1:3] for a in (psi - turn, -turn))
     # columns: star q, star u, diattenuation, and with an offset its q and u
-    parts = [star, mirror]
+    parts = [star, mirror[..., :1]]
     if offset:
         parts.append(np.broadcast_to(np.eye(2), star.shape))
     return np.concatenate(parts, axis=-1).reshape(2 * len(psi), -1)
-
-
-def _rotation(angle):
-    """Return the matrices that turn (q, u) by an angle, shape (n, 2, 2)."""
-    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
-    return np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], axis=-2)
-
-
-def _prior(width, star_error):
-    # a star known beforehand is two more measurements, of its q and u
-    rows = np.zeros((2, width))
-    rows[:, :2] = np.eye(2) / _positive(star_error, "star_error")
-    return rows
 
 
 def _covariance(columns):
