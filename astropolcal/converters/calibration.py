@@ -20,23 +20,8 @@ from astropolcal.calibration.result.calibration import DatasetRecord
 from astropolcal.calibration.result.validity import validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
+from astropolcal.converters import nodes
 from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
-from astropolcal.converters.nodes import (
-    check_posterior,
-    checksum,
-    node_from_posterior,
-    node_from_priors,
-    node_from_table,
-    node_from_value,
-    plain,
-    posterior_from_node,
-    restore_priors,
-    table_from_node,
-    unit_from_text,
-    unit_text,
-    value_from_node,
-    without_priors,
-)
 from astropolcal.converters.optics import node_from_optic
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
@@ -60,21 +45,21 @@ def node_from_calibration(calibration):
     """Return the node of a calibration, as the newest schema describes it."""
     check_calibration(calibration)
     chains, posterior = calibration.chains, calibration.posterior
-    priors = node_from_priors(chains)
+    priors = nodes.node_from_priors(chains)
     # an optic's node cannot hold priors; copies: to write a calibration must not change it
-    chains = [without_priors(chain) for chain in chains] if priors else chains
+    chains = [nodes.without_priors(chain) for chain in chains] if priors else chains
     node = {
         "chains": [_chain_node(chain) for chain in chains],
-        "wavelength": node_from_value(calibration.wavelength),
+        "wavelength": nodes.node_from_value(calibration.wavelength),
         "covariance": _covariance_node(calibration.covariance),
         "identifiability": _identifiability_node(calibration.identifiability),
         "datasets": [_dataset_node(record) for record in calibration.datasets],
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
-        **{key: plain(getattr(calibration, key), key) for key in _PLAIN},
+        **{key: nodes.plain(getattr(calibration, key), key) for key in _PLAIN},
     }
     node |= {"priors": priors} if priors else {}
-    node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
+    node |= {} if posterior is None else {"posterior": nodes.node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
     return node | {
         "checksum": _checksum(node),
@@ -85,7 +70,7 @@ def node_from_calibration(calibration):
 
 def _checksum(node):
     content = {key: value for key, value in node.items() if key not in _DERIVED}
-    return checksum(content, expand=node_from_optic)
+    return nodes.checksum(content, expand=node_from_optic)
 
 
 def _validity(calibration):
@@ -109,7 +94,7 @@ def _chain_node(chain):
 def _covariance_node(covariance):
     node = {
         "names": list(covariance.names),
-        "units": [unit_text(unit) for unit in covariance.units],
+        "units": [nodes.unit_text(unit) for unit in covariance.units],
         "matrix": covariance.matrix.copy(),
     }
     if covariance.factor is not None and covariance.factor.size:
@@ -121,7 +106,7 @@ def _covariance_node(covariance):
 
 
 def _identifiability_node(finding):
-    node = plain(vars(finding), "identifiability") | {
+    node = nodes.plain(vars(finding), "identifiability") | {
         # row by row: some versions of asdf cannot read an empty matrix
         "null_vectors": [row.copy() for row in finding.null_vectors],
         "directions": [_direction_node(direction) for direction in finding.directions],
@@ -133,15 +118,15 @@ def _identifiability_node(finding):
 
 def _direction_node(direction):
     # a list, as a mapping would lose the order
-    values = plain(direction["parameters"], direction["words"]).items()
-    return plain(direction, "direction") | {
+    values = nodes.plain(direction["parameters"], direction["words"]).items()
+    return nodes.plain(direction, "direction") | {
         "parameters": [{"name": name, "value": value} for name, value in values]
     }
 
 
 def _dataset_node(record):
     node = {key: value for key, value in vars(record).items() if key != "accuracy"}
-    return plain(node, record.name) | {"accuracy": node_from_table(record.accuracy)}
+    return nodes.plain(node, record.name) | {"accuracy": nodes.node_from_table(record.accuracy)}
 
 
 def _tie_node(name, tie):
@@ -149,7 +134,7 @@ def _tie_node(name, tie):
         "target": name,
         "source": tie.source,
         "factor": float(tie.factor),
-        "offset": node_from_value(tie.offset),
+        "offset": nodes.node_from_value(tie.offset),
     }
 
 
@@ -157,8 +142,8 @@ def _stage_node(stage):
     values = stage["parameters"].items()
     return {
         "title": stage["title"],
-        "parameters": [{"name": name} | node_from_value(value) for name, value in values],
-        "residual_rms": plain(stage["residual_rms"], "residual_rms"),
+        "parameters": [{"name": name} | nodes.node_from_value(value) for name, value in values],
+        "residual_rms": nodes.plain(stage["residual_rms"], "residual_rms"),
     }
 
 
@@ -176,17 +161,17 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         node = MIGRATIONS[step](node)
     chains = [_chain(entry) for entry in node["chains"]]
     # before the calibration is made: its free parameters bind the priors
-    restore_priors(chains, node.get("priors", []))
+    nodes.restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
         chains=chains,
-        wavelength=value_from_node(node["wavelength"]),
+        wavelength=nodes.value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
         datasets=[_dataset(entry) for entry in node["datasets"]],
         ties={name: _tie(entry) for name, entry in _by_name(node["ties"], "target").items()},
         stages=[_stage(entry) for entry in node["stages"]],
-        **{key: plain(node[key]) for key in _PLAIN},
-        posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
+        **{key: nodes.plain(node[key]) for key in _PLAIN},
+        posterior=nodes.posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
     validity_of(calibration)
@@ -211,7 +196,7 @@ def _chain(node):
 
 
 def _covariance(node):
-    units = [unit_from_text(text) for text in node["units"]]
+    units = [nodes.unit_from_text(text) for text in node["units"]]
     shape = np.shape(node.get("factor", [[0.0] * len(units)]))
     if len(shape) != 2 or shape[1] != len(units):
         # it would be laid out anew, and mean something else
@@ -228,7 +213,7 @@ def _covariance(node):
 
 
 def _identifiability(node):
-    found, vectors = plain(node), node["null_vectors"]
+    found, vectors = nodes.plain(node), node["null_vectors"]
     found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
     for key in ("directions", "near_null"):
         found[key] = [_direction(entry) for entry in found.get(key, [])]
@@ -251,12 +236,12 @@ def _direction(node):
 
 
 def _dataset(node):
-    accuracy = table_from_node(node["accuracy"])
-    return DatasetRecord(**(node | {"meta": plain(node["meta"]), "accuracy": accuracy}))
+    accuracy = nodes.table_from_node(node["accuracy"])
+    return DatasetRecord(**(node | {"meta": nodes.plain(node["meta"]), "accuracy": accuracy}))
 
 
 def _tie(node):
-    offset = value_from_node(node["offset"])
+    offset = nodes.value_from_node(node["offset"])
     # a number of its own type, as it was given
     plain_number = "unit" not in node["offset"] and not np.ndim(offset)
     return Tie(node["source"], node["factor"], offset.item() if plain_number else offset)
@@ -266,7 +251,9 @@ def _stage(node):
     parameters = node["parameters"]
     return {
         "title": node["title"],
-        "parameters": {k: value_from_node(entry) for k, entry in _by_name(parameters).items()},
+        "parameters": {
+            k: nodes.value_from_node(entry) for k, entry in _by_name(parameters).items()
+        },
         "residual_rms": node["residual_rms"],
     }
 
@@ -307,7 +294,7 @@ def check_calibration(calibration):
     for record in calibration.datasets:
         if record.accuracy is not None:
             _check_accuracy(record.accuracy, f"the accuracy of {record.name}")
-    check_posterior(calibration.posterior, calibration.covariance)
+    nodes.check_posterior(calibration.posterior, calibration.covariance)
 
 
 def _check_laws(chains, wavelength):
