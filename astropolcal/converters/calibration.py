@@ -20,8 +20,23 @@ from astropolcal.calibration.result.calibration import DatasetRecord
 from astropolcal.calibration.result.validity import validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
-from astropolcal.converters import nodes
 from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
+from astropolcal.converters.nodes import (
+    check_posterior,
+    checksum,
+    node_from_posterior,
+    node_from_priors,
+    node_from_table,
+    node_from_value,
+    plain,
+    posterior_from_node,
+    restore_priors,
+    table_from_node,
+    unit_from_text,
+    unit_text,
+    value_from_node,
+    without_priors,
+)
 from astropolcal.converters.optics import node_from_optic
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
@@ -45,21 +60,21 @@ def node_from_calibration(calibration):
     """Return the node of a calibration, as the newest schema describes it."""
     check_calibration(calibration)
     chains, posterior = calibration.chains, calibration.posterior
-    priors = nodes.node_from_priors(chains)
+    priors = node_from_priors(chains)
     # an optic's node cannot hold priors; copies: to write a calibration must not change it
-    chains = [nodes.without_priors(chain) for chain in chains] if priors else chains
+    chains = [without_priors(chain) for chain in chains] if priors else chains
     node = {
         "chains": [_chain_node(chain) for chain in chains],
-        "wavelength": nodes.node_from_value(calibration.wavelength),
+        "wavelength": node_from_value(calibration.wavelength),
         "covariance": _covariance_node(calibration.covariance),
         "identifiability": _identifiability_node(calibration.identifiability),
         "datasets": [_dataset_node(record) for record in calibration.datasets],
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
-        **{key: nodes.plain(getattr(calibration, key), key) for key in _PLAIN},
+        **{key: plain(getattr(calibration, key), key) for key in _PLAIN},
     }
     node |= {"priors": priors} if priors else {}
-    node |= {} if posterior is None else {"posterior": nodes.node_from_posterior(posterior)}
+    node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
     return node | {
         "checksum": _checksum(node),
@@ -70,7 +85,7 @@ def node_from_calibration(calibration):
 
 def _checksum(node):
     content = {key: value for key, value in node.items() if key not in _DERIVED}
-    return nodes.checksum(content, expand=node_from_optic)
+    return checksum(content, expand=node_from_optic)
 
 
 def _validity(calibration):
@@ -94,7 +109,7 @@ def _chain_node(chain):
 def _covariance_node(covariance):
     node = {
         "names": list(covariance.names),
-        "units": [nodes.unit_text(unit) for unit in covariance.units],
+        "units": [unit_text(unit) for unit in covariance.units],
         "matrix": covariance.matrix.copy(),
     }
     if covariance.factor is not None and covariance.factor.size:
@@ -106,7 +121,7 @@ def _covariance_node(covariance):
 
 
 def _identifiability_node(finding):
-    node = nodes.plain(vars(finding), "identifiability") | {
+    node = plain(vars(finding), "identifiability") | {
         # row by row: some versions of asdf cannot read an empty matrix
         "null_vectors": [row.copy() for row in finding.null_vectors],
         "directions": [_direction_node(direction) for direction in finding.directions],
@@ -118,15 +133,15 @@ def _identifiability_node(finding):
 
 def _direction_node(direction):
     # a list, as a mapping would lose the order
-    values = nodes.plain(direction["parameters"], direction["words"]).items()
-    return nodes.plain(direction, "direction") | {
+    values = plain(direction["parameters"], direction["words"]).items()
+    return plain(direction, "direction") | {
         "parameters": [{"name": name, "value": value} for name, value in values]
     }
 
 
 def _dataset_node(record):
     node = {key: value for key, value in vars(record).items() if key != "accuracy"}
-    return nodes.plain(node, record.name) | {"accuracy": nodes.node_from_table(record.accuracy)}
+    return plain(node, record.name) | {"accuracy": node_from_table(record.accuracy)}
 
 
 def _tie_node(name, tie):
@@ -134,7 +149,7 @@ def _tie_node(name, tie):
         "target": name,
         "source": tie.source,
         "factor": float(tie.factor),
-        "offset": nodes.node_from_value(tie.offset),
+        "offset": node_from_value(tie.offset),
     }
 
 
@@ -142,8 +157,8 @@ def _stage_node(stage):
     values = stage["parameters"].items()
     return {
         "title": stage["title"],
-        "parameters": [{"name": name} | nodes.node_from_value(value) for name, value in values],
-        "residual_rms": nodes.plain(stage["residual_rms"], "residual_rms"),
+        "parameters": [{"name": name} | node_from_value(value) for name, value in values],
+        "residual_rms": plain(stage["residual_rms"], "residual_rms"),
     }
 
 
@@ -161,17 +176,17 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         node = MIGRATIONS[step](node)
     chains = [_chain(entry) for entry in node["chains"]]
     # before the calibration is made: its free parameters bind the priors
-    nodes.restore_priors(chains, node.get("priors", []))
+    restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
         chains=chains,
-        wavelength=nodes.value_from_node(node["wavelength"]),
+        wavelength=value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
         datasets=[_dataset(entry) for entry in node["datasets"]],
         ties={name: _tie(entry) for name, entry in _by_name(node["ties"], "target").items()},
         stages=[_stage(entry) for entry in node["stages"]],
-        **{key: nodes.plain(node[key]) for key in _PLAIN},
-        posterior=nodes.posterior_from_node(node["posterior"]) if "posterior" in node else None,
+        **{key: plain(node[key]) for key in _PLAIN},
+        posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
     validity_of(calibration)
@@ -196,7 +211,7 @@ def _chain(node):
 
 
 def _covariance(node):
-    units = [nodes.unit_from_text(text) for text in node["units"]]
+    units = [unit_from_text(text) for text in node["units"]]
     shape = np.shape(node.get("factor", [[0.0] * len(units)]))
     if len(shape) != 2 or shape[1] != len(units):
         # it would be laid out anew, and mean something else
@@ -213,7 +228,7 @@ def _covariance(node):
 
 
 def _identifiability(node):
-    found, vectors = nodes.plain(node), node["null_vectors"]
+    found, vectors = plain(node), node["null_vectors"]
     found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
     for key in ("directions", "near_null"):
         found[key] = [_direction(entry) for entry in found.get(key, [])]
@@ -236,12 +251,12 @@ def _direction(node):
 
 
 def _dataset(node):
-    accuracy = nodes.table_from_node(node["accuracy"])
-    return DatasetRecord(**(node | {"meta": nodes.plain(node["meta"]), "accuracy": accuracy}))
+    accuracy = table_from_node(node["accuracy"])
+    return DatasetRecord(**(node | {"meta": plain(node["meta"]), "accuracy": accuracy}))
 
 
 def _tie(node):
-    offset = nodes.value_from_node(node["offset"])
+    offset = value_from_node(node["offset"])
     # a number of its own type, as it was given
     plain_number = "unit" not in node["offset"] and not np.ndim(offset)
     return Tie(node["source"], node["factor"], offset.item() if plain_number else offset)
@@ -251,9 +266,7 @@ def _stage(node):
     parameters = node["parameters"]
     return {
         "title": node["title"],
-        "parameters": {
-            k: nodes.value_from_node(entry) for k, entry in _by_name(parameters).items()
-        },
+        "parameters": {k: value_from_node(entry) for k, entry in _by_name(parameters).items()},
         "residual_rms": node["residual_rms"],
     }
 
@@ -294,7 +307,7 @@ def check_calibration(calibration):
     for record in calibration.datasets:
         if record.accuracy is not None:
             _check_accuracy(record.accuracy, f"the accuracy of {record.name}")
-    nodes.check_posterior(calibration.posterior, calibration.covariance)
+    check_posterior(calibration.posterior, calibration.covariance)
 
 
 def _check_laws(chains, wavelength):

@@ -522,10 +522,8 @@ def _size_panel(axes, nm, size, absent):
     axes.errorbar(nm[known], value[known], error[known], fmt="o", color=st.BLUE, elinewidth=1.5)
     if not known.all():
         # x in data, y in shares of the panel: the crosses stay at its foot whatever the scale
-        foot = axes.get_xaxis_transform()
-        axes.plot(
-            nm[~known], np.full((~known).sum(), 0.05), "x", color=st.VERMILION, transform=foot
-        )
+        look = {"color": st.VERMILION, "transform": axes.get_xaxis_transform()}
+        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", **look)
         axes.set_title("crosses: not determined", loc="left", fontsize=10)
     if not known.any():
         axes.set_yticks([])
