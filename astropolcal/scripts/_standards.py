@@ -186,10 +186,9 @@ def _many(arguments):
 
     site = None if arguments.site is None else _site(arguments.site)
     radius = 15.0 if arguments.radius is None else arguments.radius
-    near = arguments.near and {
-        "center": sky_position(arguments.near, "--near"),
-        "radius": radius * u.deg,
-    }
+    near = {}
+    if arguments.near:
+        near = {"center": sky_position(arguments.near, "--near"), "radius": radius * u.deg}
     found = standards.search(
         **near,
         kind=arguments.kind,
