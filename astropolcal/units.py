@@ -108,13 +108,10 @@ def plain_number(value, kind=float):
     What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
     TypeError.
     """
-    if isinstance(value, str) and _doubtful(value):
+    text = value if isinstance(value, str) else ""
+    if "_" in text or any(c.isdecimal() and not c.isascii() for c in text):
         raise ValueError(f"{value!r} is not written as a plain number")
     return kind(value)
-
-
-def _doubtful(text):
-    return "_" in text or any(c.isdecimal() and not c.isascii() for c in text)
 
 
 def iso_date(value, name="date", error=ParameterError, *, months=False):
