@@ -119,6 +119,15 @@ class OpticParameter(Parameter):
             )
         self.grid = grid
 
+    @property
+    def law(self):
+        """The model of astropy that it follows, in units, with present values; None without."""
+        law = self.model._follows.get(self.name) if self.model else None
+        if law is None:
+            return None
+        values = [getattr(self.model, name) for name in law.names(self.name)]
+        return law.in_units([p.value for p in values])
+
     def at(self, wavelength, values):
         """Return values of the parameter at wavelengths (um), between its own on straight lines."""
         grid = self.grid

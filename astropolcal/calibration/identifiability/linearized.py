@@ -197,6 +197,9 @@ def step_of(unit):
     if u.Unit(unit).is_equivalent(u.rad):
         # canonical is radian: one degree is the step that a user has a feeling for
         return np.deg2rad(1.0), 1.0, " deg"
+    if not u.Unit(unit).is_equivalent(u.um):
+        # a coefficient of a law, such as one in deg / day
+        return canonical_factor(unit), 1.0, f" {unit}"
     return 1.0, 1.0, " um"
 
 
