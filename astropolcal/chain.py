@@ -450,12 +450,12 @@ def at_positions(chain, **positions):
     for name in positions:
         if name not in known:
             raise ChainError(f"no stage {name!r} in the chain; it has {', '.join(known) or 'none'}")
-    places = {name: finite_position(value, name) for name, value in positions.items()}
     for leaf in leaves(copy):
         if leaf.stage in positions:
             leaf.position = positions[leaf.stage]
-        if leaf._follows:
-            leaf._places = leaf._places | places
+        inputs = {name for law in leaf._follows.values() for name in law.of} & set(positions)
+        places = {name: finite_position(positions[name], name) for name in inputs}
+        leaf._places = leaf._places | places
     return copy
 
 

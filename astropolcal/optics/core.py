@@ -42,12 +42,13 @@ PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
 
 
 class _Coordinates(tuple):
-    """Names of positions that are numbers; all of the form ``"COLUMN=STATE"`` are among them."""
+    """Names of positions that are numbers; `PLACES` and ``"COLUMN=STATE"`` are among them."""
 
     __slots__ = ()
 
     def __contains__(self, name):
-        return tuple.__contains__(self, name) or (isinstance(name, str) and "=" in name)
+        known = tuple.__contains__(self, name) or name in PLACES
+        return known or (isinstance(name, str) and "=" in name)
 
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
@@ -55,7 +56,7 @@ class _Coordinates(tuple):
 #: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
 #: has that state and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian
 #: Date or `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
-COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES, *PLACES))
+COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
 
 
 def finite_position(value, name, stage=None):
@@ -211,7 +212,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # the only axis that a parameter may have is that of the wavelengths
         if number.ndim > 1 or number.size == 0:
             raise ParameterError(
-                f"{label} has shape {number.shape}; allowed are a scalar or one value per wavelength"
+                f"{label} has shape {number.shape}; allowed are a scalar or one value per "
+                "wavelength"
             )
         return number if unit is None else number * unit
 
