@@ -7,14 +7,15 @@ light travels. Nothing here depends on which optics they are.
 """
 
 import math
+import warnings
 
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.mueller import act, turned
-from astropolcal.optics import Optic
-from astropolcal.optics.core import FLUXES, finite_position
+from astropolcal.optics import COORDINATES, Optic
+from astropolcal.optics.core import FLUXES, PLACES, finite_position
 from astropolcal.optics.laws import law_of
 from astropolcal.words import did_you_mean
 
@@ -353,13 +354,25 @@ def stages(chain):
     return tuple(name for name in found if name != "wavelength")
 
 
-def beyond(chain, positions):
-    """Return what laws are asked for beyond the frames that they were calibrated with, in words."""
-    found = []
-    for leaf in leaves(chain):
-        told = {key: law.beyond(positions) for key, law in leaf._follows.items()}
-        found += [f"{leaf.name}.{key} at {words}" for key, words in told.items() if words]
+def standing(chain):
+    """Return where each number of a frame stands in a view of a chain: zero, or as calibrated."""
+    found = {stage: 0.0 for stage in stages(chain) if stage in COORDINATES}
+    for law in (law for leaf in leaves(chain) for law in leaf._follows.values()):
+        found |= {name: law.middle(name) for name in law.of if name in PLACES}
     return found
+
+
+def warn_beyond(chain, positions):
+    """Warn of laws that are asked for beyond the frames that they were calibrated with."""
+    for leaf in leaves(chain):
+        for key, law in leaf._follows.items():
+            words = law.beyond(positions)
+            if words:
+                warnings.warn(
+                    f"the law of {leaf.name}.{key} is extrapolated: {words}",
+                    AstropolcalWarning,
+                    stacklevel=3,
+                )
 
 
 def states_of(chain):

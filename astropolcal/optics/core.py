@@ -445,12 +445,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if key not in type(self).param_names or key in self._follows:
             reason = "follows a law already; add the models" if key in self._follows else "is none"
             raise ParameterError(f"{self.name or type(self).__name__}.{key} {reason}")
-        self._follows = self._follows | {key: law}
-        names = law.names(key)
-        for name, parameter in zip(names, coefficients, strict=True):
+        for name, parameter in zip(law.names(key), coefficients, strict=True):
             self.__dict__[name] = parameter
             parameter.model = self
-        self.param_names = (*self.param_names, *names)
+        laws, own = self._follows | {key: law}, type(self).param_names
+        # in the order of the parameters, whichever came first
+        self._follows = {name: laws[name] for name in own if name in laws}
+        more = (name for key, law in self._follows.items() for name in law.names(key))
+        self.param_names = (*own, *more)
         self._initialize_slices()
 
     def _dispersion_at(self, wavelength):
@@ -658,9 +660,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         own = {key: values.pop(key) for key in type(self).param_names}
         new = type(self)(**own, **self._settings())
         for key, law in self._follows.items():
-            new._follow(
-                key, law, [_with_value(getattr(self, k), values[k]) for k in law.names(key)]
-            )
+            new._follow(key, law, [with_value(getattr(self, k), values[k]) for k in law.names(key)])
         for key in self.param_names:
             old, fresh = getattr(self, key), getattr(new, key)
             fresh.fixed, fresh.bounds = old.fixed, old.bounds
@@ -755,10 +755,10 @@ def _of_spectrum(spectrum):
     return wavelength[order], u.Quantity(spectrum.flux)[order], std
 
 
-def _with_value(parameter, value):
+def with_value(parameter, value):
     """Return a coefficient of a law with another value, perhaps of another shape."""
-    new, value = copy(parameter), u.Quantity(value)
-    new._default = to_unit(value, parameter.unit, parameter.name)
+    new = copy(parameter)
+    new._default = new.value = to_unit(value, parameter.unit, parameter.name)
     return new
 
 

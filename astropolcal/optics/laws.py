@@ -6,7 +6,7 @@ What a law gives is added to its parameter in each frame. Its coefficients are p
 optic like any other, named after both: ``theta_c1`` is ``c1`` of the law of ``theta``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
@@ -63,8 +63,9 @@ class Law:
     def rate(self, lam, places, coefficients, i):
         """Return the derivative of `value` to coefficient i, by central differences."""
         inputs, numbers = self._inputs(lam, places), self._numbers(coefficients)
-        # exact to rounding where the law is linear in it
-        step = 1e-6 * np.where(numbers[i] == 0, 1.0, np.abs(numbers[i]))
+        # exact to rounding where the law is linear
+        small = 1e-6 * np.where(numbers[i] == 0, 1.0, np.abs(numbers[i]))
+        step = np.ones_like(small) if _is_linear(self.model) else small
         high, low = ([*numbers[:i], numbers[i] + s, *numbers[i + 1 :]] for s in (step, -step))
         change = self._evaluated(inputs, high) - self._evaluated(inputs, low)
         return change / (2 * step) / self._factors[i]
@@ -95,14 +96,23 @@ class Law:
             parameter.value = value
         return model
 
+    def with_known(self, ends):
+        """Return the law with the lowest and highest of its inputs, of those of all positions."""
+        return replace(self, known={name: ends[name] for name in self.of if name in ends})
+
+    def middle(self, name):
+        """Return the middle of an input in the frames of a calibration, or where it is zero."""
+        return np.mean(self.known[name]) if name in self.known else self.since or 0.0
+
     def stands(self, lam, places):
         """Return whether all of its inputs are there."""
         return all(lam is not None if n == "wavelength" else n in places for n in self.of)
 
     def beyond(self, places):
         """Say in words where a place is outside of what was calibrated; None where none is."""
-        for name, (low, high) in self.known.items():
-            value, slack = np.asarray(places[name]), 1e-9 * max(1.0, abs(low), abs(high))
+        for name in set(self.known) & set(places):
+            value, (low, high) = np.asarray(places[name]), self.known[name]
+            slack = 1e-9 * max(1.0, abs(low), abs(high))
             outside = (value < low - slack) | (value > high + slack)
             if outside.any():
                 worst = value[outside].flat[0]
@@ -110,6 +120,13 @@ class Law:
                     shown(name, high)
                 )
         return None
+
+
+def _is_linear(model):
+    """Return whether a model is linear in its parameters; astropy says so of ``|`` too."""
+    if hasattr(model, "op"):
+        return model.op in "+-" and _is_linear(model.left) and _is_linear(model.right)
+    return model.linear
 
 
 def shown(name, value):

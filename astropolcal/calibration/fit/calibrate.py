@@ -192,6 +192,7 @@ def calibrate(
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
