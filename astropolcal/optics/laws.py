@@ -52,6 +52,17 @@ class Law:
         """Number of coefficients."""
         return len(self.model.param_names)
 
+    def __str__(self):
+        ends = (
+            (name, shown(name, low), shown(name, high))
+            for name, (low, high) in sorted(self.known.items())
+        )
+        where = "; ".join(f"{name} from {low} to {high}" for name, low, high in ends)
+        kind = getattr(self.model, "op", None) and "a sum or product of models"
+        since = "" if self.since is None else f" since {shown('time', self.since)}"
+        told = f"{kind or type(self.model).__name__} of {', '.join(self.of)}{since}"
+        return f"{told}, calibrated for {where}" if where else told
+
     def names(self, key):
         """Return the names of the coefficients among the parameters of an optic."""
         return tuple(f"{key}_{name}" for name in self.model.param_names)

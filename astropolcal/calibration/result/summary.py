@@ -21,6 +21,7 @@ from astropolcal.calibration.result.verdict import (
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
+from astropolcal.chain import leaves
 from astropolcal.files import columns, plain
 from astropolcal.words import counted
 
@@ -50,6 +51,7 @@ def summary(calibration, targets=TARGETS, full=False):
         [*found.words, *_more_reasons(found)],
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
+        _law_lines(calibration),
         _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -114,6 +116,17 @@ def _heading(calibration):
 def _global_lines(known):
     lines = parameter_lines(known, several=False)
     return ["Parameters for all wavelengths", *lines] if lines else []
+
+
+def _law_lines(calibration):
+    """Name the laws that parameters follow, and the frames with which they were calibrated."""
+    optics = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
+    lines = [
+        f"  - {name}.{key}: {law}"
+        for name, leaf in optics.items()
+        for key, law in leaf._follows.items()
+    ]
+    return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
 
 
 def _accuracy_lines(record, reasons):
