@@ -58,9 +58,9 @@ class Law:
             for name, (low, high) in sorted(self.known.items())
         )
         where = "; ".join(f"{name} from {low} to {high}" for name, low, high in ends)
-        kind = getattr(self.model, "op", None) and "a sum or product of models"
+        kind = "compound model" if hasattr(self.model, "op") else type(self.model).__name__
         since = "" if self.since is None else f" since {shown('time', self.since)}"
-        told = f"{kind or type(self.model).__name__} of {', '.join(self.of)}{since}"
+        told = f"{kind} of {', '.join(self.of)}{since}"
         return f"{told}, calibrated for {where}" if where else told
 
     def names(self, key):
