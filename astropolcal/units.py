@@ -115,10 +115,12 @@ def mjd_of(value, name="time"):
     Taken are `~astropy.time.Time` of any scale, texts of dates, and numbers in days or without a
     unit that can be nothing but such dates.
     """
-    if isinstance(value, str):
-        value = Time(iso_date(value, name))
-    if isinstance(value, Time):
-        found = np.asarray(value.utc.mjd)
+    if isinstance(value, str | Time):
+        with warnings.catch_warnings():
+            # leap seconds of years to come are not known, and do not matter here
+            warnings.simplefilter("ignore", ErfaWarning)
+            value = Time(iso_date(value, name)) if isinstance(value, str) else value
+            found = np.asarray(value.utc.mjd)
     else:
         found = to_unit(value, u.day if getattr(value, "unit", None) else None, name)
     strange = ~((found > _MJDS[0]) & (found < _MJDS[1]))

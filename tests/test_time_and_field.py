@@ -32,6 +32,7 @@ from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.observations import Observations
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import half_wave_plate_cycles, simulate
+from astropolcal.units import canonical_factor
 
 WAVELENGTH = [1.2, 1.6, 2.0] * u.um
 SINCE = "2026-01-01"
@@ -87,16 +88,17 @@ def test_coefficients_are_parameters_of_the_optic(still):
     polarizer = chain["polarizer"]
     assert polarizer.param_names == ("theta", "theta_c0", "theta_c1", "theta_c2")
     assert polarizer.theta_c1.unit == u.deg / u.day
-    assert polarizer.theta_c1.quantity == pytest.approx(0.01 * u.deg / u.day)
+    assert polarizer.theta_c1.value == pytest.approx(0.01)
     # those of the user are in his unit
     np.testing.assert_allclose(polarizer.theta_c1.bounds, [-1, 1])
     assert polarizer.theta_c2.unit == u.deg / u.day**2
     assert [getattr(polarizer, name).fixed for name in polarizer.param_names] == [0, 1, 0, 0]
-    assert polarizer.theta.law(10 * u.day) == pytest.approx(0.1 * u.deg)
+    assert polarizer.theta.law(10 * u.day).to_value(u.deg) == pytest.approx(0.1)
     assert still["polarizer"].theta.law is None
     assert stages(chain) == ("time", "hwp", "derotator")
     polarizer.theta_c1 = 1 * u.arcmin / u.day
-    assert chain.copy()["polarizer"].theta.law(60 * u.day) == pytest.approx(1 * u.deg)
+    found = chain.copy()["polarizer"].theta.law(60 * u.day)
+    assert found.to_value(u.deg) == pytest.approx(1)
 
 
 def test_constant_of_a_law_is_held(still):
@@ -193,9 +195,7 @@ def test_fluxes_of_every_optic_are_those_of_its_matrices(name):
             names = chain["optic"].param_names
             found = sweep.derivatives([(1, j) for j in range(len(names))], weights)
             for j, label in enumerate(names):
-                unit = chain["optic"].__dict__[label].unit
-                factor = np.deg2rad(1) if unit == u.deg else 1e3 if unit == u.mm else 1
-                factor = 1e-3 if unit == u.nm else factor
+                factor = canonical_factor(chain["optic"].__dict__[label].unit)
                 wanted = slopes[f"optic.{label}"].value[..., 0, 0].T / factor
                 np.testing.assert_allclose(found.get((1, j), 0 * wanted), wanted, atol=1e-9)
 
@@ -209,7 +209,7 @@ def test_jacobian_is_that_of_central_differences(still, frames):
     for i, name in enumerate(measurement.param_names):
         step = 1e-5 * np.eye(len(vector))[i]
         change = measurement.predict(vector + step) - measurement.predict(vector - step)
-        np.testing.assert_allclose(jacobian[i], change / 2e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(jacobian[i], change / 2e-5, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 # --- calibration --------------------------------------------------------------------------------
@@ -297,8 +297,10 @@ def test_summary_names_the_law(calibrated):
 def test_files_keep_laws(still, frames, tmp_path):
     chain = everything(still)
     chain["polarizer"].theta_c1.prior = Normal(0.02 * u.deg / u.day, 1 * u.deg / u.day)
+    # the retardances are known: what is kept does not depend on how many are free
+    chain["hwp"].retardance.fixed = chain["wollaston"].efficiency_phase_0.fixed = True
     observations = simulate(chain, WAVELENGTH, frames, flux=1e6, seed=1)
-    calibration = calibrate(chain, observations, **ARRAY)
+    calibration = calibrate(chain, observations, gauge=None, **ARRAY)
     path = tmp_path / "law.asdf"
     calibration.write(path)
     again = Calibration.read(path)
@@ -322,17 +324,19 @@ def test_files_keep_laws(still, frames, tmp_path):
     # what a law says belongs to the content
     text = path.read_bytes().replace(b"of: [time]", b"of: [sequence]", 1)
     path.write_bytes(text)
-    with pytest.raises(CalibrationFileError, match=r"checksum|since"):
+    with pytest.raises(CalibrationFileError, match=r"checksum|unit"):
         Calibration.read(path)
 
 
+@pytest.mark.slow
 def test_diagnosis_of_a_model_that_drifts(still, frames):
     chain = law_of_time(still)
-    truth = chain.copy() | optics.BeamGain(imbalance=0.02, name="gain")
+    truth = chain.copy()
     truth["polarizer"].theta_c1 = 0.01 * u.deg / u.day
     observations = simulate(truth, WAVELENGTH, frames, flux=1e6, seed=1)
-    found = diagnose(chain, observations)
-    assert found.causes[0].name == "beam_gain"
+    # what drifts in the model is no gap; where it does not, the drift is found
+    assert not diagnose(chain, observations).causes
+    assert any("time" in c.name or "drift" in c.name for c in diagnose(still, observations).causes)
 
 
 # --- several nights -----------------------------------------------------------------------------

@@ -406,6 +406,27 @@ def with_own_scalars(model, labels):
     return new
 
 
+def with_values(model, values, units=None):
+    """Return a copy of a model with other values, without units or in others."""
+    new = model.copy()
+    units = [None] * len(values) if units is None else units
+    for name, value, unit in zip(new.param_names, values, units, strict=True):
+        parameter = getattr(new, name)
+        parameter._unit = unit
+        parameter.value = np.asarray(value, dtype=float)
+    new._initialize_slices()
+    return new
+
+
+def add_parameters(model, parameters, names):
+    """Give a model parameters of its own, by name, beside those of its class."""
+    for name, parameter in parameters.items():
+        model.__dict__[name] = parameter
+        parameter.model = model
+    model.param_names = names
+    model._initialize_slices()
+
+
 def without_units(model, labels, values, bounds):
     """Give scalar parameters of a model, its own, plain values and bounds in place of units."""
     for label, value, bound in zip(labels, values, bounds, strict=True):

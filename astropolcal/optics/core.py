@@ -19,7 +19,13 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
-from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined, values_text
+from astropolcal.optics._modelling import (
+    KeywordOnly,
+    add_parameters,
+    copied_attributes,
+    joined,
+    values_text,
+)
 from astropolcal.units import canonical_factor, length_to_um, mjd_of, to_unit
 from astropolcal.words import did_you_mean
 
@@ -445,15 +451,12 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if key not in type(self).param_names or key in self._follows:
             reason = "follows a law already; add the models" if key in self._follows else "is none"
             raise ParameterError(f"{self.name or type(self).__name__}.{key} {reason}")
-        for name, parameter in zip(law.names(key), coefficients, strict=True):
-            self.__dict__[name] = parameter
-            parameter.model = self
         laws, own = self._follows | {key: law}, type(self).param_names
         # in the order of the parameters, whichever came first
         self._follows = {name: laws[name] for name in own if name in laws}
         more = (name for key, law in self._follows.items() for name in law.names(key))
-        self.param_names = (*own, *more)
-        self._initialize_slices()
+        found = dict(zip(law.names(key), coefficients, strict=True))
+        add_parameters(self, found, (*own, *more))
 
     def _dispersion_at(self, wavelength):
         """Return the dispersion, or None without a wavelength where none is needed."""

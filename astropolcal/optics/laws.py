@@ -14,7 +14,7 @@ from astropy.modeling import Model
 from astropy.modeling.polynomial import Polynomial1D, Polynomial2D, PolynomialModel
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics._modelling import OpticParameter
+from astropolcal.optics._modelling import OpticParameter, with_values
 from astropolcal.optics.core import COORDINATES, PLACES
 from astropolcal.units import canonical_factor, iso_date, mjd_of, to_unit
 
@@ -100,12 +100,7 @@ class Law:
 
     def in_units(self, values):
         """Return the model with values of its coefficients, in their units."""
-        model = self.model.copy()
-        for name, value, unit in zip(model.param_names, values, self.units, strict=True):
-            parameter = getattr(model, name)
-            parameter._unit = unit
-            parameter.value = value
-        return model
+        return with_values(self.model, values, self.units)
 
     def with_known(self, ends):
         """Return the law with the lowest and highest of its inputs, of those of all positions."""
@@ -192,8 +187,12 @@ def law_of(label, unit, model, of, since=None):
     units = coefficient_units(model, of, unit)
     named = list(zip(model.param_names, units, strict=True))
     found = {name: _coefficient(f"{label}_{name}", getattr(model, name), x) for name, x in named}
-    plain = _plain(model, [np.asarray(p.value) for p in found.values()])
-    law = Law(plain, of, unit, None if since is None else float(mjd_of(since, "since")))
+    law = Law(
+        with_values(model, [np.mean(p.value) for p in found.values()]),
+        of,
+        unit,
+        None if since is None else float(mjd_of(since, "since")),
+    )
     _hold_constant(law, found)
     return law, found
 
@@ -217,16 +216,6 @@ def _coefficient(label, given, unit):
     )
     new.prior = given.prior
     return new
-
-
-def _plain(model, values):
-    """Return a copy of a model without units; what it stands at means nothing but is stored."""
-    copy = model.copy()
-    for name, value in zip(model.param_names, values, strict=True):
-        parameter = getattr(copy, name)
-        parameter._unit = None
-        parameter.value = value if np.shape(value) == np.shape(parameter.value) else 0.0
-    return copy
 
 
 def _hold_constant(law, found):
