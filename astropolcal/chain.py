@@ -9,6 +9,7 @@ light travels. Nothing here depends on which optics they are.
 import math
 import warnings
 
+import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel
 
@@ -356,9 +357,9 @@ def stages(chain):
 
 def standing(chain):
     """Return where each number of a frame stands in a view of a chain: zero, or as calibrated."""
-    found = {stage: 0.0 for stage in stages(chain) if stage in COORDINATES}
+    found = {stage: 0.0 * u.one for stage in stages(chain) if stage in COORDINATES}
     for law in (law for leaf in leaves(chain) for law in leaf._follows.values()):
-        found |= {name: law.middle(name) for name in law.of if name in PLACES}
+        found |= {name: law.middle(name) * PLACES[name] for name in law.of if name in PLACES}
     return found
 
 

@@ -258,7 +258,8 @@ def _ideal(leaf, wavelength):
 
 def _normalized(leaf, wavelength):
     """Return the matrices of an optic in its own axes, without its losses."""
-    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *leaf.canonical_values()[1:])
+    own = leaf.canonical_values()[1 : len(type(leaf).param_names)]
+    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *own)
     matrix = np.reshape(matrix, (-1, 4, 4))
     return matrix / matrix[:, :1, :1]
 

@@ -27,7 +27,6 @@ from astropolcal.calibration.system import split_chain
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import EllipticalRetarder, LinearRetarder, MuellerElement
-from astropolcal.optics.core import PLACES
 
 __all__ = []
 
@@ -176,7 +175,7 @@ def _knows_hand(measurement, vector):
             continue
         source = join(front)
         step = max(1, dataset.frames.shape[0] // _FEW)
-        places = {name: x * (PLACES.get(name) or u.one) for name, x in standing(source).items()}
+        places = standing(source)
         positions = places | {
             stage: dataset.positions[stage][:, ::step].ravel() * u.rad
             for stage in stages(source)

@@ -146,7 +146,7 @@ def _positions(chain, settings, law):
     placed = {stage: np.repeat(angle, n_frames) for stage, angle in each.items()}
     placed["hwp"] = np.repeat(plate, n_frames) + np.tile(cycle, count)
     # where another number of a frame is zero, an optic that depends on it does nothing
-    placed |= {stage: np.full(1, value) for stage, value in standing(chain).items()}
+    placed |= {stage: np.full(1, x.value) for stage, x in standing(chain).items()}
     if n_states > 1:
         placed[_MODULATOR] = np.tile(np.repeat(_STATES, len(_CYCLE)), count)
     return {stage: placed[stage] for stage in wanted}, count
