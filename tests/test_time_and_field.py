@@ -235,6 +235,18 @@ def test_recovery_with_errors(still, frames):
     assert abs(np.mean(pulls)) < 0.7
 
 
+def test_step_at_a_dated_event(still, frames):
+    # from day 50 on
+    step = models.Box1D(0.5, 1050, 2000, fixed={"x_0": True, "width": True})
+    chain = law_of_time(still, model=step)
+    observations = simulate(chain, WAVELENGTH, frames, flux=1e6, seed=1)
+    start = law_of_time(still, model=models.Box1D(0, 1050, 2000, fixed=step.fixed))
+    found = calibrate(start, observations, **ARRAY)
+    std = found.covariance.std("polarizer.theta_amplitude").value
+    assert found.chain["polarizer"].theta_amplitude.value == pytest.approx(0.5, abs=4 * std)
+    assert std < 0.1
+
+
 @pytest.fixture
 def calibrated(still, frames):
     """A calibration of a plate that changes with time, and the truth."""

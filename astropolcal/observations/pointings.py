@@ -443,18 +443,14 @@ def _place(observations, name):
         )
     if name != "time":
         return numeric_column(frames, name, observations.name, PLACES[name])
-    times = clock(frames)
-    if times is None:
-        times = _times(observations)
-        if times is None or np.any(getattr(times, "mask", False)):
-            raise ObservationError(
-                f"{observations.name}: column time; a law of a parameter needs a date in each frame"
-            )
-    elif not isinstance(frames["time"], Time):
-        unit = getattr(frames["time"], "unit", None)
-        times = times if unit is None else times * unit
-    else:
-        times = frames["time"]
+    times, unit = clock(frames), getattr(frames["time"], "unit", None)
+    if isinstance(frames["time"], Time) or times is None:
+        times, unit = _times(observations), None
+    if times is None or np.any(getattr(times, "mask", False)):
+        raise ObservationError(
+            f"{observations.name}: column time; a law of a parameter needs a date in each frame"
+        )
+    times = times if unit is None else times * unit
     try:
         return mjd_of(times, f"{observations.name}: time")
     except ParameterError as error:
