@@ -385,6 +385,14 @@ def test_nights_share_all_but_what_is_their_own(still, nights, tmp_path):
     assert names == ["polarizer_night_2", "polarizer_night_3"]
 
 
+def test_summary_says_which_parameters_vary(still, nights):
+    own = ["polarizer.theta", "derotator.retardance"]
+    found = calibrate(still, nights[:2], own=own, **ARRAY)
+    words = " ".join(found.summary(full=True).split())
+    assert "polarizer.theta: differs (ln Bayes factor " in words
+    assert "derotator.retardance: may as well be the same in all of them (ln Bayes" in words
+
+
 def test_other_parameters_of_the_optic_stay_shared(still, nights):
     # the plate turns in the second night; its retardances are those of all
     still["hwp"].theta.fixed = False

@@ -150,7 +150,8 @@ def with_own(chains, names, own, ties=None):
 
     ``own`` are names of parameters, or these with the group of each dataset, by default its name.
     An optic is called as before in the first group, and with the name of its group after its own in
-    the others, where what is shared is tied; those ties are returned too.
+    the others, where what is shared is tied. Those ties are returned too, and of each parameter the
+    names that it has in the groups.
     """
     names = names if len(set(names)) == len(names) else range(1, len(names) + 1)
     own = own if isinstance(own, Mapping) else dict.fromkeys(own, names)
@@ -160,7 +161,7 @@ def with_own(chains, names, own, ties=None):
         _check_own(name, groups, table, len(chains), ties)
         optic, key = name.split(".")
         optics.setdefault(optic, {})[key] = groups
-    trains = [leaves(chain.copy()) for chain in chains]
+    trains, copies = [leaves(chain.copy()) for chain in chains], {}
     for optic, keys in optics.items():
         called, first = {}, {}
         for i, train in enumerate(trains):
@@ -174,7 +175,8 @@ def with_own(chains, names, own, ties=None):
                     lead = first.setdefault((key, mine.get(key)), f"{leaf.name}.{key}")
                     if lead != f"{leaf.name}.{key}" and not getattr(leaf, key).fixed:
                         ties[f"{leaf.name}.{key}"] = ties.get(f"{optic}.{key}", Tie(lead))
-    return [join(train) for train in trains], ties
+        copies |= {f"{optic}.{k}": [x for (o, _), x in first.items() if o == k] for k in keys}
+    return [join(train) for train in trains], ties, copies
 
 
 def _check_own(name, groups, table, count, ties):

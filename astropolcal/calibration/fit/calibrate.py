@@ -130,7 +130,8 @@ def calibrate(
     own : sequence of str, or dict of str to sequence
         Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
         the group of each dataset, such as its night, in which they have the same. All others are
-        shared. Behind the first group such an optic has the name of its group after its own.
+        shared. Behind the first group such an optic has the name of its group after its own. The
+        full summary says which of them really differ.
     positions : sequence of dict, optional
         Position of every stage for each dataset, see
         `~astropolcal.measurement.Measurement`.
@@ -197,9 +198,10 @@ def calibrate(
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
+    copies = {}
     if own:
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
-        chain, ties = with_own(chains, [table.name for table in tables], own, ties)
+        chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
@@ -229,6 +231,7 @@ def calibrate(
             "errors": errors,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+            **({"own": copies} if copies else {}),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
         stages=stages,

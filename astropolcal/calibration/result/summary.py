@@ -28,6 +28,8 @@ from astropolcal.words import counted
 __all__ = []
 
 _WIDTH = 80
+# logarithm of the Bayes factor from which on something is said to be so
+_STRONG = 3.0
 # value and error of so many parameters fill the 80 columns
 _N_COLUMNS = 3
 # errors from which on digits behind the point are too long
@@ -52,6 +54,7 @@ def summary(calibration, targets=TARGETS, full=False):
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
         _law_lines(calibration),
+        _own_lines(calibration),
         _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -127,6 +130,37 @@ def _law_lines(calibration):
         for key, law in leaf._follows.items()
     ]
     return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
+
+
+def _own_lines(calibration):
+    """Say which parameters of their own in several nights differ, by the evidence for it."""
+    lines = []
+    for name, copies in (calibration.settings.get("own") or {}).items():
+        evidence = _evidence(calibration, copies)
+        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
+        words = words if np.isfinite(evidence) else "is not determined"
+        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
+    return list(_wrap(["Parameters with values of their own", *lines])) if lines else []
+
+
+def _evidence(calibration, names):
+    """Return the logarithm of the Bayes factor of parameters that differ against equal ones."""
+    free = list(calibration.covariance.names)
+    value = dict(zip(calibration.parameters["name"], calibration.parameters["value"], strict=True))
+    first, *others = ([e for e in free if e.partition("[")[0] == name] for name in names)
+    contrasts = np.zeros((len(first) * len(others), len(free)))
+    pairs = ((one, other) for several in others for one, other in zip(first, several, strict=True))
+    for row, (one, other) in zip(contrasts, pairs, strict=True):
+        row[free.index(one)], row[free.index(other)] = -1.0, 1.0
+    used = contrasts.any(axis=0)
+    matrix = calibration.covariance.matrix[np.ix_(used, used)]
+    difference = contrasts @ [value[name] for name in free]
+    if not np.isfinite(matrix).all():
+        return np.nan
+    spread = contrasts[:, used] @ matrix @ contrasts[:, used].T
+    chi2 = difference @ np.linalg.pinv(spread, hermitian=True) @ difference
+    # Schwarz's approximation (1978, Ann. Statist. 6, 461)
+    return (chi2 - len(difference) * np.log(calibration.fit["n_data"])) / 2
 
 
 def _accuracy_lines(record, reasons):
