@@ -15,7 +15,7 @@ from astropy.modeling.polynomial import Polynomial1D, Polynomial2D, PolynomialMo
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics._modelling import OpticParameter, with_values
-from astropolcal.optics.core import COORDINATES, PLACES
+from astropolcal.optics.core import COORDINATES, FLUXES, PLACES
 from astropolcal.units import canonical_factor, iso_date, mjd_of, to_unit
 
 __all__ = []
@@ -177,7 +177,7 @@ def law_of(label, unit, model, of, since=None):
     of = (of,) if isinstance(of, str) else tuple(of)
     if not (isinstance(model, Model) and model.fittable and model.n_outputs == 1):
         raise ParameterError(f"{label} follows {model!r}; a fittable model of one output is needed")
-    if len(of) != model.n_inputs or not all(isinstance(name, str) for name in of):
+    if len(of) != model.n_inputs or not all(isinstance(n, str) and n not in FLUXES for n in of):
         raise ParameterError(
             f"{label}: of = {of!r}; {type(model).__name__} has {model.n_inputs} inputs, and each "
             'needs a name such as "time", "x", "y", "wavelength" or that of a stage'
