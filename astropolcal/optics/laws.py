@@ -116,15 +116,13 @@ class Law:
 
     def beyond(self, places):
         """Say in words where a place is outside of what was calibrated; None where none is."""
-        for name in set(self.known) & set(places):
+        for name in (name for name in self.known if name in places):
             value, (low, high) = np.asarray(places[name]), self.known[name]
             slack = 1e-9 * max(1.0, abs(low), abs(high))
             outside = (value < low - slack) | (value > high + slack)
             if outside.any():
-                worst = value[outside].flat[0]
-                return f"{name} = {shown(name, worst)}, calibrated from {shown(name, low)} to " + (
-                    shown(name, high)
-                )
+                words = [shown(name, x) for x in (value[outside].flat[0], low, high)]
+                return "{} = {}, calibrated from {} to {}".format(name, *words)
         return None
 
 
