@@ -113,7 +113,7 @@ def mjd_of(value, name="time"):
     Return moments as Modified Julian Dates, UTC.
 
     Taken are `~astropy.time.Time` of any scale, texts of dates, and numbers in days or without a
-    unit that can be nothing but such dates.
+    unit that lie where such dates do.
     """
     if isinstance(value, str | Time):
         with warnings.catch_warnings():

@@ -127,7 +127,7 @@ class Law:
 
 
 def _is_linear(model):
-    """Return whether a model is linear in its parameters; astropy says so of ``|`` too."""
+    """Return whether a model is linear in its parameters; for astropy what ``|`` joins is."""
     if hasattr(model, "op"):
         return model.op in "+-" and _is_linear(model.left) and _is_linear(model.right)
     return model.linear

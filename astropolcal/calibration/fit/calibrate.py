@@ -130,7 +130,7 @@ def calibrate(
     own : sequence of str, or dict of str to sequence
         Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
         the group of each dataset, such as its night, in which they have the same. All others are
-        shared. Behind the first group such an optic has the name of its group after its own. The
+        shared. In all groups but the first the name of the group is added to that of the optic. The
         full summary says which of them really differ.
     positions : sequence of dict, optional
         Position of every stage for each dataset, see
