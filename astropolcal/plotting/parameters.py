@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrated parameters against wavelength and date, with what is known of their errors."""
 
+import base64
+import io
 import textwrap
 from itertools import pairwise
 
@@ -13,7 +15,7 @@ from astropolcal import instruments
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
-from astropolcal.pipeline.history import _Named, _named, parameter_history, significance
+from astropolcal.pipeline.history import _Named, named_by_date, parameter_history, significance
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -22,6 +24,7 @@ from astropolcal.plotting._style import (
     ORANGE,
     SIGMA,
     SKY,
+    VERMILION,
     canvas,
     draw_band,
     draw_line,
@@ -544,6 +547,8 @@ def _mirror_legend(figure, panels):
 
 # ---- history --------------------------------------------------------------------------------
 _MOST_LINES = 6
+# one tail of a normal law beyond three sigma; of more dates only such differences are marked
+_SEEN, _MOST_MARKS = 0.00135, 8
 _MOST_PANELS = 12
 # share of the time axis over which the wavelengths of one calibration are spread
 _SPREAD = 0.03
@@ -651,16 +656,53 @@ def _draw_history(ax, own, name, most):
 def _mark_changes(ax, calibrations, own, name):
     """Write between neighbours how many sigma they differ by."""
     held = {row["calibration"]: row["date"].mjd for row in own}
-    for first, second in pairwise(_named(calibrations)):
+    crowded = len(held) > _MOST_MARKS
+    for first, second in pairwise(named_by_date(calibrations)):
         try:
             found = significance([_Named(*first), _Named(*second)], [name])
         except (ParameterError, FitError):
             continue
         if not found.dof or not {first[0], second[0]} <= set(held):
             continue
+        if crowded and found.p_value >= _SEEN:
+            # of many, those that changed
+            continue
         middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
         look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         look |= {"xytext": (0, -4), "ha": "center", "va": "top", "color": GREY}
-        # one tail of a normal law beyond three sigma
-        look |= {"color": "black", "fontweight": "bold"} if found.p_value < 0.00135 else {}
+        look |= {"color": "black", "fontweight": "bold"} if found.p_value < _SEEN else {}
         ax.annotate(f"{found.sigma:.1f} {SIGMA}", (middle, 1), **look)
+
+
+def draw_accuracies(group, goal=None, *, figure=None):
+    """Draw the accuracies of the calibrations of `~astropolcal.pipeline.health` against date."""
+    dated = [one for one in group["calibrations"] if one["date"] is not None]
+    with style():
+        fig = canvas(figure, 7.2, 4.0)
+        ax = fig.subplots()
+        dates = Time([one["date"] for one in dated], scale="tai").datetime
+        for key, color, marker, label in (
+            ("s_cv_percent", BLUE, "o", "left-out frames (s_cv)"),
+            ("s_res_percent", VERMILION, "s", "residuals of the fit (s_res)"),
+        ):
+            values = np.array([one[key] for one in dated], dtype=float)
+            ax.plot(dates, values, color=color, marker=marker, lw=1, label=label)
+        if goal is not None:
+            ax.axhline(goal, color=BLACK, ls="--", lw=1, label="goal")
+        for one in group["events"]:
+            ax.axvspan(
+                *Time([one["from"], one["to"]], scale="tai").datetime, color=GREY, alpha=0.2, lw=0
+            )
+        ax.set(ylabel="accuracy (% of polarization)", xlabel="date of the calibration data (UTC)")
+        ax.set_ylim(bottom=0)
+        ax.tick_params(axis="x", labelrotation=25)
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        fig.suptitle("Accuracy over time; grey: an optic changed")
+    return fig
+
+
+def embedded(figure):
+    """Return a figure as a data URI, for a page that is one file."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

@@ -26,6 +26,7 @@ from astropolcal.calibration.fit.strategies import (
     describe_gauge,
     hold_silent,
     open_parameters,
+    other_laws,
     search_branches,
     sequential,
     settled,
@@ -73,6 +74,9 @@ ERRORS = ("scatter", "white")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 _ROBUST_ROUNDS = 50
+# residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
+# one counts that leaves less than this share
+_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
 
@@ -353,10 +357,40 @@ def _outside_bounds(measurement):
 
 
 def _joint(measurement, weighting, fitter, search, prepare):
-    """Fit everything; go on as long as some bin finds a better mirror branch."""
+    """Fit everything; where the residuals stand out, from other values of its laws, too."""
     origin = measurement.vector()
+    best = _descend(measurement, weighting, fitter, search, prepare, origin)
+    if not search or not _stands_out(measurement):
+        return best
+    found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
+    least = np.sum(problem.residuals(found) ** 2)
+    for _, start in other_laws(problem, found, origin)[:_STARTS]:
+        measurement.stand_at(start)
+        outcome = _descend(measurement, weighting, fitter, search, prepare, origin, start)
+        left = np.sum(problem.residuals(measurement.vector()) ** 2)
+        if left < _BETTER * least:
+            best, found, least = outcome, measurement.vector(), left
+            if not _stands_out(measurement):
+                break
+    measurement.stand_at(found)
+    return best
+
+
+def _stands_out(measurement):
+    """Whether the residuals are far above the noise that the frames show."""
+    try:
+        sigma = _noise_of_frames(measurement).sigma_of_data
+    except AstropolcalError:
+        # nothing to hold against
+        return False
+    residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
+    return bool(np.mean((residuals / sigma) ** 2) > _STANDS_OUT**2)
+
+
+def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
+    """Fit everything; go on as long as some bin finds a better mirror branch."""
     small, noise = _thinned(measurement, weighting)
-    if search:
+    if search and start is None:
         small.stand_at(_first_search(small, noise, origin))
     prepare(small)
     # branches are found on few frames, so the long table starts from their fit
