@@ -37,11 +37,12 @@ from astropolcal.converters.nodes import (
     value_from_node,
     without_priors,
 )
-from astropolcal.converters.optics import node_from_optic
+from astropolcal.converters.optics import node_from_optic, spelled_model
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table
 from astropolcal.observations.reading import stated_date
+from astropolcal.optics import Optic
 from astropolcal.version import version
 
 __all__ = []
@@ -85,7 +86,12 @@ def node_from_calibration(calibration):
 
 def _checksum(node):
     content = {key: value for key, value in node.items() if key not in _DERIVED}
-    return checksum(content, expand=node_from_optic)
+    return checksum(content, expand=_expanded)
+
+
+def _expanded(item):
+    """Return what a checksum says of an optic, or of a model that a parameter follows."""
+    return node_from_optic(item) if isinstance(item, Optic) else spelled_model(item)
 
 
 def _validity(calibration):
@@ -327,7 +333,7 @@ def _check_values(chains, free):
             bounds = [parameter.bounds]
             if name not in free.by_name:
                 # the bounds of a fit do not matter to what is held or tied, those of the optic do
-                bounds.append(getattr(type(leaf), key).bounds)
+                bounds.append(leaf._declared(key).bounds)
             low = min(-_LARGEST if low is None else low for low, _ in bounds)
             high = max(_LARGEST if high is None else high for _, high in bounds)
             value = np.asarray(parameter.value, dtype=float)

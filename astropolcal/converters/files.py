@@ -35,7 +35,7 @@ __all__ = []
 _KEY = "calibration"
 _ALLOWED_TAGS = re.compile(
     r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
-    r"|unit/(quantity|unit))-[0-9.]+"
+    r"|unit/(quantity|unit)|transform/[a-z0-9_]+)-[0-9.]+"
     r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
     rf"|{'|'.join(map(re.escape, CALIBRATION_TAGS))}"
     r"|tag:astropolcal\.org:astropolcal/optics/[a-z_0-9]+-1\.0\.0"

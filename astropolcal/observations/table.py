@@ -349,7 +349,8 @@ class Observations:
             fluxes of the beams in the unit of the table, 0 where masked;
             ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the
             fluxes over those of the frame taken before, 1 for the
-            first and where one of the two is masked.
+            first and where one of the two is masked. For laws of parameters also ``"time"``, a
+            Modified Julian Date (UTC), and ``"x"`` and ``"y"``, the place in the field in arcsec.
 
         Returns
         -------

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import stages
+from astropolcal.chain import stages, standing
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
 from astropolcal.observations.quality import clusters, is_star
-from astropolcal.optics import COORDINATES
 from astropolcal.plotting import _style as st
 from astropolcal.propagation import Propagator
 
@@ -130,8 +129,7 @@ class DataGrid:
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
         # between the data there is neither a time nor a flux: such optics do nothing there
-        others = [s for s in stages(self.chain) if s in COORDINATES and s != "flc_state"]
-        positions |= {stage: np.zeros(1) for stage in others}
+        positions |= {stage: np.full(1, x.value) for stage, x in standing(self.chain).items()}
         if "flc_state" in stages(self.chain):
             state = self.part.observations.position("flc_state")
             positions["flc_state"] = np.repeat(state[self.part.frames[series.data[0]]], n)

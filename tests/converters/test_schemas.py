@@ -80,7 +80,7 @@ def test_schema_has_the_parameters_and_units_of_the_class():
         assert set(parameters["properties"]) == set(cls.param_names), message
         for key, entry in parameters["properties"].items():
             (reference,) = entry["allOf"]
-            unit = cls._declared(key).unit
+            unit = cls()._declared(key).unit
             kind = reference["$ref"].rpartition("/")[2]
             assert KINDS[kind] == (unit and unit.to_string()), f"{name}.{key}: {message}"
 

@@ -62,7 +62,8 @@ from astropolcal.calibration.validation.cross_validation import accuracy_table, 
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.measurement.datasets import as_pairs
+from astropolcal.measurement.parameters import ROUNDING, with_own
 from astropolcal.units import to_unit
 from astropolcal.version import version
 
@@ -89,6 +90,7 @@ def calibrate(
     observable=None,
     weights=None,
     ties=None,
+    own=(),
     positions=None,
     wavelength=None,
     search=None,
@@ -129,6 +131,11 @@ def calibrate(
         per wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
+    own : sequence of str, or dict of str to sequence
+        Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
+        the group of each dataset, such as its night, in which they have the same. All others are
+        shared. In all groups but the first the name of the group is added to that of the optic. The
+        full summary says which of them really differ.
     positions : sequence of dict, optional
         Position of every stage for each dataset, see
         `~astropolcal.measurement.Measurement`.
@@ -195,7 +202,12 @@ def calibrate(
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
+    copies = {}
+    if own:
+        chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
+        chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
@@ -223,6 +235,7 @@ def calibrate(
             "errors": errors,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+            **({"own": copies} if copies else {}),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
         stages=stages,
