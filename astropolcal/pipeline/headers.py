@@ -40,7 +40,7 @@ __all__ = []
 
 _SKY = ("right_ascension", "declination")
 # columns that are no angles of a stage, though their values may be numbers
-_OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
+_OTHERS = {"exposure_time", "exposures", "mjd", *TEXTS} - set(_SKY)
 
 
 def describe(header, instrument=None, stated=()):
@@ -59,6 +59,7 @@ def describe(header, instrument=None, stated=()):
     own = _look_up(header, "instrument", layout)
     if "instrument" in stated or own in layout.identities:
         own = None
+    header = layout.from_header(header)
     time = None if "date" in stated else _time(header, layout)
     return {
         "instrument": found.name,
@@ -118,7 +119,7 @@ class FrameAngles:
         self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
         self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
         self._layout = layout = instrument.files
-        self.n_frames = len(headers)
+        self.n_frames, headers = len(headers), [layout.from_header(header) for header in headers]
         table = QTable({"frame": np.arange(self.n_frames)})
         for column in (c for c in layout.keywords if c not in _OTHERS):
             values = [_look_up(header, column, layout) for header in headers]

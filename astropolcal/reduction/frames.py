@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.fitscheck import open_fits, readable_fits
+from astropolcal.fitscheck import open_fits, primary_header, readable_fits
 from astropolcal.reduction.headers import (
     FrameHeader,
     add_pointing,
@@ -157,7 +157,8 @@ def _read_beams(path, hdus, layout):
     data = hdus[number].data
     if data is not None and data.ndim == 2 and wanted[0] == 1:
         data = data[None]
-    if data is None or data.shape != wanted:
+    several = layout.stacked and data is not None and data.shape[1:] == wanted[1:]
+    if data is None or (data.shape != wanted and not several):
         shape = "no data" if data is None else f"shape {data.shape}"
         raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")
     if data.dtype.kind not in "fiu":
@@ -171,6 +172,12 @@ def _read_beams(path, hdus, layout):
         good &= np.asarray(weight.reshape(cube.shape)) > 0
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
+    if cube.shape != wanted:
+        # one saturated exposure spoils the mean, and is to be seen in it
+        full = np.where(good, cube, -np.inf).max(axis=0) >= layout.saturation
+        seen = good.sum(axis=0, keepdims=True)
+        cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.maximum(seen, 1)
+        cube, good = np.where(full, layout.saturation, cube), seen > 0
     return hdus[0].header, hdus[number].header, cube, good
 
 
@@ -182,8 +189,7 @@ def _check_header(frame, layout, source):
     frame.errors += [
         f"no keyword {keywords[column]} in its header"
         for column in ("hwp", "derotator")
-        if column not in values
-        and not any(error.startswith(keywords[column]) for error in frame.errors)
+        if column not in values and not frame.errors
     ]
     with suppress(ObservationError):
         time = observation_time(values)
@@ -252,20 +258,21 @@ def match_beams(frame, layout, cube, detector):
     return replace(detector, left=left.in_units_of(detector)), cube
 
 
-def beam_scale(path, layout, values, unit=None):
-    """
-    Return by what the left image is multiplied to count electrons as the right one does.
-
-    1 where one file holds both beams. ``values`` are those of the right beam's header, ``unit`` its
-    BUNIT.
-    """
-    path = layout.left_file(path)
-    if path is None:
-        return 1.0
-    other = read_header(path, layout).values
-    gains = [detector_of(layout, unit, v.get("exposure_time"), v).gain for v in (other, values)]
-    # electrons per adu on the left over those on the right
-    return gains[0] / gains[1]
+def beam_detectors(path, layout, values):
+    """Return the detectors of the right and left beam; ``values`` are of the right one's header."""
+    left = layout.left_file(path)
+    both = (
+        [(path, values)] * 2
+        if left is None
+        else [
+            (path, values),
+            (left, read_header(left, layout).values),
+        ]
+    )
+    return [
+        detector_of(layout, primary_header(file).get("BUNIT"), known.get("exposure_time"), known)
+        for file, known in both
+    ]
 
 
 def _contradictions(right, left, name):

@@ -20,7 +20,7 @@ from astropy.coordinates import FK5, SkyCoord
 from astropy.time import Time
 from erfa import ErfaError
 
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.instruments.layout import (
@@ -104,15 +104,27 @@ def read_header(path, layout, *, header=None, raw=None):
     """
     header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
+    # what is in the file goes before what a header says of it
+    if layout.stacked and header.get("NAXIS") == 3 and header["NAXIS3"] > 1:
+        frame.values["exposures"] = float(header["NAXIS3"])
+    columns = list(layout.keywords)
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            header = layout.from_header(header)
+        frame.doubts += [str(warning.message) for warning in told]
+    except AstropolcalError as error:
+        frame.errors.append(str(error).removeprefix("frame 0: "))
+        columns = [column for column in columns if column not in ANGLES]
     headers = [header]
     # only for these is a raw header opened
     missing = [c for c in layout.raw_columns if look_up(headers, c, layout)[1] is None]
     if raw is not None and missing:
         # behind the cube: its own keywords come first
         headers += _raw_header(frame, raw)
-    for column in layout.keywords:
+    for column in columns:
         keyword, value = look_up(headers, column, layout)
-        if value is not None:
+        if value is not None and column not in frame.values:
             _convert(frame, column, keyword, value, layout)
         if column in ANGLES and column in frame.values:
             _compare(frame, column, stated(headers, column, layout), layout)

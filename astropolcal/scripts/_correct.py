@@ -158,7 +158,7 @@ def run(arguments):
     instrument = configured(instrument, files)
     # one a frame: files of left beams follow those of the right ones
     files = instrument.files.frame_files(files)
-    table, centres, scale, left_scale = survey_frames(
+    table, centres, scale, detectors = survey_frames(
         files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
     frames = ScienceFrames.from_files(
@@ -171,7 +171,8 @@ def run(arguments):
         position_angle=_position_angles(table, arguments),
         mirrored=arguments.mirrored,
         scale=scale,
-        left_scale=left_scale,
+        left_scale=[left.gain / right.gain for right, left in detectors],
+        detectors=detectors,
         # date and mode were checked when the calibration was chosen
         date=None,
         mode=calibration.validity.mode,
