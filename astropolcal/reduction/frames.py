@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.fitscheck import open_fits, primary_header, readable_fits
+from astropolcal.fitscheck import open_fits, readable_fits
 from astropolcal.reduction.headers import (
     FrameHeader,
     add_pointing,
@@ -36,8 +36,6 @@ _ARRAYS = (
 class Frame(FrameHeader):
     """What is known of one file."""
 
-    # of the fluxes
-    unit: str = ""
     photometry: Photometry | None = None
     # of the fluxes, by which copies are recognized
     digest: str = ""
@@ -258,21 +256,15 @@ def match_beams(frame, layout, cube, detector):
     return replace(detector, left=left.in_units_of(detector)), cube
 
 
-def beam_detectors(path, layout, values):
-    """Return the detectors of the right and left beam; ``values`` are of the right one's header."""
+def beam_detectors(path, layout, values, unit=None):
+    """
+    Return the detectors of the right and the left beam, the same where one file holds both.
+
+    ``values`` are those of the right beam's header, ``unit`` the BUNIT of both.
+    """
     left = layout.left_file(path)
-    both = (
-        [(path, values)] * 2
-        if left is None
-        else [
-            (path, values),
-            (left, read_header(left, layout).values),
-        ]
-    )
-    return [
-        detector_of(layout, primary_header(file).get("BUNIT"), known.get("exposure_time"), known)
-        for file, known in both
-    ]
+    both = (values, values if left is None else read_header(left, layout).values)
+    return [detector_of(layout, unit, known.get("exposure_time"), known) for known in both]
 
 
 def _contradictions(right, left, name):

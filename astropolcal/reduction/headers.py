@@ -53,6 +53,8 @@ class FrameHeader:
     # why it cannot be used; and what is odd, but does not matter
     errors: list = field(default_factory=list)
     doubts: list = field(default_factory=list)
+    # of the pixels; None if the header does not say
+    unit: str | None = None
 
 
 def frame_number(name, layout, header=None):
@@ -104,6 +106,7 @@ def read_header(path, layout, *, header=None, raw=None):
     """
     header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
+    frame.unit = header.get("BUNIT")
     # what is in the file goes before what a header says of it
     if layout.stacked and header.get("NAXIS") == 3 and header["NAXIS3"] > 1:
         frame.values["exposures"] = float(header["NAXIS3"])

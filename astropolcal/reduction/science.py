@@ -96,7 +96,7 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
     exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
     differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
     detectors = [
-        beam_detectors(file, layout, f.values) for file, f in zip(files, found, strict=True)
+        beam_detectors(file, layout, f.values, f.unit) for file, f in zip(files, found, strict=True)
     ]
     return _angles(found), centre, exposure / np.median(exposure) if differ else None, detectors
 

@@ -317,14 +317,14 @@ def told(monkeypatch):
 
 
 def test_angles_that_some_frame_knows_are_columns(told):
-    table, centres, scale, left = told({"hwp": 0.0, "altitude": 60.0}, {"hwp": 45.0})
+    table, centres, scale, detectors = told({"hwp": 0.0, "altitude": 60.0}, {"hwp": 45.0})
     assert table["hwp"].to_value(u.deg).tolist() == [0.0, 45.0]
     assert np.isnan(table["altitude"].value).tolist() == [False, True]
     assert set(table.colnames) == {"hwp", "altitude"}
     assert centres == (70.0, 85.0)
     assert scale is None
     # one file holds both beams
-    assert left == [1.0, 1.0]
+    assert all(right == left for right, left in detectors)
 
 
 def test_true_plate_angle_is_used_of_all_frames_or_of_none(told):
