@@ -141,8 +141,10 @@ class FileLayout:
         Longitude and latitude in degree, height in metre.
     beam_files : tuple of str
         Marks in the names of the files of the right and of the left beam, where each camera
-        writes files of its own. The shape, and all places, are then those of both images side by
-        side, the left one first.
+        writes files of its own; each ends with the number of its camera. The shape, and all
+        places, are then those of both images side by side, the left one first.
+    partners : dict of str to str
+        File of the right beam to that of the left one, where headers tell and not the names.
     weights : {"inverse variance", "error"}
         What the extension after the cube holds.
     states : dict of str to str
@@ -199,6 +201,7 @@ class FileLayout:
     hwp_step: float = 11.25
     site: tuple = ()
     beam_files: tuple = ()
+    partners: dict = field(default_factory=dict)
     weights: str = _WEIGHTS[0]
     states: dict = field(default_factory=dict)
     read_outs: dict = field(default_factory=dict)
@@ -291,6 +294,8 @@ class FileLayout:
         """
         if not self.beam_files:
             return None
+        if str(path) in self.partners:
+            return Path(self.partners[str(path)])
         path, (right, left) = Path(path), self.beam_files
         # the last one: a folder or target may have the mark in its name too
         head, found, tail = path.name.rpartition(right)
@@ -306,9 +311,13 @@ class FileLayout:
         if not self.beam_files:
             return files
         # left files without a right one stay, so that the error names them
-        rights = [path for path in files if self.beam_files[0] in Path(path).name]
+        rights = [path for path in files if self.is_right(path)]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]
+
+    def is_right(self, path):
+        """Return whether a file is known to be of the right beam, by its name or by headers."""
+        return str(path) in self.partners or self.beam_files[0] in Path(path).name
 
 
 def side_by_side(rows, columns, lit):

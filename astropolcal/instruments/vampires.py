@@ -136,7 +136,9 @@ def layout_of(header):
         )
     keywords = LAYOUT.keywords | ({"filter": _MODE} if multiband else {})
     shape = (len(slices_of(header)), side, 2 * side)
-    return replace(LAYOUT, keywords=keywords, shape=shape, **side_by_side(side, side, _LIT))
+    # raw frames of a filter: a cube of exposures in one state
+    places = side_by_side(side, side, _LIT) | {"stacked": not multiband}
+    return replace(LAYOUT, keywords=keywords, shape=shape, **places)
 
 
 def mode_header(wavelength):

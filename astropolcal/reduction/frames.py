@@ -155,7 +155,7 @@ def _read_beams(path, hdus, layout):
     data = hdus[number].data
     if data is not None and data.ndim == 2 and wanted[0] == 1:
         data = data[None]
-    several = layout.stacked and data is not None and data.shape[1:] == wanted[1:]
+    several = layout.stacked and wanted[0] == 1 and np.shape(data)[1:] == wanted[1:]
     if data is None or (data.shape != wanted and not several):
         shape = "no data" if data is None else f"shape {data.shape}"
         raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")

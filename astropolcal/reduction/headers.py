@@ -108,8 +108,9 @@ def read_header(path, layout, *, header=None, raw=None):
     frame = FrameHeader(str(path), frame_number(path, layout, header))
     frame.unit = header.get("BUNIT")
     # what is in the file goes before what a header says of it
-    if layout.stacked and header.get("NAXIS") == 3 and header["NAXIS3"] > 1:
-        frame.values["exposures"] = float(header["NAXIS3"])
+    stack = header.get("NAXIS3", 1) if header.get("NAXIS") == 3 else 1
+    if layout.stacked and layout.shape[0] == 1 and stack > 1:
+        frame.values["exposures"] = float(stack)
     columns = list(layout.keywords)
     try:
         with warnings.catch_warnings(record=True) as told:
@@ -131,6 +132,11 @@ def read_header(path, layout, *, header=None, raw=None):
             _convert(frame, column, keyword, value, layout)
         if column in ANGLES and column in frame.values:
             _compare(frame, column, stated(headers, column, layout), layout)
+        if column == "flc_state":
+            told = list(stated(headers, column, layout))
+            if len({layout.states.get(str(v), str(v).strip()) for _, v in told} - {""}) > 1:
+                words = ", but ".join(f"{keyword} = {value!r}" for keyword, value in told)
+                frame.errors.append(f"{words}: which state of the modulator?")
     return frame
 
 

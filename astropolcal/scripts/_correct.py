@@ -2,6 +2,7 @@
 """``astropolcal correct``: from science cubes to Stokes parameters."""
 
 import argparse
+import copy
 from pathlib import Path
 
 import astropy.units as u
@@ -147,6 +148,7 @@ def run(arguments):
     from astropolcal import instruments
     from astropolcal.correction import ScienceFrames, correct
     from astropolcal.reduction.science import configured, survey_frames
+    from astropolcal.reduction.sorting import sort_beams
 
     check_suffix("-o", arguments.output, ".fits")
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
@@ -157,9 +159,13 @@ def run(arguments):
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     # one a frame: files of left beams follow those of the right ones
-    files = instrument.files.frame_files(files)
+    files, layout, lost = sort_beams(files, instrument.files)
+    for path, why in lost.items():
+        raise ObservationError(f"{path}: {'; '.join(why)}")
+    instrument = copy.copy(instrument)
+    instrument.files = layout
     table, centres, scale, detectors = survey_frames(
-        files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
+        files, layout, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
     frames = ScienceFrames.from_files(
         files,
