@@ -34,6 +34,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.fitscheck import primary_header
+from astropolcal.optics import COORDINATES
 from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,
@@ -365,7 +366,7 @@ class LoadedCalibration:
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             # the same reader as for tables of observations, so that tracking laws and offsets agree
-            positions = {name: angle * u.rad for name, angle in found.items()}
+            positions = {n: a if n in COORDINATES else a * u.rad for n, a in found.items()}
         lam, mix = match_wavelengths(self.wavelength, chain, wavelength, interpolate)
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
         value = system_mueller(chain, lam, positions)
@@ -377,7 +378,16 @@ class LoadedCalibration:
             shown = {name: angle[0] for name, angle in shown.items()}
         return SystemMueller(value, lam, beam, shown, *parts, assumed)
 
-    def correct(self, stokes, header, *, difference="right-left", **options):
+    def correct(
+        self,
+        stokes,
+        header=None,
+        *,
+        positions=None,
+        hwp=None,
+        difference="right-left",
+        **options,
+    ):
         r"""
         Correct a Stokes cube that a pipeline has made of frames by differences.
 
@@ -393,6 +403,10 @@ class LoadedCalibration:
             Shape (n_components, n_wavelengths, ...): I, Q, U. A fourth, V, is taken for true.
         header : sequence of `~astropy.io.fits.Header`, mapping or path-like
             Primary headers of all frames that the cube was made of, or their files.
+        positions : dict of str to `~astropy.units.Quantity`
+            In their place the positions of all stages in each frame, as for `system_mueller`.
+        hwp : `~astropy.units.Quantity`, optional
+            Commanded angles of the half-wave plate; by default those of the headers or positions.
         difference : {"right-left", "left-right"}
             Of the beams.
         **options
@@ -411,13 +425,17 @@ class LoadedCalibration:
             If the cube has another shape, or the angles of the plate do not tell Q and U apart.
         """
         given, (headers, _) = np.array(stokes, dtype=float), _headers(header)
-        beams = [self.system_mueller(headers, beam=b, **options) for b in ("right", "left")]
+        options |= {"header": headers or None, "positions": positions}
+        beams = [self.system_mueller(beam=b, **options) for b in ("right", "left")]
+        if hwp is None and headers:
+            hwp = FrameAngles(headers, self.instrument).position("hwp") * u.rad
+        hwp = beams[0].positions["hwp"] if hwp is None else hwp
         size = len(beams[0].wavelength)
         if given.ndim < 2 or given.shape[0] not in (3, 4) or given.shape[1] != size:
             raise ParameterError(
                 f"stokes of shape {given.shape}; needed are I, Q, U (and V) at {size} wavelengths"
             )
-        sums = self._demodulation(headers, difference)
+        sums = _demodulation(hwp, beams[0].positions.get("flc_state", 0), difference)
         # b: beams, f: frames, w: wavelengths, k: measured, s and t: true Stokes parameters, r: rank
         matrix = np.einsum("kbf,bfws->wks", sums, [m.value[..., 0, :] for m in beams])
         slopes = np.einsum("kbf,bfwsr->wksr", sums, [m.factor[..., 0, :, :] for m in beams])
@@ -439,22 +457,6 @@ class LoadedCalibration:
         systematic[:3] = np.where(is_open, np.inf, spread)
         return flat.reshape(given.shape), systematic.reshape(given.shape)
 
-    def _demodulation(self, headers, difference):
-        """Return by what the beams of each frame are multiplied for I, Q and U, (3, 2, n)."""
-        if difference not in ("right-left", "left-right"):
-            raise ParameterError(f"difference = {difference!r}; allowed are right-left, left-right")
-        angles = FrameAngles(headers, self.instrument)
-        theta = 4 * angles.position("hwp")
-        sign = np.full(len(theta), 1.0 if difference == "right-left" else -1.0)
-        if "flc_state" in angles.frames.colnames:
-            sign = sign * np.where(angles.position("flc_state") > 0, -1, 1)
-        ideal = np.stack([np.cos(theta), np.sin(theta)], axis=1)
-        if np.linalg.matrix_rank(ideal, tol=1e-6) < 2:
-            raise ParameterError("the angles of the half-wave plate do not tell Q and U apart")
-        two = np.linalg.pinv(ideal) * sign
-        mean = np.full(len(theta), 1 / len(theta))
-        return np.stack([[mean, mean], *np.stack([two, -two], axis=1)])
-
     def _check(self, frames, light):
         """Refuse frames for which the calibration does not hold."""
         options = {"max_age": self._max_age, "light": light, "ways": _WAYS}
@@ -463,7 +465,7 @@ class LoadedCalibration:
     def _stated_frame(self):
         """Return a frame without a header, of the date that was stated."""
         mode = self._stated.get("mode", self.validity.mode)
-        return [("the frame", self._stated["date"], mode)]
+        return [("the frame", self._stated.get("date"), mode)]
 
     def _frames(self, headers):
         """Return what to call each frame, its date and its mode; refuse other instruments."""
@@ -498,12 +500,18 @@ class LoadedCalibration:
         if light == "internal":
             return join(inner), ()
         outer = telescope_optics(self.calibration)
-        return self._published(inner) if outer is None else (join([*outer, *inner]), ())
+        if outer is not None:
+            return join([*outer, *inner]), ()
+        frames = self._frames(headers) if headers else self._stated_frame()
+        return self._published(inner, [date for _, date, _ in frames if date is not None])
 
-    def _published(self, inner):
+    def _published(self, inner, dates):
         """Return a chain with the telescope as the instrument publishes it."""
+        told = {"wavelength": self.wavelength, "date": dates or None}
+        known = self.instrument.sky_options if self.instrument else ()
+        options = {key: told[key] for key in known}
         try:
-            chain = self.instrument.on_sky(join(inner)) if self.instrument else None
+            chain = self.instrument.on_sky(join(inner), **options) if self.instrument else None
         except InstrumentError:
             chain = None
         if chain is None:
@@ -527,3 +535,17 @@ class LoadedCalibration:
 def _degrees(position):
     angle = u.Quantity(position)
     return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
+
+
+def _demodulation(hwp, state, difference):
+    """Return by what the beams of each frame are multiplied for I, Q and U, (3, 2, n)."""
+    if difference not in ("right-left", "left-right"):
+        raise ParameterError(f"difference = {difference!r}; allowed are right-left, left-right")
+    theta = 4 * np.atleast_1d(u.Quantity(hwp).to_value(u.rad))
+    sign = np.where(np.asarray(state) > 0, -1.0, 1.0) * (1 if difference == "right-left" else -1)
+    ideal = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    if np.linalg.matrix_rank(ideal, tol=1e-6) < 2:
+        raise ParameterError("the angles of the half-wave plate do not tell Q and U apart")
+    two = np.linalg.pinv(ideal) * sign
+    mean = np.full(len(theta), 1 / len(theta))
+    return np.stack([[mean, mean], *np.stack([two, -two], axis=1)])
