@@ -148,7 +148,6 @@ def run(arguments):
     from astropolcal import instruments
     from astropolcal.correction import ScienceFrames, correct
     from astropolcal.reduction.science import configured, survey_frames
-    from astropolcal.reduction.sorting import sort_beams
 
     check_suffix("-o", arguments.output, ".fits")
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
@@ -158,14 +157,9 @@ def run(arguments):
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
-    # one a frame: files of left beams follow those of the right ones
-    files, layout, lost = sort_beams(files, instrument.files)
-    for path, why in lost.items():
-        raise ObservationError(f"{path}: {'; '.join(why)}")
-    instrument = copy.copy(instrument)
-    instrument.files = layout
+    files, instrument = _sorted(files, instrument)
     table, centres, scale, detectors = survey_frames(
-        files, layout, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
+        files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
     frames = ScienceFrames.from_files(
         files,
@@ -206,6 +200,19 @@ def run(arguments):
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
         _report(summary, result.systematic, arguments)
+
+
+def _sorted(files, instrument):
+    """Return one file per frame, and the instrument that knows those of the left beams."""
+    from astropolcal.reduction.sorting import sort_beams
+
+    files, layout, lost = sort_beams(files, instrument.files)
+    for path, why in lost.items():
+        raise ObservationError(f"{path}: {'; '.join(why)}")
+    # the registry hands out instances that others may hold
+    instrument = copy.copy(instrument)
+    instrument.files = layout
+    return files, instrument
 
 
 def _check_options(arguments):
