@@ -613,7 +613,8 @@ class IRDIS(Instrument):
         found = [FILTERS[i] for i in filters_at(np.atleast_1d(wavelength))]
         if len(found) != 1:
             raise InstrumentError(
-                f"irdis: a file is of one filter, not of {', '.join(found)}; give one wavelength"
+                f"irdis: a file is of one filter, not of {', '.join(found)}; give one wavelength, "
+                "or a calibration of one filter"
             )
         return {_FILTER: f"FILT_BBF_{found[0]}"}
 
