@@ -368,7 +368,7 @@ class LoadedCalibration:
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             # the same reader as for tables of observations, so that tracking laws and offsets agree
-            units = PLACES | dict.fromkeys(COORDINATES - PLACES.keys(), 1)
+            units = dict.fromkeys(COORDINATES, 1) | PLACES
             positions = {name: angle * units.get(name, u.rad) for name, angle in found.items()}
         lam, mix = match_wavelengths(self.wavelength, chain, wavelength, interpolate)
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
