@@ -27,7 +27,7 @@ POINTINGS = ((32, 48), (94, 60), (126, 60), (24, 67))
 def _rows(title):
     """Cells of the list-table of a section, by the first of them."""
     text = PAGE.read_text(encoding="utf-8")
-    section = re.search(rf"^{title}\n-+\n(.*?)^\S[^\n]*\n-+\n", text, re.S | re.M).group(1)
+    section = re.search(rf"^{title}\n-+\n(.*?)(?:^\S[^\n]*\n-+\n|\Z)", text, re.S | re.M).group(1)
     table = section.split(".. list-table::")[1]
     rows = re.split(r"^   \* - ", table, flags=re.M)[1:]
     cells = (
