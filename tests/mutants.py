@@ -77,7 +77,7 @@ def mutants_of(path):
 
 
 def run(tree, arguments, seconds=None):
-    """Return code and last lines of pytest in a copy of the tree, with the quick tests."""
+    """Which quick test fails in a copy of the tree: None if none does, and the output."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--tb=no"]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
@@ -86,17 +86,18 @@ def run(tree, arguments, seconds=None):
             cwd=tree, env=environment, capture_output=True, text=True, timeout=seconds,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return 1, "out of time"
+        return "out of time", ""
     failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return done.returncode, failed[0] if failed else done.stdout[-300:]
+    # other codes mean that there is no such test
+    return (failed[0] if failed else "?") if done.returncode in (1, 2) else None, done.stdout
 
 
 def tests_by_line(tree, package, folders):
     """Function: the tests that run a line of a file, the fewest first."""
     options = [f"--cov={package}", "--cov-context=test", "--cov-report=", "--cov-fail-under=0"]
-    code, text = run(tree, [*options, *folders])
-    if code:
-        raise SystemExit(f"the tests have to pass before anything is changed: {text}")
+    failed, output = run(tree, [*options, *folders])
+    if failed:
+        raise SystemExit(f"the tests have to pass before anything is changed: {output}")
     data = CoverageData(str(tree / ".coverage"))
     data.read()
 
@@ -108,17 +109,17 @@ def tests_by_line(tree, package, folders):
 
 
 def survives(tree, mutant, tests, folders):
-    """The test that fails for a mutant: first those that run its line, then all; or None."""
+    """The test that fails: of an earlier one, those that run the line, and all; or None."""
     path = tree / mutant["file"]
     source = path.read_text(encoding="utf-8")
     path.write_text(source.replace(mutant["before"], mutant["after"]), encoding="utf-8")
     chosen = tests(mutant["file"], source[: source.index(mutant["before"])].count("\n") + 1)
     (tree / "chosen.txt").write_text("\n".join(chosen), encoding="utf-8")
     try:
-        for names in (["@chosen.txt"] if chosen else []), folders:
-            code, text = run(tree, names, 600) if names else (0, "")
-            if code:
-                return text.removeprefix("FAILED ").partition(" - ")[0]
+        for names in [mutant.get("killed by")], ["@chosen.txt"] * bool(chosen), folders:
+            failed, _ = run(tree, names, 600) if any(names) else (None, "")
+            if failed:
+                return failed.removeprefix("FAILED ").partition(" - ")[0]
     finally:
         path.write_text(source, encoding="utf-8")
     return None
