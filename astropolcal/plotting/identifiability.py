@@ -24,7 +24,6 @@ from astropolcal.plotting._style import (
     heading,
     legend_outside,
     note,
-    style,
 )
 from astropolcal.units import angle_to_rad
 
@@ -115,8 +114,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     angles = _angles(calibration, hwp)
     words = _wrapped(rows)
     heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
-    with style():
-        figure = canvas(figure, _WIDTH, sum(heights) + 1.6)
+    with canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
@@ -432,8 +430,7 @@ def plot_correlations(calibration, *, figure=None):
     groups = [(stem, len(at)) for stem, at in element_places(covariance.names).items()]
     with np.errstate(invalid="ignore"):
         matrix = covariance.correlation
-    with style():
-        figure = canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4)
+    with canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4) as figure:
         axes = figure.add_subplot()
         edges = _edges(groups)
         image = _draw_matrix(axes, edges, matrix)
