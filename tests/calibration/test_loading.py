@@ -472,6 +472,22 @@ def test_nothing_else_is_needed(tmp_path):
     assert (tmp_path / "m.fits").exists()
 
 
+_HEAVY = """
+import sys
+from astropolcal.pipeline import load
+load(sys.argv[1])
+print(*sorted({"matplotlib", "specutils", "scipy.optimize", "scipy.stats"} & set(sys.modules)))
+"""
+
+
+@pytest.mark.slow
+def test_loading_imports_nothing_that_draws_or_fits():
+    """ASDF would import the plug-ins of every package that is installed."""
+    command = [sys.executable, "-c", _HEAVY, str(OLD)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
 @pytest.mark.slow
 def test_beam_that_the_library_lacks(calibration, tmp_path):
     """The date of the frame says that the beam switcher was not there yet."""
