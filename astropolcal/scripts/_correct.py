@@ -159,7 +159,6 @@ def run(arguments):
         weights="variance" if arguments.weights == "variance" else None,
         any_date=True,
         n_samples=arguments.samples,
-        progress=not arguments.quiet,
         provenance=provenance,
         **{name: getattr(arguments, name) for name in _PASSED_ON},
     )

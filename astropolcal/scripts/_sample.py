@@ -123,7 +123,8 @@ def _sample(calibration, arguments):
             burn_in=arguments.burn,
             seed=arguments.seed,
             checkpoint=arguments.checkpoint,
-            progress=not arguments.quiet,
+            # as for all commands, and not at all where that is not wanted
+            progress=False,
         )
     except FitError as error:
         # about the option instead of the argument

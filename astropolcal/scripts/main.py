@@ -135,6 +135,7 @@ def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
+    from astropolcal.progress import shown
     from astropolcal.scripts._common import check_paths
 
     with warnings.catch_warnings():
@@ -145,7 +146,7 @@ def _run(argv):
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            with _earth(arguments):
+            with _earth(arguments), shown(not getattr(arguments, "quiet", False)):
                 arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
@@ -173,6 +174,9 @@ def _one_line(message):
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
+    from astropolcal.progress import clear
+
+    clear()
     print(f"astropolcal: warning: {_one_line(message)}", file=sys.stderr)
 
 

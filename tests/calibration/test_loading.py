@@ -446,7 +446,7 @@ for module, owners in packages_distributions().items():
     if not ours and not {o.lower().replace("_", "-") for o in owners} & allowed:
         sys.modules[module] = None
         blocked.append(module)
-assert {"matplotlib", "photutils", "specutils", "tqdm", "jinja2", "scipy"} <= set(blocked), blocked
+assert {"matplotlib", "photutils", "specutils", "jinja2", "scipy"} <= set(blocked), blocked
 
 from astropolcal.pipeline.loading import load
 from astropolcal.calibration.result.validity import with_validity
