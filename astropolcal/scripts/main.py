@@ -56,6 +56,25 @@ class _OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"astropolcal: error: {_one_line(message)} (see {self.prog} --help)\n")
 
 
+class _PrintCompletion(argparse.Action):
+    """Print what a shell runs to complete our commands, options and files."""
+
+    def __call__(self, parser, namespace, shell, option_string=None):
+        try:
+            import shtab
+        except ImportError:
+            parser.error(f'{option_string} needs shtab: pip install "astropolcal[completion]"')
+        from astropolcal.scripts._common import Folder, Input, Output
+
+        commands = next(iter(parser._subparsers._group_actions)).choices
+        for action in (action for each in commands.values() for action in each._actions):
+            if isinstance(action.type, type) and issubclass(action.type, (Input, Output)):
+                folder = issubclass(action.type, Folder)
+                action.complete = shtab.DIRECTORY if folder else shtab.FILE
+        print(shtab.complete(parser, shell))
+        parser.exit()
+
+
 def _did_you_mean(text, known):
     from astropolcal.words import did_you_mean
 
@@ -75,6 +94,9 @@ def build_parser():
 
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
+    words = "print what completes commands, options and files in a shell (needs shtab)"
+    shells = {"choices": ("bash", "zsh", "tcsh"), "help": words}
+    parser.add_argument("--print-completion", action=_PrintCompletion, **shells)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in _COMMANDS:
         add_command(commands, name, import_module(f"astropolcal.scripts._{name}"))
