@@ -89,7 +89,7 @@ def test_warnings_go_to_standard_error_in_one_line(running, capsys):
 
 
 _COMPLETED = """
-source script
+source ./script
 try() {
     COMP_WORDS=("$@"); COMP_CWORD=$(( $# - 1 )); COMPREPLY=()
     _shtab_astropolcal; echo "${COMPREPLY[*]}"
