@@ -9,7 +9,9 @@ import argparse
 import os
 import re
 import sys
+import threading
 import warnings
+from _thread import interrupt_main
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
@@ -130,6 +132,7 @@ def main(argv=None):
     vampires
     0
     """
+    shown, sys.unraisablehook = sys.unraisablehook, _insist
     try:
         status = _run(argv)
         # what is left in the buffer: at exit it would be too late to say why it is lost
@@ -148,9 +151,20 @@ def main(argv=None):
         words = _one_line(f"{where}: cannot be written: {error.strerror or error}")
         print(f"astropolcal: error: {words}", file=sys.stderr)
         status = 2
+    finally:
+        sys.unraisablehook = shown
     # do not complain again at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return status
+
+
+def _insist(lost):
+    """Interrupt again: what Python calls by itself, as while it imports, drops an interruption."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        # once that is over
+        threading.Timer(0.1, interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _run(argv):

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 import warnings
 from types import SimpleNamespace
 
@@ -62,6 +63,19 @@ def test_interruption_is_status_130(running, capsys):
 def test_interruption_while_the_commands_are_loaded(monkeypatch, capsys):
     monkeypatch.setattr(module, "build_parser", lambda: fail(KeyboardInterrupt()))
     assert main([]) == 130
+    assert capsys.readouterr().err == "astropolcal: interrupted\n"
+
+
+def test_interruption_is_not_lost_where_python_drops_exceptions(running, capsys):
+    class Odd:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    def work():
+        Odd()
+        time.sleep(20)
+
+    assert running(work) == 130
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
 
 
