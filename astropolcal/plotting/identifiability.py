@@ -22,7 +22,6 @@ from astropolcal.plotting._style import (
     canvas,
     element_places,
     heading,
-    legend_outside,
     note,
     style,
 )
