@@ -348,6 +348,9 @@ def _verdict(summary, systematic):
         )
         for words, key, unit, scale in (("DoLP", "s_p", " %", 100), ("AoLP", "s_chi", " deg", 1))
     )
+    # the unit once: the line is short
+    if not told:
+        degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
     verdict, advice = "Usable", "astropolcal info tells what the product holds"
     if not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"

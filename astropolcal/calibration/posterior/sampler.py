@@ -508,7 +508,8 @@ def _warn(posterior):
         return
     short = posterior.n_times < ENOUGH
     problem = f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
-    warnings.warn(f"the chain {problem}: {posterior.words()}", AstropolcalWarning, stacklevel=3)
+    complaints = "; ".join(posterior.convergence.complaints(posterior.names))
+    warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=3)
 
 
 def _kept_burn_in(burn_in, n_steps, thin):
