@@ -32,6 +32,14 @@ def counted(number, noun, plural=None):
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
+def listed(texts, word="and", most=None):
+    """Return texts as a list in words; beyond ``most`` their number."""
+    texts = list(texts)
+    if most is not None and len(texts) > most:
+        return f"{', '.join(texts[:most])} {word} {len(texts) - most} more"
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
+
+
 def html(text, table=None):
     """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
     shown = "" if table is None else table._repr_html_()

@@ -146,7 +146,7 @@ def test_package_data_names_every_file_that_is_no_module(tool):
 
 
 def test_installed_package_has_its_data():
-    for pattern in ["resources/**/*.yaml", "data/*.ecsv", "gap/templates/*.html"]:
+    for pattern in ["resources/**/*.yaml", "data/*.ecsv", "data/*.toml", "gap/templates/*.html"]:
         assert list(Path(astropolcal.__file__).parent.glob(pattern)), pattern
 
 

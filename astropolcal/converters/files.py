@@ -39,7 +39,7 @@ __all__ = []
 _KEY = "calibration"
 _ALLOWED_TAGS = re.compile(
     r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
-    r"|unit/(quantity|unit))-[0-9.]+"
+    r"|unit/(quantity|unit)|transform/[a-z0-9_]+)-[0-9.]+"
     r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
     rf"|{'|'.join(map(re.escape, CALIBRATION_TAGS))}"
     r"|tag:astropolcal\.org:astropolcal/optics/[a-z_0-9]+-1\.0\.0"
@@ -73,7 +73,10 @@ def read_calibration(path):
     with _speaking_of(path, "damaged"):
         content = path.read_bytes()
         # cheap checks first: most broken files are truncated or something else
-        _check_ends(content)
+        if not content.startswith(_BEGIN):
+            raise CalibrationFileError("not an ASDF file")
+        if not content.endswith(_END):
+            raise CalibrationFileError("truncated: the end of the file is missing")
         _check_tree(content)
         return _from_bytes(content)
 
@@ -158,13 +161,6 @@ def _strict_asdf(kind=_ConfigWithUnits):
 
 
 # ---- what is refused before ASDF opens the file ------------------------------------
-
-
-def _check_ends(content):
-    if not content.startswith(_BEGIN):
-        raise CalibrationFileError("not an ASDF file")
-    if not content.endswith(_END):
-        raise CalibrationFileError("truncated: the end of the file is missing")
 
 
 def _check_tree(content):
@@ -265,10 +261,7 @@ def _speaking_of(path, words, prefix="", reads=True):
         except CalibrationFileError as error:
             raise CalibrationFileError(f"{path}: {prefix}{one_line(error, 500)}") from error
         except ValidationError as error:
-            raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
-
-
-def _where(error):
-    """Return what a schema objects to, and at which place of the file."""
-    place = ".".join(str(part) for part in error.absolute_path)
-    return f"invalid at {one_line(place)}: {one_line(error.message)}"
+            # what a schema objects to, and at which place of the file
+            place = one_line(".".join(map(str, error.absolute_path)))
+            words = f"invalid at {place}: {one_line(error.message)}"
+            raise CalibrationFileError(f"{path}: {prefix}{words}") from error

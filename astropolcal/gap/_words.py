@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
-from astropolcal.words import p_words
+from astropolcal.words import listed, p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
 _DETERMINED = 0.1
@@ -73,14 +73,6 @@ def change(old, new, digits=2):
 
 
 # ---- names -----------------------------------------------------------------------------------
-
-
-def listed(texts, word="and", most=None):
-    """Return texts as a list in words; beyond ``most`` their number."""
-    texts = list(texts)
-    if most is not None and len(texts) > most:
-        return f"{', '.join(texts[:most])} {word} {len(texts) - most} more"
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
 
 
 def in_title(texts):

@@ -315,7 +315,8 @@ def _nested(base, smooth, groups, say, cells):
         fold = Model(GapProblem(base.chains, kept), base.fit, base.added)
         fold.problem.settle_noise(fold.problem.start)
         fold = Model(fold.problem, fold.problem.fit(base.fit.coefficients), base.added)
-        chosen = select(fold, smooth, None, lambda line: None, cells=cells)
+        # as the whole was chosen: other groups may contradict a cause
+        chosen = select(fold, smooth, groups, lambda line: None, cells=cells)
         recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
         whole = base.with_effects(recipes, like=chosen.model, steps=0)
         start = chosen.model.start_of(whole.problem)

@@ -20,7 +20,6 @@ from scipy.linalg import cho_factor, cho_solve
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._words import listed
 from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
 from astropolcal.gap.problem import OPEN, GapProblem
@@ -28,6 +27,7 @@ from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.simulation import simulate
+from astropolcal.words import listed
 
 __all__ = []
 
@@ -39,6 +39,8 @@ _SKY = ("parallactic", "altitude")
 _LEVELS = (0.5, 2.0)
 # new angles of the derotator that are tried, and frames of a run that are repeated
 _NEW_ANGLES, _LONGEST = 3, 128
+# a stage that modulates without such a plate is turned by so much (degree)
+_TURNED_BY = (22.5, 45.0)
 # an alias of a smaller share is not asked about; so many are
 _LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
 # of the doubt, the least that an exposure has to take; what a change of the set-up and a frame
@@ -51,6 +53,7 @@ _APART = np.log(10)
 # a dataset is repeated so many times to know its noise
 _REPEATS = 3
 MODULATOR, STATES = "flc_state", ("A", "B")
+GROUP = "group"
 #: What cannot be seen to one standard deviation is not worth an exposure.
 LEAST_GAIN = 1.0
 # a change of this size (radian or relative) has to be seen
@@ -68,9 +71,9 @@ class Exposure:
 
     #: The dataset whose set-up it repeats.
     dataset: int
-    #: Half-wave-plate angles in degree, one a frame.
+    #: Half-wave-plate angles in degree, one per frame; empty where there is no such plate.
     hwp: tuple
-    #: Other stages and their angle in degree, one a frame where it changes.
+    #: Other stages and their angle in degree, or state, one per frame where it changes.
     positions: tuple = ()
     #: Degrees by which the calibration polarizer is turned.
     polarizer_turned: float = 0.0
@@ -88,13 +91,14 @@ class Exposure:
     @property
     def n_frames(self):
         """Number of frames: each angle in each state."""
-        return len(self.hwp) * max(len(self.states), 1)
+        return len(next(iter(self.angles.values()), ()))
 
     @property
     def angles(self):
-        """Angle of every stage in every frame, degree, by name."""
-        n, each = len(self.hwp), max(len(self.states), 1)
-        found = {"hwp": self.hwp, **dict(self.positions)}
+        """Angle of every stage in every frame, degree, or its state, by name."""
+        found = {"hwp": self.hwp} if self.hwp else {}
+        found |= dict(self.positions)
+        n, each = max(map(np.size, found.values()), default=0), max(len(self.states), 1)
         return {name: np.repeat(np.broadcast_to(a, n), each) for name, a in found.items()}
 
     @property
@@ -134,20 +138,22 @@ def exposures(model, *, flux_matters=False):
     Return exposures that the set-ups of the data allow.
 
     New angles, a full turn of the plate, the run again, in another order and backwards, the
-    polarizer turned or taken out, and another lamp.
+    polarizer turned or taken out, and another lamp. Where no half-wave plate modulates two beams,
+    it is the run again with each stage turned.
     """
     found, trains = [], model.trains
     polarized = [Roles(train).polarizer is not None for train in trains]
     for i, (train, observations) in enumerate(zip(trains, model.observations, strict=True)):
-        if "hwp" not in observations.frames.colnames or observations.single_beam:
-            continue
         run = _run(i, train, observations)
         # of several datasets it has to be said whose source and lamp it is
         run = replace(run, setup=observations.name) if len(trains) > 1 else run
-        blocks = _blocks(run, train)
+        plain = bool(run.hwp) and not observations.single_beam
+        blocks = _blocks(run, train) if plain else _turned(run, observations.name)
         found += [*blocks, *_runs(run, train, observations.name)]
+        if not blocks:
+            continue
         middle = blocks[len(blocks) // 2]
-        if polarized[i]:
+        if polarized[i] and plain:
             # Q into U: what acts on one of them alone shows
             found.append(replace(middle, polarizer_turned=45.0))
             # a dataset without it is that exposure already
@@ -163,14 +169,37 @@ def _run(i, train, observations):
     states, take = (), np.ones(observations.n_frames, dtype=bool)
     if MODULATOR in stages(train):
         states, take = STATES, observations.position(MODULATOR) < 0.5
-    names = [s for s in stages(train) if s not in COORDINATES and s != "hwp"]
+    # "filter=CLEAR" is a state of the column filter
+    names = dict.fromkeys(stage.partition("=")[0] for stage in ("hwp", *stages(train)))
     known = set(observations.frames.colnames)
     where = {
-        name: tuple(np.round(np.rad2deg(observations.position(name)[take]), 6)[:_LONGEST])
-        for name in ("hwp", *names)
-        if name in known
+        name: tuple(_column(observations, name)[take][:_LONGEST])
+        for name in names
+        if name in known and name not in COORDINATES
     }
-    return Exposure(i, where.pop("hwp"), tuple(where.items()), states=states)
+    if observations.single_beam:
+        where[GROUP] = tuple(observations.brightness_groups[take][:_LONGEST].tolist())
+    return Exposure(i, where.pop("hwp", ()), tuple(where.items()), states=states)
+
+
+def _column(observations, name):
+    """Return the angles (degree) or the states of a stage, (F,)."""
+    if observations.frames[name].dtype.kind in "US":
+        return np.asarray(observations.frames[name])
+    return np.round(np.rad2deg(observations.position(name)), 6)
+
+
+def _turned(run, name):
+    """Return the run with each of its stages turned, those of the sky aside."""
+    found = []
+    for stage, angles in run.angles.items():
+        if stage not in (*_SKY, GROUP) and angles.dtype.kind == "f":
+            for by in _TURNED_BY:
+                where = dict(run.positions) | {"hwp": run.hwp} | {stage: tuple(angles + by)}
+                what = f"the run of {name} with {stage} turned by {by:g} deg"
+                plate = where.pop("hwp")
+                found.append(replace(run, hwp=plate, positions=tuple(where.items()), what=what))
+    return found
 
 
 def _blocks(run, train):
@@ -202,19 +231,25 @@ def _runs(run, train, name):
     if any(stage in _SKY for stage in stages(train)):
         # the sky moves on by itself
         return [same]
-    n = len(run.hwp)
+    # frames that share their brightness stay together
+    group = dict(run.positions).get(GROUP, np.arange(run.n_frames // max(len(run.states), 1)))
+    group = np.unique(group, return_inverse=True)[1]
+    n = group.max(initial=-1) + 1
     # the same for all runs of a length: the proposal can be repeated
     shuffled = np.random.default_rng(n).permutation(n)
     return [
         same,
-        _in_order(same, shuffled, f"the frames of {name} in shuffled order"),
-        _in_order(same, np.arange(n)[::-1], f"the run of {name} backwards, from its last frame"),
+        _in_order(same, shuffled[group], f"the frames of {name} in shuffled order"),
+        _in_order(same, n - group, f"the run of {name} backwards, from its last frame"),
     ]
 
 
-def _in_order(run, order, what):
+def _in_order(run, rank, what):
+    """Return a run with its frames in the order of a rank each."""
+    order = np.argsort(rank, kind="stable")
     positions = tuple((name, tuple(np.array(a)[order])) for name, a in run.positions)
-    return replace(run, hwp=tuple(np.array(run.hwp)[order]), positions=positions, what=what)
+    plate = tuple(np.array(run.hwp)[order]) if run.hwp else ()
+    return replace(run, hwp=plate, positions=positions, what=what)
 
 
 # ---- the plan ----------------------------------------------------------------------------------
@@ -566,10 +601,9 @@ def _hypothetical(base, exposure):
     measured = np.exp(_middle(problem.channels[i], problem.channels[i].observed[1]))
     # of a wavelength without a datum nothing is asked: any flux will do
     measured = np.where(np.isfinite(measured), measured, usual)
-    frames = QTable({name: angles * u.deg for name, angles in exposure.angles.items()})
-    if "derotator" not in frames.colnames:
-        # tables have it, also those of instruments without one
-        frames["derotator"] = np.zeros(len(frames)) * u.deg
+    frames = QTable(
+        {name: a * u.deg if a.dtype.kind == "f" else a for name, a in exposure.angles.items()}
+    )
     if exposure.states:
         frames[MODULATOR] = (exposure.modulator == STATES[1]).astype(float)
     return simulate(
@@ -599,6 +633,12 @@ def _whitened(array, old, exposure, new):
     sigma = _middle(old, old.sigma)[..., None]
     weight = np.where(np.isfinite(sigma), np.sqrt(exposure.lamp) / sigma, 0.0)
     out = array * weight
+    if new.groups is not None:
+        # of a single beam nothing is known but that a group shares its brightness
+        member = np.eye(new.groups.max() + 1)[new.groups]
+        out[..., 0, :, :] = 0.0
+        out[..., 1, :, :] -= out[..., 1, :, :] @ (member / member.sum(axis=0)) @ member.T
+        return out
     sums = out[..., 1, :, :] - out[..., 1, :, :].mean(axis=-1, keepdims=True)
     norm = np.sqrt(np.sum(weight[1] ** 2))
     direction = weight[1] / (norm if norm > 0 else 1.0)

@@ -13,9 +13,10 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import decimals, listed
+from astropolcal.gap._words import decimals
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
+from astropolcal.words import listed
 
 __all__ = []
 

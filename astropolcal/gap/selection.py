@@ -432,7 +432,8 @@ def _continuations(found, most):
 def _extended(evidence, state, added):
     """Return a set with more causes, fitted in full, None where that is impossible."""
     model = state.model.with_effects([one.recipe for one in added], **_QUICK)
-    if not all(model.is_physical(one.name) for one in added):
+    # what was possible before may be driven to its limit by what is added
+    if not all(model.is_physical(one.name) for one in (*state.chosen, *added)):
         return None
     # what the full fit gains over the linear promise
     gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)

@@ -5,6 +5,8 @@ from astropolcal.pipeline.export import mueller_table, write_mueller
 from astropolcal.pipeline.history import Change, changes, parameter_history, restart
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
+from astropolcal.pipeline.monitoring import health, write_health
+from astropolcal.pipeline.timeline import courses
 
 __all__ = [
     "Change",
@@ -13,9 +15,12 @@ __all__ = [
     "LoadedCalibration",
     "SystemMueller",
     "changes",
+    "courses",
+    "health",
     "load",
     "mueller_table",
     "parameter_history",
     "restart",
+    "write_health",
     "write_mueller",
 ]

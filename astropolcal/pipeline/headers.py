@@ -33,8 +33,9 @@ from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
-from astropolcal.observations.pointings import offline, sky_angle
+from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import numeric_column
+from astropolcal.optics.core import PLACES
 
 __all__ = []
 
@@ -178,7 +179,9 @@ class FrameAngles:
         return angles * u.deg
 
     def position(self, column):
-        """Return an angle of every frame in radian."""
+        """Return an angle of every frame in radian, or a moment or place in the field."""
+        if column in PLACES:
+            return frame_coordinate(self, column)
         if column not in self._table.colnames:
             keyword = self._layout.keywords.get(column)
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"

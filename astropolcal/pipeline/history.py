@@ -31,9 +31,11 @@ __all__ = ["Change", "changes", "parameter_history", "restart"]
 
 # a direction less certain than this share of the most certain one tells nothing
 _RANK = 1e-12
+# degrees by which a retardance, or an orientation, is the same again
+_PERIODS = {"retardance": 360.0, "theta": 180.0}
 
 
-def _named(calibrations):
+def named_by_date(calibrations):
     """Return (name, calibration) by start of validity."""
     if isinstance(calibrations, Library):
         if calibrations.problems:
@@ -72,6 +74,7 @@ def parameter_history(calibrations, parameters=None):
         One row a calibration, parameter and wavelength: ``date`` (start of validity, masked if
         it is not known), ``calibration``, ``parameter``, ``wavelength`` (nm; NaN for one value
         for all), ``value``, ``std`` (NaN where not determined or held), ``unit``, ``fixed``.
+        Retardances and orientations are in the turn that is nearest to the first calibration's.
 
     Raises
     ------
@@ -93,7 +96,7 @@ def parameter_history(calibrations, parameters=None):
     >>> table["date"].iso[0][:10], len(table)
     ('2025-03-01', 2)
     """
-    named = _named(calibrations)
+    named = named_by_date(calibrations)
     rows = []
     for name, calibration in named:
         for key, entry in calibration.parameter_values().items():
@@ -106,7 +109,17 @@ def parameter_history(calibrations, parameters=None):
     if parameters is None:
         free = {row["parameter"] for row in rows if not row["fixed"]}
         rows = [row for row in rows if row["parameter"] in free]
-    return _as_table(rows)
+    table, first = _as_table(rows), {}
+    for row in table:
+        key = row["parameter"], str(row["wavelength"].value)
+        row["value"] = _in_turn(row["value"], first.setdefault(key, row["value"]), key[0])
+    return table
+
+
+def _in_turn(value, first, name):
+    """Return an angle in degree in the turn that is nearest to a first one, anything else as is."""
+    period = _PERIODS.get(name.partition("[")[0].rpartition(".")[2])
+    return value if period is None else value - period * np.round((value - first) / period)
 
 
 def _wanted(key, entry, parameters):
@@ -227,9 +240,38 @@ def significance(calibrations, parameters=None):
     all determine. A fit in another mirror branch counts as a change, so start it from the earlier
     one.
     """
-    named = _named(calibrations)
+    named = named_by_date(calibrations)
     if len(named) < 2:
         raise FitError(f"{len(named)} calibration: at least two are needed to compare")
+    found = compared(named, parameters)
+    chi2, rank = _chi_square(found.values, found.covariances)
+    dof = rank * (len(named) - 1)
+    p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
+    labels = [name for name, _ in named]
+    return Change(labels, found.names, chi2, dof, p, found.left_out, found.n_open)
+
+
+@dataclass
+class Compared:
+    """What several calibrations say of some parameters, in the directions that all determine."""
+
+    names: list
+    left_out: list
+    #: Orthonormal directions, shape (n, n_names), of parameters in units of ``steps``.
+    basis: np.ndarray
+    steps: np.ndarray
+    #: Of each calibration, along these directions.
+    values: list
+    covariances: list
+
+    @property
+    def n_open(self):
+        """Number of directions that are open in one of the calibrations."""
+        return len(self.names) - len(self.basis)
+
+
+def compared(named, parameters=None):
+    """Return what calibrations of independent data say of the same parameters, `Compared`."""
     _check_independent(named)
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
@@ -239,19 +281,17 @@ def significance(calibrations, parameters=None):
     # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
     # open in any of them
     basis = _determined([a.open[:, p] for a, p in zip(axes, places, strict=True)], len(names))
-    values = [
-        basis @ (_values(calibration, names) / a.steps[p])
-        for (_, calibration), a, p in zip(named, axes, places, strict=True)
-    ]
+    steps = axes[0].steps[places[0]]
+    values = [_values(calibration, names) for _, calibration in named]
+    # another turn is no change
+    for own in values[1:]:
+        turned = zip(own, values[0], names, strict=True)
+        own[:] = [_in_turn(value, first, name) for value, first, name in turned]
+    values = [basis @ (own / steps) for own in values]
     known = [
         (a.known * a.sigmas[:, None])[:, p] @ basis.T for a, p in zip(axes, places, strict=True)
     ]
-    chi2, rank = _chi_square(values, [k.T @ k for k in known])
-    dof = rank * (len(named) - 1)
-    p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
-    return Change(
-        [name for name, _ in named], names, chi2, dof, p, left_out, len(names) - len(basis)
-    )
+    return Compared(names, left_out, basis, steps, values, [k.T @ k for k in known])
 
 
 def _check_independent(named):
@@ -375,11 +415,11 @@ def changes(calibrations, parameters=None):
     >>> changes(years)["what"].tolist()
     ['calibration_polarizer', 'hwp', 'derotator', 'wollaston']
     """
-    named = _named(calibrations)
+    named = named_by_date(calibrations)
     rows = []
     for first, second in pairwise(named):
         pair = [_Named(*first), _Named(*second)]
-        for what in parameters or _optics(pair):
+        for what in parameters or optics_of((first, second)):
             found = significance(pair, [what])
             rows.append(
                 {
@@ -409,10 +449,10 @@ class _Named:
         return SimpleNamespace(name=self.label)
 
 
-def _optics(pair):
-    names = [set(item.calibration.covariance.names) for item in pair]
-    first = pair[0].calibration.covariance.names
-    common = [name for name in first if name in names[1]]
+def optics_of(named):
+    """Return the optics of which a parameter is free in all calibrations."""
+    names = [calibration.covariance.names for _, calibration in named]
+    common = [name for name in names[0] if all(name in own for own in names)]
     return list(dict.fromkeys(name.partition(".")[0] for name in common))
 
 

@@ -22,6 +22,7 @@ from astropolcal.chain import (
     leaves,
     system_mueller,
     system_mueller_derivatives,
+    warn_beyond,
     with_beam,
 )
 from astropolcal.converters.calibration import content_hash
@@ -32,6 +33,7 @@ from astropolcal.exceptions import (
     InstrumentError,
     ParameterError,
 )
+from astropolcal.optics.core import PLACES, finite_position
 from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,
@@ -346,13 +348,14 @@ class LoadedCalibration:
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             # the same reader as for tables of observations, so that tracking laws and offsets agree
-            positions = {name: angle * u.rad for name, angle in found.items()}
+            positions = {name: angle * PLACES.get(name, u.rad) for name, angle in found.items()}
         lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
         chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
+        warn_beyond(chain, {k: finite_position(x, k) for k, x in positions.items() if k in PLACES})
         value = system_mueller(chain, lam, positions)
         slopes = system_mueller_derivatives(chain, lam, positions)
         parts = errors(self.calibration, self._covariance, value, slopes, bins)
-        shown = {name: _degrees(position) for name, position in positions.items()}
+        shown = {name: _degrees(name, position) for name, position in positions.items()}
         if single:
             value, *parts = (part[0] for part in (value, *parts))
             shown = {name: angle[0] for name, angle in shown.items()}
@@ -427,6 +430,8 @@ class LoadedCalibration:
         return chain, assumed
 
 
-def _degrees(position):
+def _degrees(name, position):
+    if name in PLACES:
+        return finite_position(position, name) * PLACES[name]
     angle = u.Quantity(position)
     return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle

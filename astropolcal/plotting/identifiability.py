@@ -23,7 +23,6 @@ from astropolcal.plotting._style import (
     element_places,
     heading,
     note,
-    style,
 )
 from astropolcal.units import angle_to_rad
 
@@ -114,8 +113,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     angles = _angles(calibration, hwp)
     words = _wrapped(rows)
     heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
-    with style():
-        figure = canvas(figure, _WIDTH, sum(heights) + 1.6)
+    with canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
@@ -432,8 +430,7 @@ def plot_correlations(calibration, *, figure=None):
     known = np.isfinite(np.diag(matrix))
     groups, left_out = _by_stem(covariance.names, known), _by_stem(covariance.names, ~known)
     matrix = matrix[np.ix_(known, known)]
-    with style():
-        figure = canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4)
+    with canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4) as figure:
         axes = figure.add_subplot()
         heading(figure, calibration, "Correlations of the parameters")
         if left_out:

@@ -23,7 +23,7 @@ __all__ = ["main"]
 # in the order in which a night is worked through, as the help lists them
 _COMMANDS = (
     *("reduce", "calibrate", "sample", "diagnose", "correct", "efficiency", "standards"),
-    *("simulate", "challenge", "info"),
+    *("simulate", "challenge", "health", "info"),
 )
 _DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from astropolcal import optics
+from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import Weighting
 from astropolcal.measurement import Measurement, Normal
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 N_BINS = 22
 
@@ -305,3 +306,23 @@ def test_polish_with_priors_reaches_the_minimum_of_both(make):
         best = least_squares(residuals, vector[element], args=(element,), xtol=1e-12)
         assert costs[i] == pytest.approx(best.cost, rel=1e-6)
         np.testing.assert_allclose(vector[element], best.x, atol=1e-6)
+
+
+def test_a_thickness_off_by_little_ends_in_no_other_minimum():
+    """A plate off by 0.3 %, and turned by a degree: the first valley may be a wrong one."""
+    rng = np.random.default_rng(4)
+    charis = instruments.get("charis")
+    cycles = half_wave_plate_cycles(derotator=np.linspace(50, 110, 5) * u.deg)
+    for i in range(8):
+        grid = charis.wavelength[:: 2 if i % 2 else 5]
+        chain = charis.chain(derotator="elliptical" if i % 2 else "linear", wavelength=grid)
+        truth = chain.copy()
+        truth["hwp"].theta = rng.uniform(-1.5, 1.5) * u.deg
+        truth["derotator"].theta = rng.uniform(-1, 1) * u.deg
+        for key in ("w_sio2", "w_mgf2"):
+            value = getattr(truth["hwp"], key).value * (1 + rng.normal(0, 0.003))
+            setattr(truth["hwp"], key, value * u.mm)
+        table = simulate(truth, grid, cycles, seed=i, flux=3e6, meta={"source": "polarized"})
+        found = calibrate(chain, table, cross_validate=False)
+        measurement = found.live_measurement()
+        assert np.sqrt(np.mean(measurement.residuals() ** 2)) < 1e-3, i

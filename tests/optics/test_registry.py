@@ -862,7 +862,7 @@ def test_any_unit_gives_the_same_optic(label, data, angle):
 def test_plain_number_is_refused_where_a_unit_is_due(label):
     cls = CASES[label].optic
     for key in cls().param_names:
-        if cls._declared(key).unit is not None:
+        if cls()._declared(key).unit is not None:
             with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} = 1.0 needs a unit"):
                 cls(**{key: 1.0})
             with pytest.raises(ParameterError, match="needs a unit"):

@@ -26,6 +26,7 @@ from astropolcal.calibration.fit.strategies import (
     describe_gauge,
     hold_silent,
     open_parameters,
+    other_laws,
     search_branches,
     sequential,
     settled,
@@ -61,7 +62,8 @@ from astropolcal.calibration.validation.cross_validation import accuracy_table, 
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.measurement.datasets import as_pairs
+from astropolcal.measurement.parameters import ROUNDING, with_own
 from astropolcal.progress import stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
@@ -73,6 +75,9 @@ ERRORS = ("scatter", "white")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 _ROBUST_ROUNDS = 50
+# residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
+# one counts that leaves less than this share
+_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
 
@@ -86,6 +91,7 @@ def calibrate(
     observable=None,
     weights=None,
     ties=None,
+    own=(),
     positions=None,
     wavelength=None,
     search=None,
@@ -126,6 +132,11 @@ def calibrate(
         per wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
+    own : sequence of str, or dict of str to sequence
+        Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
+        the group of each dataset, such as its night, in which they have the same. All others are
+        shared. In all groups but the first the name of the group is added to that of the optic. The
+        full summary says which of them really differ.
     positions : sequence of dict, optional
         Position of every stage for each dataset, see
         `~astropolcal.measurement.Measurement`.
@@ -192,7 +203,12 @@ def calibrate(
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
+    copies = {}
+    if own:
+        chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
+        chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
@@ -220,6 +236,7 @@ def calibrate(
             "errors": errors,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+            **({"own": copies} if copies else {}),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
         stages=stages,
@@ -342,10 +359,40 @@ def _outside_bounds(measurement):
 
 
 def _joint(measurement, weighting, fitter, search, prepare):
-    """Fit everything; go on as long as some bin finds a better mirror branch."""
+    """Fit everything; where the residuals stand out, from other values of its laws, too."""
     origin = measurement.vector()
+    best = _descend(measurement, weighting, fitter, search, prepare, origin)
+    if not search or not _stands_out(measurement):
+        return best
+    found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
+    least = np.sum(problem.residuals(found) ** 2)
+    for _, start in other_laws(problem, found, origin)[:_STARTS]:
+        measurement.stand_at(start)
+        outcome = _descend(measurement, weighting, fitter, search, prepare, origin, start)
+        left = np.sum(problem.residuals(measurement.vector()) ** 2)
+        if left < _BETTER * least:
+            best, found, least = outcome, measurement.vector(), left
+            if not _stands_out(measurement):
+                break
+    measurement.stand_at(found)
+    return best
+
+
+def _stands_out(measurement):
+    """Whether the residuals are far above the noise that the frames show."""
+    try:
+        sigma = _noise_of_frames(measurement).sigma_of_data
+    except AstropolcalError:
+        # nothing to hold against
+        return False
+    residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
+    return bool(np.mean((residuals / sigma) ** 2) > _STANDS_OUT**2)
+
+
+def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
+    """Fit everything; go on as long as some bin finds a better mirror branch."""
     small, noise = _thinned(measurement, weighting)
-    if search:
+    if search and start is None:
         small.stand_at(_first_search(small, noise, origin))
     prepare(small)
     # branches are found on few frames, so the long table starts from their fit

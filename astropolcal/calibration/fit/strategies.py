@@ -38,6 +38,10 @@ _CLEARLY_BETTER = 0.99
 # a polish ends when no bin gains a thousandth in a step, or is about to
 _STILL_GAINING = 0.999
 _STUCK = 1.0
+# so many other thicknesses to either side are tried; each step changes the data by so much (rms)
+_LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
+# starts whose sums of squares differ by less are the same
+_APART = 1.001
 
 
 class BinProblem(Problem):
@@ -196,6 +200,40 @@ def search_branches(problem, vector, origin=None):
                 costs = np.where(better, new, costs)
                 moved |= better
     return best, moved
+
+
+def other_laws(problem, vector, origin):
+    """
+    Return sums of squares and starts with other thicknesses of each optic, best first.
+
+    A phase that is a law of a thickness has minima of its own, as one of a bin has. Thicknesses are
+    tried around those of ``origin``, beside the other common parameters of ``vector``, with each
+    bin roughly in its best valley, and in that of the origin.
+    """
+    slots = [s for s in problem.measurement.free.slots if not s.per_wavelength and _is_length(s)]
+    slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
+    low, high = problem.measurement.free.bounds()
+    base = vector.copy()
+    for slot in slots:
+        base[slot.start] = origin[slot.start]
+    for slot in {slot.name.partition(".")[0]: slot for slot in reversed(slots)}.values():
+        size = np.sqrt(np.mean(slopes[:, slot.start] ** 2))
+        for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
+            start = base.copy()
+            start[slot.start] += k * _LAW_STEP / size
+            if low[slot.start] <= start[slot.start] <= high[slot.start]:
+                start[problem.elements] = origin[problem.elements]
+                found.append(problem.polish(start, _ROUGH))
+                for row, *bounds in problem.main_retardances():
+                    start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
+                found.append(problem.polish(start, _ROUGH))
+    ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
+    # where the best valley is the nearest one, both are the same
+    return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def _is_length(slot):
+    return slot.unit is not None and slot.unit.is_equivalent(u.m)
 
 
 def _data_of_bins(measurement, n_bins):

@@ -1,0 +1,264 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The health of an instrument through all its calibrations: what changed, and what needs care."""
+
+from itertools import pairwise
+
+import astropy.units as u
+import numpy as np
+from astropy.time import Time
+
+from astropolcal.calibration.result.validity import instrument_of
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.files import atomic_path, plain, printable
+from astropolcal.instruments import Instrument
+from astropolcal.pipeline.library import Library
+from astropolcal.pipeline.timeline import COURSES, courses, moment_of
+from astropolcal.words import counted, listed
+
+__all__ = ["health", "write_health"]
+
+#: A change, or a course, at least this probable is an event.
+LIKELY = 0.9
+_COURSE_WORDS = {
+    "constant": "constant",
+    "steps": "changes in steps",
+    "drift": "drifts",
+    "walk": "wanders",
+    "scatter": "differs from run to run",
+}
+
+
+def health(library, *, goal=None, max_age=None, events=(), now=None):
+    """
+    Return how an instrument does, from all its calibrations.
+
+    Parameters
+    ----------
+    library : Library or path-like
+        The calibrations.
+    goal : `~astropy.units.Quantity` or float, optional
+        Accuracy that is wanted, percent of polarization: the cross-validated one is compared.
+    max_age : `~astropy.units.Quantity`, optional
+        Age from which on a calibration is too old; by default that of the instrument.
+    events : sequence of str
+        Dates at which something was done to the instrument, see `courses`.
+    now : str or `~astropy.time.Time`, optional
+        The moment for which it is said.
+
+    Returns
+    -------
+    dict
+        Ready for JSON: ``now``, ``unreadable`` and ``groups``, one per instrument and mode, with
+        ``instrument``, ``mode``, ``calibrations`` (name, date, ``s_res_percent``,
+        ``s_cv_percent``, converged, datasets), ``courses`` (what, course, probabilities),
+        ``events`` (what, between which calibrations and dates, probability), ``alarms`` and
+        ``next`` (sentences), and ``left_out``, why calibrations take no part in the courses.
+
+    Raises
+    ------
+    ParameterError
+        If the folder holds no calibration, or the goal or the age is none.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.pipeline import Library, health
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> table = simulate(chain, charis.wavelength, frames, seed=1, meta={"date": "2025-03-01"})
+    >>> Path("runs").mkdir()
+    >>> _ = Library("runs").add(calibrate(chain, table, instrument="charis"))
+    >>> (group,) = health("runs", now="2027-01-01")["groups"]
+    >>> print(group["alarms"][0])
+    The newest calibration is of 2025-03-01, 671 days old; charis wants one every 365 days.
+    """
+    library = library if isinstance(library, Library) else Library(library)
+    if not len(library):
+        raise ParameterError(f"{library.source}: holds no calibration that can be read")
+    moment = moment_of(Time.now() if now is None else now, "now")
+    goal = None if goal is None else _positive("goal", goal, u.percent)
+    limit = None if max_age is None else _positive("max_age", max_age, u.day)
+    rows = {row["name"]: row for row in library.table()}
+    groups = {}
+    for entry in library.entries:
+        key = (entry.validity.instrument or "", entry.validity.mode or "")
+        groups.setdefault(key, []).append(entry)
+    return plain(
+        {
+            "now": moment.isot[:19],
+            "goal_percent": goal,
+            "unreadable": {path.name: reason for path, reason in library.problems.items()},
+            "groups": [
+                _group(*key, sorted(own, key=_start), rows, moment, goal, limit, events)
+                for key, own in sorted(groups.items())
+            ],
+        }
+    )
+
+
+def _positive(name, value, unit):
+    try:
+        number = float(u.Quantity(value, unit).value)
+    except (TypeError, u.UnitConversionError):
+        number = np.nan
+    if not (np.isfinite(number) and number > 0):
+        raise ParameterError(f"{name} = {value!r}; a positive number of {unit.long_names[0]}s")
+    return number
+
+
+def _start(entry):
+    return entry.validity.valid_from or ""
+
+
+def _group(instrument, mode, entries, rows, moment, goal, limit, events):
+    """Return what is to be said of the calibrations of an instrument and a mode."""
+    dated = [e for e in entries if e.validity.valid_from is not None]
+    left_out = [f"{e.name} has no date" for e in entries if e.validity.valid_from is None]
+    found, why = None, ""
+    try:
+        found = courses(dated, events=events)
+    except (ParameterError, FitError) as problem:
+        why = str(problem)
+    content = {
+        "instrument": instrument,
+        "mode": mode,
+        "calibrations": [_calibration(entry, rows[entry.name]) for entry in entries],
+        "courses": [] if found is None else _courses(found),
+        "events": [] if found is None else _events(found, dated),
+        "left_out": [*left_out, why] if why else left_out,
+    }
+    newest = dated[-1] if dated else entries[-1]
+    known = instrument_of(newest.calibration) or Instrument
+    limit = float(known.max_age.to_value(u.day)) if limit is None else limit
+    content["alarms"] = _alarms(content, newest, moment, goal, limit)
+    advice = newest.calibration.verdict().words[-1].partition(" ")[2].strip()
+    content["next"] = [*_next(content, newest, moment, limit), f"{newest.name}: {advice}"]
+    return content
+
+
+def _calibration(entry, row):
+    return {
+        "name": entry.name,
+        "date": entry.validity.valid_from,
+        "datasets": str(row["datasets"]),
+        "s_res_percent": float(row["s_res"]),
+        "s_cv_percent": float(row["s_cv"]),
+        "converged": bool(row["converged"]),
+    }
+
+
+def _courses(found):
+    return [
+        {"what": str(row["what"]), "course": str(row["course"])}
+        | {name: float(row[name]) for name in COURSES}
+        | {"words": f"{row['what']} {_COURSE_WORDS[row['course']]} ({row[row['course']]:.0%})"}
+        for row in found
+    ]
+
+
+def _events(found, dated):
+    """Return the changes that are likely, in the order of time."""
+    events = []
+    for row in found:
+        for (before, after), chance in zip(pairwise(dated), row["change"], strict=True):
+            if chance >= LIKELY:
+                days = [_start(e)[:10] for e in (before, after)]
+                words = f"{row['what']} changed between {days[0]} and {days[1]} ({chance:.0%})"
+                one = {"what": str(row["what"]), "before": before.name, "after": after.name}
+                one |= {"from": days[0], "to": days[1], "probability": float(chance)}
+                events.append(one | {"words": words})
+    return sorted(events, key=lambda one: one["to"])
+
+
+def _alarms(content, newest, moment, goal, limit):
+    """Return sentences on what needs care."""
+    found, name = [], content["instrument"] or "the instrument"
+    if newest.validity.valid_from is not None:
+        day = _start(newest)
+        age = (moment - moment_of(day, "date")).to_value(u.day)
+        if age > limit and newest.validity.valid_until is None:
+            found.append(
+                f"The newest calibration is of {day[:10]}, {age:.0f} days old; {name} wants one "
+                f"every {limit:.0f} days."
+            )
+    last = content["calibrations"][-1]
+    if not last["converged"]:
+        found.append(f"{last['name']}: the fit did not converge.")
+    verdict = newest.calibration.verdict()
+    if not verdict.usable:
+        found.append(f"{newest.name} is not usable as it is: {verdict.reasons[0]}.")
+    reached = last["s_cv_percent"] if np.isfinite(last["s_cv_percent"]) else last["s_res_percent"]
+    if goal is not None and not reached <= goal:
+        found.append(f"{last['name']} reaches {reached:.2g} %; the goal is {goal:.2g} %.")
+    fresh = [one["what"] for one in content["events"] if one["after"] == newest.name]
+    if fresh:
+        found.append(
+            f"{listed(fresh)} changed before {newest.name}: frames between the last two "
+            "calibrations have no calibration that is sure."
+        )
+    moving = [
+        one["what"]
+        for one in content["courses"]
+        if one["course"] in ("drift", "walk", "scatter") and one[one["course"]] >= LIKELY
+    ]
+    if moving:
+        verb = "is" if len(moving) == 1 else "are"
+        found.append(f"{listed(moving)} {verb} not constant: errors grow with the age of a file.")
+    return found
+
+
+def _next(content, newest, moment, limit):
+    """Return when to calibrate again, a sentence in a list."""
+    n = len([one for one in content["calibrations"] if one["date"] is not None])
+    if not n:
+        return ["Give the calibrations dates: with_validity(valid_from=) states one."]
+    due = moment_of(_start(newest), "date") + limit * u.day
+    words = "is due" if due < moment else f"is due by {due.isot[:10]}"
+    more = f"; {counted(3 - n, 'more run')} will show what changes" if n < 3 else ""
+    return [f"The next calibration {words}{more}."]
+
+
+def write_health(content, path, *, figures=None):
+    """
+    Write what `health` returns as one self-contained page.
+
+    Parameters
+    ----------
+    content : dict
+        Of `health`.
+    path : path-like
+        The file; an existing one is replaced.
+    figures : sequence of dict of str to str, optional
+        Per group, data URIs of figures by caption.
+
+    Raises
+    ------
+    ParameterError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> from astropolcal.pipeline import write_health
+    >>> write_health({"now": "2027-01-01T00:00:00", "groups": [], "unreadable": {}}, "h.html")
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    from astropolcal.version import version
+
+    environment = Environment(
+        loader=PackageLoader("astropolcal.pipeline", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    figures = figures or [{} for _ in content["groups"]]
+    page = environment.get_template("health.html").render(
+        content=content, groups=list(zip(content["groups"], figures, strict=True)), version=version
+    )
+    with atomic_path(path, error=ParameterError) as temporary:
+        temporary.write_text(printable(page), encoding="utf-8")

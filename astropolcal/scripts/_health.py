@@ -1,0 +1,86 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal health``: how an instrument does, from all its calibrations."""
+
+from astropolcal.scripts._common import give, printer, say_written, wrapped
+from astropolcal.words import counted
+
+HELP = "what changed over all calibrations of an instrument, and what needs care"
+DESCRIPTION = """\
+Read all calibrations of a folder; say for each instrument and mode which optics
+are constant, drift or changed and when, what needs care, and when the next
+calibration is due. --html writes a page with figures that can be sent or served."""
+EXAMPLES = """\
+examples:
+  astropolcal health library/
+  astropolcal health library/ --html health.html --goal 0.2
+  astropolcal health library/ --event 2029-06-10   the mirror was recoated
+"""
+OPTIONS = """
+library DIR Input  folder of calibrations
+--html FILE Output  write a self-contained page
+--goal PERCENT float  accuracy that is wanted, in percent of polarization
+--max-age DAYS float  age from which on a calibration is too old (default: the instrument's)
+--event DATE + ...  something was done to the instrument on this date
+--date DATE  moment for which it is said (default: now)
+@ json quiet
+"""
+
+
+def run(arguments):
+    """Say how the instruments do, and write the page."""
+    import astropy.units as u
+
+    from astropolcal.pipeline import Library, health, write_health
+
+    library = Library(arguments.library)
+    content = health(
+        library,
+        goal=arguments.goal,
+        max_age=None if arguments.max_age is None else arguments.max_age * u.day,
+        events=arguments.event or (),
+        now=arguments.date,
+    )
+    if arguments.html:
+        figures = [_figures(library, group, arguments.goal) for group in content["groups"]]
+        write_health(content, arguments.html, figures=figures)
+    lines = [line for group in content["groups"] for line in _group(group)]
+    lines += [f"UNREADABLE  {name}: {reason}" for name, reason in content["unreadable"].items()]
+    give(arguments, [wrapped(line, indent=4) for line in lines], content)
+    say_written(printer(arguments), [path for path in (arguments.html, arguments.json) if path])
+
+
+def _group(group):
+    """Return what is printed of an instrument and a mode."""
+    name = ", ".join(part for part in (group["instrument"], group["mode"]) if part)
+    dates = [one["date"][:10] for one in group["calibrations"] if one["date"]]
+    span = f", {dates[0]} to {dates[-1]}" if dates else ""
+    lines = [
+        f"{name or 'no instrument'}: {counted(len(group['calibrations']), 'calibration')}{span}"
+    ]
+    lines += [f"  ALARM: {words}" for words in group["alarms"]] or ["  No alarm"]
+    lines += [f"  Changed: {one['words']}" for one in group["events"]]
+    steady = [one["what"] for one in group["courses"] if one["course"] == "constant"]
+    lines += [f"  Constant: {', '.join(steady)}"] if steady else []
+    moved = [one["words"] for one in group["courses"] if one["course"] != "constant"]
+    lines += [f"  Course: {words}" for words in moved]
+    lines += [f"  Left out: {words}" for words in group["left_out"]]
+    return lines + [f"  Next: {words}" for words in group["next"]]
+
+
+def _figures(library, group, goal):
+    """Return the figures of a group by caption, as data URIs."""
+    from astropolcal.exceptions import ParameterError
+    from astropolcal.plotting import plot_history
+    from astropolcal.plotting.parameters import draw_accuracies, embedded
+
+    names = {one["name"] for one in group["calibrations"] if one["date"]}
+    entries = [entry for entry in library.entries if entry.name in names]
+    found = {"Accuracy of each calibration": draw_accuracies(group, goal)} if entries else {}
+    for one in group["courses"] if len(entries) > 1 else ():
+        try:
+            figure = plot_history(entries, [one["what"]], title=one["words"])
+        except ParameterError:
+            # more parameters than a figure holds; the courses are in the table
+            continue
+        found[one["words"]] = figure
+    return {caption: embedded(figure) for caption, figure in found.items()}

@@ -1,0 +1,176 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Courses of optics over the years, and the page on the health of an instrument."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import calibrate, instruments
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.pipeline import Library, changes, courses, health, parameter_history, write_health
+from astropolcal.scripts.main import main
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[::5]
+CHAIN = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)
+FRAMES = half_wave_plate_cycles(derotator=[50, 65, 80, 95] * u.deg)
+N = 8
+
+
+def run(i, change=lambda truth, i: None, **meta):
+    truth = CHAIN.copy()
+    change(truth, i)
+    meta = {"date": f"{2020 + i // 2}-{1 + 6 * (i % 2)}-01", "source": "polarized"} | meta
+    table = simulate(truth, WAVELENGTH, FRAMES, seed=i, flux=3e6, meta=meta, name=f"run {i}")
+    return calibrate(CHAIN, table, instrument="charis", cross_validate=False)
+
+
+def replaced(truth, i):
+    if i >= 5:
+        truth["wollaston"].efficiency = truth["wollaston"].efficiency.value - 0.01
+
+
+def drifting(truth, i):
+    truth["hwp"].theta = 0.1 * i * u.deg
+
+
+def slipping(truth, i):
+    truth["hwp"].theta = [0.5, -0.4, 0.1, 0.6, -0.6, 0.3, -0.2, 0.45][i] * u.deg
+
+
+@pytest.fixture(scope="module")
+def steady():
+    return [run(i) for i in range(N)]
+
+
+@pytest.fixture(scope="module")
+def worn():
+    """A prism that is replaced and a plate that drifts."""
+
+    def change(truth, i):
+        replaced(truth, i)
+        drifting(truth, i)
+
+    return [run(i, change) for i in range(N)]
+
+
+def by_optic(table):
+    return {row["what"]: row for row in table}
+
+
+def test_what_is_constant_is_not_said_to_change(steady):
+    for row in courses(steady):
+        chances = np.array([row[key] for key in ("constant", "steps", "drift", "walk", "scatter")])
+        assert row["course"] == "constant", row
+        assert chances.sum() == pytest.approx(1)
+        assert row["change"].max() < 0.2
+        assert row["change"].shape == (N - 1,)
+
+
+def test_a_step_and_a_drift_are_found_and_dated(worn):
+    found = by_optic(courses(worn))
+    assert found["wollaston"]["course"] == "steps"
+    assert found["wollaston"]["change"].round(2).tolist() == [0, 0, 0, 0, 1, 0, 0]
+    assert found["hwp"]["course"] == "drift"
+    assert found["hwp"]["change"].max() < 0.1
+    assert found["calibration_polarizer"]["course"] == "constant"
+
+
+def test_what_differs_from_run_to_run_is_neither_a_drift_nor_a_single_step():
+    (row,) = courses([run(i, slipping) for i in range(N)], ["hwp.theta"])
+    assert row["constant"] < 1e-6
+    assert row["drift"] < 0.01
+    assert row["scatter"] + row["walk"] > 0.5
+
+
+def test_an_event_makes_a_faint_change_more_probable():
+    def faint(truth, i):
+        truth["hwp"].theta = 0.12 * (i >= 4) * u.deg
+
+    runs = [run(i, faint) for i in range(N)]
+    chance = [courses(runs, ["hwp.theta"], events=e)["change"][0][3] for e in ((), ("2021-10-01",))]
+    assert chance[1] > chance[0]
+
+
+def test_another_turn_of_a_retardance_is_no_change(steady):
+    """A fit may end a turn away: the same retarder."""
+    turned = run(N)
+    angle = turned.chain["derotator"].retardance
+    angle.value = angle.value + 360 * (np.arange(len(WAVELENGTH)) == 1)
+    for leaf in turned.chains:
+        leaf["derotator"].retardance.value = angle.value
+    table = changes([steady[-1], turned], ["derotator"])
+    assert table["sigma"].max() < 5
+    values = parameter_history([steady[-1], turned], ["derotator.retardance"])
+    first, second = (values["value"][values["calibration"] == c] for c in ("run 7", "run 8"))
+    assert np.abs(first - second).max() < 5
+
+
+def test_what_gives_no_course_is_refused(steady):
+    undated = calibrate(
+        CHAIN, simulate(CHAIN, WAVELENGTH, FRAMES, seed=90, name="x"), cross_validate=False
+    )
+    cases = [
+        (ParameterError, steady[:2], {}, "2 calibrations: at least three"),
+        (ParameterError, [*steady[:3], undated], {}, "x has no date"),
+        (ParameterError, [*steady[:3], run(20, date="2020-01-01")], {}, "neither comes first"),
+        (FitError, [*steady[:3], steady[0]], {}, "neither comes first|both made from"),
+        (ParameterError, steady, {"events": ["2020-02-01", "2020-03-01"]}, "another one lies"),
+        (ParameterError, steady, {"events": ["soon"]}, "'soon' is no date"),
+        (ParameterError, steady, {"parameters": ["mirror"]}, "no free parameter 'mirror'"),
+    ]
+    for error, runs, options, message in cases:
+        with pytest.raises((error, ParameterError), match=message) as info:
+            courses(runs, **options)
+        assert "\n" not in str(info.value)
+
+
+@pytest.fixture(scope="module")
+def folder(worn, tmp_path_factory):
+    path = tmp_path_factory.mktemp("library")
+    library = Library(path)
+    for calibration in worn:
+        library.add(calibration)
+    return path
+
+
+def test_health_says_what_needs_care(folder):
+    content = health(folder, now="2030-01-01", goal=1e-6)
+    (group,) = content["groups"]
+    assert json.loads(json.dumps(content)) == content
+    assert [one["what"] for one in group["events"]] == ["wollaston"]
+    assert (group["events"][0]["from"], group["events"][0]["to"]) == ("2022-01-01", "2022-07-01")
+    alarms = " ".join(group["alarms"])
+    assert "of 2023-07-01" in alarms
+    assert "hwp is not constant" in alarms
+    assert "the goal is 1e-06 %" in alarms
+    (fresh,) = health(folder, now="2023-08-01", max_age=4 * u.yr)["groups"]
+    assert not any("days old" in words for words in fresh["alarms"])
+    for options in ({"goal": -1}, {"max_age": 3 * u.m}, {"goal": "high"}):
+        with pytest.raises(ParameterError, match="a positive number"):
+            health(folder, **options)
+
+
+def test_the_command_writes_a_page_and_numbers(folder, tmp_path, capsys):
+    page, numbers = tmp_path / "health.html", tmp_path / "health.json"
+    options = ["--html", str(page), "--json", str(numbers), "--date", "2024-01-01"]
+    assert main(["health", str(folder), *options]) in (0, None)
+    out = capsys.readouterr().out
+    assert "wollaston changed between 2022-01-01 and 2022-07-01" in out
+    assert max(len(line) for line in out.splitlines() if str(tmp_path) not in line) <= 80
+    text = page.read_text()
+    assert text.count("<img") >= 4
+    assert "wollaston changed" in text
+    assert json.loads(numbers.read_text())["groups"][0]["events"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ParameterError, match="no calibration"):
+        health(tmp_path / "empty")
+
+
+def test_a_page_escapes_what_it_shows(tmp_path):
+    content = {"now": "2030-01-01", "groups": [], "unreadable": {"<b>.asdf": "<script>"}}
+    write_health(content, tmp_path / "page.html")
+    assert "<script>" not in (tmp_path / "page.html").read_text()
