@@ -2,7 +2,7 @@
 """
 How far long work is: one line of the terminal with how much is done, and the time left.
 
-The line is written over, and gone at the end. It needs a terminal and someone who wants it: a
+The line is written over, and erased at the end. It needs a terminal, and is asked for: by a
 function with ``progress=True``, or the command line without ``--quiet``, see `shown`.
 """
 

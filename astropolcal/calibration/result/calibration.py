@@ -59,7 +59,7 @@ class DatasetRecord:
 
 
 class ParameterTable(QTable):
-    """A table that prints what a reader wants of every row; the other columns are by name."""
+    """A table that prints value, error, unit and status of every row; the rest is by name."""
 
     def __str__(self):
         shown = [
