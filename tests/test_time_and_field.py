@@ -176,7 +176,7 @@ def test_fluxes_of_every_optic_are_those_of_its_matrices():
         "flux": np.ones((2, 3, n)),
         "total_flux": np.ones((2, 3, n)),
     }
-    for cls, key in ((cls, key) for cls in optics.OPTICS.values() for key in cls.param_names):
+    for cls, key in ((optic, key) for optic in optics.OPTICS.values() for key in optic.param_names):
         chain = example(cls, key)
         placed = {stage: known[stage] for stage in stages(chain)}
         propagator = Propagator(chain, WAVELENGTH.value, placed)

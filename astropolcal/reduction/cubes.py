@@ -345,7 +345,8 @@ def simulate_cubes(
             cube, weight = reading.expose(falling, response, seeds[i])
             # as extraction marks pixels without a value
             cube[bad], weight[bad] = np.nan, 0.0
-            write_cube(*names[i], cube, weight, header_of(frames[i], layout) | more, layout)
+            header = layout.to_header(header_of(frames[i], layout) | more)
+            write_cube(*names[i], cube, weight, header, layout)
     if brightest > how.saturation and not detector.saturate:
         _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
@@ -621,11 +622,16 @@ def write_cube(cube, raw_header, image, weight, header, layout):
             own = in_cube | ({} if camera is None else {camera: number})
             _save(_hdus(own, *(part[side] for part in parts), layout), path)
     if raw_header is not None:
-        _save(fits.HDUList([fits.PrimaryHDU(header=fits.Header(list(header.items())))]), raw_header)
+        _save(fits.HDUList([fits.PrimaryHDU(header=_cards(header))]), raw_header)
+
+
+def _cards(header):
+    # longer names are those of the convention of ESO, of which astropy otherwise warns
+    return fits.Header([(k if len(k) <= 8 else f"HIERARCH {k}", v) for k, v in header.items()])
 
 
 def _hdus(header, image, weight, layout):
-    header, second = fits.Header(list(header.items())), ("IVAR", "adu-2")
+    header, second = _cards(header), ("IVAR", "adu-2")
     if layout.weights == "error":
         with np.errstate(divide="ignore"):
             # where nothing is known the weight is 0, and so is this

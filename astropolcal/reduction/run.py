@@ -26,6 +26,7 @@ from astropolcal.observations.reading import stated_date
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames
+from astropolcal.reduction.sorting import sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -254,26 +255,27 @@ def reduce_run(
         raise ObservationError("no files to reduce")
     # before the work is done: the table would be refused
     stated_date(meta or {}, "reduced")
-    files = instrument.files.frame_files(files)
+    n_files = len(files)
+    files, layout, lost = sort_beams(files, instrument.files)
     task = {
-        "layout": instrument.files,
+        "layout": layout,
         "source": photometry,
-        "raw": None if raw is None else raw_frames(raw, instrument.files),
+        "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
     }
     frames = _measure_all(files, task, workers, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
-        check_stars(frames, instrument.files)
-    reduction = Reduction(instrument, photometry, options=options)
+        check_stars(frames, layout)
+    reduction = Reduction(instrument, photometry, problems=lost, options=options)
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
-    frames = consistent(frames, reduction, instrument.files, hwp_sequence is None)
+    frames = consistent(frames, reduction, layout, hwp_sequence is None)
     if photometry == "internal" and not keep_repeats:
         frames = without_repeats(frames, reduction)
     if not frames:
-        raise ObservationError(_nothing(len(files), reduction.problems) + _hint(task, reduction))
+        raise ObservationError(_nothing(n_files, reduction.problems) + _hint(task, reduction))
     reduction.frames = frames
     for frame in frames:
         if frame.values.get("light") == "uneven":
