@@ -40,6 +40,14 @@ def test_without_network_no_other_documentation_is_asked(settings):
     assert not any("intersphinx_toggle" in name for name in found["extensions"])
 
 
+def test_page_of_changes_has_those_of_the_next_version(settings):
+    settings()
+    page = (DOCS / "generated" / "unreleased.txt").read_text(encoding="utf-8")
+    for path in (DOCS / "changes").glob("*.*.rst"):
+        first = path.read_text(encoding="utf-8").strip().splitlines()[0]
+        assert f"- {first}" in page, path.name
+
+
 def test_with_network_links_are_followed_where_there_are_any(settings):
     """A name of a package without an inventory would be an error of every build otherwise."""
     for variable in ADDRESSES:

@@ -194,7 +194,7 @@ class CHARIS(Instrument):
         known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(_BOUNDS))}
         self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
         grid = self.grid(wavelength)
-        train = subaru.entrance(source, grid, star, target, subaru.tertiary_mirror(m3, grid))
+        train = subaru.entrance(source, grid, star, target, m3)
         # the published retardances, in our sign, are where a fit starts
         nm = CHARIS.wavelength.to_value(u.nm)
         start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg

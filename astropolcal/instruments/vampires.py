@@ -352,7 +352,7 @@ class VAMPIRES(Instrument):
         known |= {"plate": (plate, ("free", "two-layer")), "m3": (m3, subaru.M3_MODELS)}
         self.check_choices(source, optics_in, **known)
         grid = self.grid(wavelength)
-        train = subaru.entrance(source, grid, star, target, _mirror(m3, grid))
+        train = subaru.entrance(source, grid, star, target, m3, _mirror)
         train.append(_half_wave_plate(grid, plate))
         train += [_derotator(grid, derotator), _relay(grid.size)]
         if "flc" in optics_in:

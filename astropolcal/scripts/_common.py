@@ -22,6 +22,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
+from astropolcal.progress import clear
 from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
@@ -372,6 +373,7 @@ def is_quiet(arguments):
 
 def show(text, file=None):
     """Print lines; names of files may hold what a terminal would act on."""
+    clear()
     print(printable(text), file=file, flush=file is not None)
 
 

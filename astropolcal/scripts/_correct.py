@@ -185,7 +185,6 @@ def run(arguments):
         weights="variance" if arguments.weights == "variance" else None,
         any_date=True,
         n_samples=arguments.samples,
-        progress=not arguments.quiet,
         provenance=provenance,
         **{name: getattr(arguments, name) for name in _PASSED_ON},
     )
@@ -406,6 +405,9 @@ def _verdict(summary, systematic):
         )
         for words, key, unit, scale in (("DoLP", "s_p", " %", 100), ("AoLP", "s_chi", " deg", 1))
     )
+    # the unit once: the line is short
+    if not told:
+        degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
     verdict, advice = "Usable", "astropolcal info tells what the product holds"
     if not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"

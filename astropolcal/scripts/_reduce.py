@@ -69,30 +69,23 @@ TYPES = {"pair": _pair, "radius": number_or("fwhm", "growth")}
 
 def run(arguments):
     """Reduce the cubes and write the table."""
-    from tqdm import tqdm
-
     from astropolcal import instruments
     from astropolcal.reduction import reduce_run
 
     check_suffix("-o", arguments.output, ".ecsv")
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument or _recognized(files))
-    with tqdm(
-        total=len(files), desc="reducing", unit="cube", disable=True if arguments.quiet else None
-    ) as bar:
-        reduction = reduce_run(
-            files,
-            instrument,
-            source=arguments.source,
-            raw=arguments.raw,
-            meta=dict(arguments.meta),
-            workers=arguments.workers,
-            resume=arguments.resume,
-            hwp_sequence=arguments.hwp_sequence,
-            # tqdm counts steps, the reduction the total
-            progress=lambda done, _: bar.update(done - bar.n),
-            **_options(arguments),
-        )
+    reduction = reduce_run(
+        files,
+        instrument,
+        source=arguments.source,
+        raw=arguments.raw,
+        meta=dict(arguments.meta),
+        workers=arguments.workers,
+        resume=arguments.resume,
+        hwp_sequence=arguments.hwp_sequence,
+        **_options(arguments),
+    )
     reduction.write(arguments.output, overwrite=True)
     # after the table, which is what the time went into
     figures = []

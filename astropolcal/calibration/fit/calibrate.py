@@ -64,6 +64,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitErro
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs
 from astropolcal.measurement.parameters import ROUNDING, with_own
+from astropolcal.progress import stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
 
@@ -316,6 +317,7 @@ def _run(measurement, weighting, fitter):
 
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
+    stage(f"fitting {measurement.free.size} parameters")
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:
@@ -420,6 +422,7 @@ def _thinned(measurement, weighting):
 
 def _first_search(measurement, weighting, origin):
     """Return the best branches; where no noise is known yet, first without the priors."""
+    stage("looking for where to start")
     problem = BinProblem(measurement, weighting)
     found = search_branches(problem, origin)[0]
     if weighting.is_known or not problem.has_priors:
@@ -512,6 +515,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
+    stage("cross-validation")
     return calibration.cross_validate() if cross_validate else calibration
 
 
