@@ -7,18 +7,22 @@ light travels. Nothing here depends on which optics they are.
 """
 
 import math
+import warnings
 
+import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.mueller import act, turned
-from astropolcal.optics import Optic
-from astropolcal.optics.core import FLUXES, finite_position
+from astropolcal.optics import COORDINATES, Optic
+from astropolcal.optics.core import FLUXES, PLACES, finite_position
+from astropolcal.optics.laws import law_of
 from astropolcal.words import did_you_mean
 
 __all__ = [
     "at_positions",
+    "follow",
     "insert_optic",
     "join",
     "leaves",
@@ -263,6 +267,65 @@ def remove_optic(chain, name):
     return _again(chain, [leaf for leaf in leaves(chain) if leaf is not gone])
 
 
+def follow(chain, name, model, of, *, since=None):
+    """
+    Return a chain in which a parameter follows a model of astropy.
+
+    What the model gives is added to the parameter, in each frame. Its coefficients become
+    parameters of the optic: ``c1`` of a law of ``theta`` is ``theta_c1``. The one that does the
+    same everywhere is held, as the parameter itself is that constant.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain; it is not changed.
+    name : str
+        The parameter, ``"optic.parameter"``.
+    model : `~astropy.modeling.Model`
+        Fittable, of one output, with bounds and fixed flags. Values without units are in the unit
+        of the parameter, and per day, arcsec, micrometre or degree of the inputs.
+    of : str or sequence of str
+        Its inputs: ``"time"`` (days), ``"x"``, ``"y"`` (arcsec in the field), ``"wavelength"``
+        (micrometre), a stage (degree), or one of `~astropolcal.optics.COORDINATES`.
+    since : str, `~astropy.time.Time` or float, optional
+        When time is zero (UTC); a law of time needs it.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+        The law with its present coefficients is ``chain[optic].parameter.law``.
+
+    Raises
+    ------
+    ChainError, ParameterError
+        If there is no such parameter, or the model does not fit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.modeling import models
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import at_positions, follow
+    >>> plate = optics.LinearRetarder(retardance=170 * u.deg, name="plate")
+    >>> chain = follow(plate, "plate.retardance", models.Polynomial1D(1, c1=0.1), "time",
+    ...                since="2026-01-01")
+    >>> chain.retardance_c1.quantity
+    <Quantity 0.1 deg / d>
+    >>> later = at_positions(chain, time="2026-04-11")
+    >>> later.mueller()[2, 2].round(6)
+    np.float64(-1.0)
+    """
+    optic, _, key = name.rpartition(".")
+    old = find_optic(chain, optic)
+    if key not in type(old).param_names:
+        known = ", ".join(type(old).param_names)
+        raise ParameterError(f"no parameter {key!r} of {optic!r}; it has {known}")
+    new = old.copy()
+    law, found = law_of(name, old._declared(key).unit, model, of, since)
+    new._follow(key, law, found.values())
+    return replace_optic(chain, optic, new)
+
+
 def stages(chain):
     """
     Return the names of the stages whose positions the chain needs.
@@ -275,7 +338,8 @@ def stages(chain):
     Returns
     -------
     tuple of str
-        Each name once, without sign, in the order the light meets them.
+        Each name once, without sign, in the order the light meets them; inputs of laws that
+        parameters follow are among them.
 
     Examples
     --------
@@ -284,7 +348,32 @@ def stages(chain):
     >>> stages(optics.LinearRetarder(mount="hwp") | optics.Rotator(mount="-altitude"))
     ('hwp', 'altitude')
     """
-    return tuple(dict.fromkeys(leaf.stage for leaf in leaves(chain) if leaf.stage))
+    found = {}
+    for leaf in leaves(chain):
+        found |= {leaf.stage: None} if leaf.stage else {}
+        found |= dict.fromkeys(name for law in leaf._follows.values() for name in law.of)
+    return tuple(name for name in found if name != "wavelength")
+
+
+def standing(chain):
+    """Return where each number of a frame stands in a view of a chain: zero, or as calibrated."""
+    found = {stage: 0.0 * u.one for stage in stages(chain) if stage in COORDINATES}
+    for law in (law for leaf in leaves(chain) for law in leaf._follows.values()):
+        found |= {name: law.middle(name) * PLACES[name] for name in law.of if name in PLACES}
+    return found
+
+
+def warn_beyond(chain, positions):
+    """Warn of laws that are asked for beyond the frames that they were calibrated with."""
+    for leaf in leaves(chain):
+        for key, law in leaf._follows.items():
+            words = law.beyond(positions)
+            if words:
+                warnings.warn(
+                    f"the law of {leaf.name}.{key} is extrapolated: {words}",
+                    AstropolcalWarning,
+                    stacklevel=3,
+                )
 
 
 def states_of(chain):
@@ -378,6 +467,9 @@ def at_positions(chain, **positions):
     for leaf in leaves(copy):
         if leaf.stage in positions:
             leaf.position = positions[leaf.stage]
+        inputs = {name for law in leaf._follows.values() for name in law.of} & set(positions)
+        places = {name: finite_position(positions[name], name) for name in inputs}
+        leaf._places = leaf._places | places
     return copy
 
 
@@ -396,8 +488,20 @@ def _stage_position(leaf, positions):
 def _oriented_leaves(chain, wavelength, positions):
     """Yield each leaf with what its matrix needs: dispersion, angle, values."""
     for leaf in leaves(chain):
-        dispersion, angle, values = leaf._resolve(wavelength, None)
+        check_inputs(leaf, positions)
+        dispersion, angle, values = leaf._resolve(wavelength, None, places=positions)
         yield leaf, *leaf._moved(dispersion, angle, _stage_position(leaf, positions)), values
+
+
+def check_inputs(leaf, positions):
+    """Refuse positions without what the laws of an optic depend on."""
+    for key, law in leaf._follows.items():
+        for name in law.of:
+            if name not in positions and name != "wavelength":
+                raise ChainError(
+                    f"{leaf.name or type(leaf).__name__}.{key} follows a law of {name!r}, but "
+                    f"positions has only {sorted(positions)}"
+                )
 
 
 def system_mueller(chain, wavelength=None, positions=None):
@@ -519,7 +623,8 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
     ):
         if not leaf.name:
             raise ChainError(f"{type(leaf).__name__} needs a name before its parameters have one")
-        for key, slope in zip(leaf.param_names, leaf._oriented_derivatives(*rest), strict=True):
+        slopes = leaf._oriented_derivatives(*rest, leaf._rates_at(wavelength, positions))
+        for key, slope in zip(leaf.param_names, slopes, strict=True):
             value = np.broadcast_to(after @ slope @ upstream, (*shape, 4, 4)).copy()
             result[f"{leaf.name}.{key}"] = leaf._per_unit(key, value)
         after = after @ matrix

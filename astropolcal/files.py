@@ -380,7 +380,9 @@ def check_yaml(text, error=AstropolcalError):
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, size = levels.pop()
         elif isinstance(event, yaml.ScalarEvent):
-            if _merges(event):
+            # a merge key, by its look or its tag
+            plain_merge = event.value == "<<" and event.implicit[0]
+            if plain_merge or (event.tag or "").endswith(":merge"):
                 raise error("YAML merge keys ('<<') are not allowed")
             size = 1
         else:
@@ -391,8 +393,3 @@ def check_yaml(text, error=AstropolcalError):
         # size counts what aliases stand for, written what is in the file
         if levels[-1][1] > _FREE_NODES + _MOST_REPEATS * written:
             raise error("its YAML repeats itself so often that it cannot be loaded")
-
-
-def _merges(event):
-    """Return whether a scalar is a merge key, by its look or its tag."""
-    return (event.value == "<<" and event.implicit[0]) or (event.tag or "").endswith(":merge")

@@ -7,8 +7,10 @@ Each material knows the wavelengths at which it was measured
 (``valid_range``), and refuses any other.
 """
 
+import tomllib
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -49,11 +51,6 @@ class SellmeierLaw:
             self.constant
             + sum(strength * square / (square - pole) for strength, pole in self.terms)
         ) ** 0.5
-
-
-def _sellmeier(*terms):
-    """Return a law of strengths and resonances (um)."""
-    return SellmeierLaw(tuple((strength, resonance**2) for strength, resonance in terms))
 
 
 def _range_um(limits, name):
@@ -303,12 +300,12 @@ class BrendelBormannLaw:
     drude: tuple
     resonances: tuple = ()
 
-    def _permittivity_um(self, wavelength_um):
-        """Return the complex permittivity at wavelengths in micrometre, unchecked."""
+    def _index_um(self, wavelength_um):
+        """Return n + ik at wavelengths in micrometre, unchecked."""
         omega = _EV_UM / np.asarray(wavelength_um, dtype=float)
         strength, width = self.drude
         total = 1.0 - strength * self.plasma**2 / (omega * (omega + 1j * width))
-        return total + sum(self._resonance(omega, *terms) for terms in self.resonances)
+        return np.sqrt(total + sum(self._resonance(omega, *terms) for terms in self.resonances))
 
     def _resonance(self, omega, strength, width, centre, spread):
         # pipelines that load a calibration need no scipy, unless a metal is in it
@@ -318,10 +315,6 @@ class BrendelBormannLaw:
         scale = np.sqrt(2) * spread
         shape = wofz((a - centre) / scale) + wofz((a + centre) / scale)
         return 0.5j * np.sqrt(np.pi) * strength * self.plasma**2 / (a * scale) * shape
-
-    def _index_um(self, wavelength_um):
-        """Return n + ik at wavelengths in micrometre, unchecked."""
-        return np.sqrt(self._permittivity_um(wavelength_um))
 
 
 class TabulatedLaw:
@@ -374,142 +367,26 @@ class TabulatedLaw:
         return np.interp(wavelength_um, self._wavelength, self._index)
 
 
-_RAKIC = "10.1364/AO.37.005271"
-
-#: Silver; Rakić et al. 1998, Brendel-Bormann parameters, 0.1 to 5 eV.
-#:
-#: Films differ: at 1.6 um, n is 0.43 here, 0.27 in Yang et al. (2015,
-#: doi:10.1103/PhysRevB.91.235137) and 0.15 in Johnson & Christy (1972,
-#: doi:10.1103/PhysRevB.6.4370); k is 10.4, 11.3 and 11.8.
-SILVER = IsotropicMaterial(
-    "silver",
-    BrendelBormannLaw(
-        plasma=9.01,
-        drude=(0.821, 0.049),
-        resonances=(
-            (0.050, 0.189, 2.025, 1.894),
-            (0.133, 0.067, 5.185, 0.665),
-            (0.051, 0.019, 4.343, 0.189),
-            (0.467, 0.117, 9.809, 1.170),
-            (4.000, 0.052, 18.56, 0.516),
-        ),
-    ),
-    measured_range=[0.248, 12.398] * u.um,
-    doi=_RAKIC,
-    aliases=("ag",),
-)
-
-#: Gold; Rakić et al. 1998, Brendel-Bormann parameters, 0.2 to 5 eV.
-#:
-#: Films differ: at 1.6 um, n is 0.61 here and 0.34 in Olmon et al. (2012,
-#: evaporated, doi:10.1103/PhysRevB.86.235147); k is 10.2 and 11.0.
-GOLD = IsotropicMaterial(
-    "gold",
-    BrendelBormannLaw(
-        plasma=9.03,
-        drude=(0.770, 0.050),
-        resonances=(
-            (0.054, 0.074, 0.218, 0.742),
-            (0.050, 0.035, 2.885, 0.349),
-            (0.312, 0.083, 4.069, 0.830),
-            (0.719, 0.125, 6.137, 1.246),
-            (1.648, 0.179, 27.97, 1.795),
-        ),
-    ),
-    measured_range=[0.248, 6.199] * u.um,
-    doi=_RAKIC,
-    aliases=("au",),
-)
-
-#: Aluminium; Rakić et al. 1998, Brendel-Bormann parameters, 0.005 to 20 eV.
-ALUMINIUM = IsotropicMaterial(
-    "aluminium",
-    BrendelBormannLaw(
-        plasma=14.98,
-        drude=(0.526, 0.047),
-        resonances=(
-            (0.213, 0.312, 0.163, 0.013),
-            (0.060, 0.315, 1.561, 0.042),
-            (0.182, 1.587, 1.827, 0.256),
-            (0.014, 2.145, 4.495, 1.735),
-        ),
-    ),
-    measured_range=[0.062, 247.97] * u.um,
-    doi=_RAKIC,
-    aliases=("al", "aluminum"),
-)
+def _built_in(name, entry):
+    """Return a material of the table that comes with the package."""
+    ranges = {key: value * u.um for key, value in entry.items() if key.endswith("_range")}
+    known = {"doi": entry["doi"], "aliases": entry["aliases"]} | ranges
+    if "metal" in entry:
+        plasma, drude, resonances = (entry["metal"][k] for k in ("plasma", "drude", "resonances"))
+        law = BrendelBormannLaw(plasma, tuple(drude), tuple(map(tuple, resonances)))
+        return IsotropicMaterial(name, law, **known)
+    laws = []
+    for law in entry["sellmeier"]:
+        terms = law.get("terms") or [(strength, root**2) for strength, root in law["roots"]]
+        laws.append(SellmeierLaw(tuple(map(tuple, terms)), law.get("constant", 1.0)))
+    return (UniaxialMaterial if len(laws) > 1 else IsotropicMaterial)(name, *laws, **known)
 
 
-#: Crystalline quartz (alpha SiO2; not fused silica), at room temperature.
-#:
-#: Ghosh 1999, Opt. Commun. 163, 95, doi:10.1016/S0030-4018(99)00091-7, from
-#: data between 0.198 and 2.0531 um. The law is evaluated up to 2.5 um, because
-#: K-band half-wave plates need it there and its form, whose lattice pole lies
-#: at 10 um, stays smooth. The price: against the independent law of
-#: Radhakrishnan (1951, Proc. Indian Acad. Sci.; 0.18 to 3 um, coefficients as
-#: listed by refractiveindex.info) its birefringence is low by 0.8 % at 1.6 um,
-#: 1.2 % at 2.05 um, 1.8 % at 2.4 um and 2.1 % at 2.5 um; from 0.25 to 1.2 um
-#: the two differ by less than 0.5 %.
-QUARTZ = UniaxialMaterial(
-    "quartz",
-    SellmeierLaw(constant=1.28604141, terms=((1.07044083, 1.00585997e-2), (1.10202242, 100.0))),
-    SellmeierLaw(constant=1.28851804, terms=((1.09509924, 1.02101864e-2), (1.15662475, 100.0))),
-    measured_range=[0.198, 2.0531] * u.um,
-    valid_range=[0.198, 2.5] * u.um,
-    doi="10.1016/S0030-4018(99)00091-7",
-    aliases=("sio2", "crystalline quartz", "crystal quartz"),
-)
-
-#: Magnesium fluoride at 19 deg C.
-#:
-#: Dodge 1984, Appl. Opt. 23, 1980, doi:10.1364/AO.23.001980.
-MGF2 = UniaxialMaterial(
-    "MgF2",
-    _sellmeier((0.48755108, 0.04338408), (0.39875031, 0.09461442), (2.3120353, 23.793604)),
-    _sellmeier((0.41344023, 0.03684262), (0.50497499, 0.09076162), (2.4904862, 23.771995)),
-    measured_range=[0.2, 7.04] * u.um,
-    doi="10.1364/AO.23.001980",
-    aliases=("magnesium fluoride",),
-)
-
-#: Fused silica (amorphous SiO2) at 20 deg C.
-#:
-#: Malitson 1965, J. Opt. Soc. Am. 55, 1205, doi:10.1364/JOSA.55.001205.
-FUSED_SILICA = IsotropicMaterial(
-    "fused silica",
-    _sellmeier((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161)),
-    measured_range=[0.21, 3.71] * u.um,
-    doi="10.1364/JOSA.55.001205",
-    aliases=("silica", "silica glass", "vitreous silica"),
-)
-
-#: Aluminium oxide; the ordinary index of synthetic sapphire at 24 deg C.
-#:
-#: Malitson 1962, J. Opt. Soc. Am. 52, 1377, doi:10.1364/JOSA.52.001377.
-#: Evaporated films are less dense: their index is 1.6 to 1.7 in the near
-#: infrared, that of the crystal 1.75.
-AL2O3 = IsotropicMaterial(
-    "Al2O3",
-    _sellmeier((1.023798, 0.06144821), (1.058264, 0.1106997), (5.280792, 17.92656)),
-    measured_range=[0.2652, 5.577] * u.um,
-    doi="10.1364/JOSA.52.001377",
-    aliases=("alumina", "sapphire", "aluminium oxide", "aluminum oxide"),
-)
-
-#: Silicon nitride, a film.
-#:
-#: Luke et al. 2015, Opt. Lett. 40, 4823, doi:10.1364/OL.40.004823.
-SI3N4 = IsotropicMaterial(
-    "Si3N4",
-    _sellmeier((3.0249, 0.1353406), (40314.0, 1239.842)),
-    measured_range=[0.310, 5.504] * u.um,
-    doi="10.1364/OL.40.004823",
-    aliases=("silicon nitride",),
-)
-
-_BUILT_IN = (QUARTZ, MGF2, SILVER, GOLD, ALUMINIUM, FUSED_SILICA, AL2O3, SI3N4)
-_MATERIALS = {material.name: material for material in _BUILT_IN}
-_BY_NAME = {name.lower(): m for m in _BUILT_IN for name in (m.name, *m.aliases)}
+_DATA = Path(__file__).parent / "data" / "materials.toml"
+_MATERIALS = {k: _built_in(k, v) for k, v in tomllib.loads(_DATA.read_text("utf-8")).items()}
+_BY_NAME = {name.lower(): m for m in _MATERIALS.values() for name in (m.name, *m.aliases)}
+QUARTZ, MGF2, SILVER, GOLD = (_MATERIALS[n] for n in ("quartz", "MgF2", "silver", "gold"))
+FUSED_SILICA = _MATERIALS["fused silica"]
 
 
 def material_names():

@@ -536,7 +536,7 @@ def phase_of(stage, theta):
     """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
     if np.ndim(theta):
         # one value per wavelength goes along the first axis, positions along the second
-        turn = np.exp(-2j * theta)[:, None]
+        turn = np.exp(-2j * (theta[:, None] if theta.ndim == 1 else theta))
     elif theta:
         turn = cmath.exp(-2j * theta)
     else:

@@ -18,7 +18,7 @@ where it changes from frame to frame.
 
 import numpy as np
 
-from astropolcal.chain import leaves
+from astropolcal.chain import check_inputs, leaves
 from astropolcal.exceptions import ChainError
 from astropolcal.mueller import act, act_back, inverse, phase_of, plane, turned
 from astropolcal.optics import FrameOptic
@@ -29,18 +29,47 @@ __all__ = []
 class _Node:
     """An optic of the chain, with what does not change in a fit."""
 
-    __slots__ = ("dispersion", "index", "leaf", "per_frame", "phase", "stage_angle")
+    __slots__ = (
+        "dispersion",
+        "follows",
+        "index",
+        "leaf",
+        "per_frame",
+        "phase",
+        "places",
+        "stage_angle",
+        "varies",
+    )
 
-    def __init__(self, index, leaf, wavelength, positions):
-        self.index = index
-        self.leaf = leaf
-        self.per_frame = isinstance(leaf, FrameOptic)
+    def __init__(self, index, leaf, wavelength, positions, follows):
+        self.index, self.leaf, self.phase = index, leaf, None
+        # whether some optic follows a law: the values of all have an axis for the frames then
+        self.follows = follows
+        inputs = {name for law in leaf._follows.values() for name in law.of} & set(positions)
+        self.places = wavelength[:, None], {name: np.atleast_2d(positions[name]) for name in inputs}
+        by_law = bool(set(leaf._follows) - {"theta"})
+        self.per_frame = isinstance(leaf, FrameOptic) or by_law
+        self.varies = self.per_frame or bool(leaf._follows)
         shift = leaf.stage_sign * _of_beam(leaf, positions) if leaf.stage else 0.0
-        if self.per_frame:
+        if isinstance(leaf, FrameOptic):
             self.dispersion, self.stage_angle = leaf._moved(0.0, 0.0, np.atleast_2d(shift))
         else:
-            self.dispersion, self.stage_angle = leaf._dispersion(wavelength), shift
-        self.phase = None
+            self.dispersion = leaf._dispersion(wavelength[:, None] if by_law else wavelength)
+            self.stage_angle = shift
+
+    def followed(self, values):
+        """Return theta and the other values, with what laws add in each frame."""
+        if not self.follows:
+            return values
+        found = self.leaf._followed(*self.places, _lifted(values))
+        return found if self.per_frame else [found[0], *values[1 : len(found)]]
+
+    def rates(self, values):
+        """Return of each coefficient of a law which parameter it moves, and by how much."""
+        found = self.leaf._rates(*self.places, _lifted(values))
+        first = len(values) - len(found)
+        moved = enumerate(found, start=first)
+        return {(self.index, j): ((self.index, i), rate) for j, (i, rate) in moved}
 
     def follow(self, frame):
         """
@@ -68,10 +97,15 @@ class _Node:
 
     def _along(self, values):
         """Put values given per wavelength along the first of the frames' two axes."""
-        return [v[:, None] if np.ndim(v) else v for v in values] if self.per_frame else values
+        return _lifted(values) if self.per_frame else values
 
     def _shaped(self, matrix):
         return matrix if self.per_frame or matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
+
+
+def _lifted(values):
+    """Put values given per wavelength along the first of two axes."""
+    return [v[:, None] if np.ndim(v) == 1 else v for v in values]
 
 
 def _for_beam(leaf, beam):
@@ -121,11 +155,11 @@ class Propagator:
         acting = [i for i, leaf in enumerate(self.leaves) if not leaf.rotates_frame]
         split = next((i for i in acting if self.leaves[i].depends_on_beam), max(acting, default=-1))
         beams = ("right", "left") if splits(self.leaves) else ("right",)
-        make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
-        self._common = make[:split]
+        known = wavelength, positions, any(leaf._follows for leaf in self.leaves)
+        self._common = [_Node(i, leaf, *known) for i, leaf in enumerate(self.leaves[:split])]
         self._arms = [
             [
-                _Node(i, _for_beam(leaf, beam), wavelength, positions)
+                _Node(i, _for_beam(leaf, beam), *known)
                 for i, leaf in enumerate(self.leaves[split:], start=split)
             ]
             for beam in beams
@@ -186,6 +220,7 @@ def _check(found, positions, n_wavelengths):
         raise ChainError("the chain has no optic that polarizes or splits the light")
     for leaf in found:
         label = f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}"
+        check_inputs(leaf, positions)
         if leaf.stage and leaf.stage not in positions:
             raise ChainError(f"{label}; the observations give positions of {sorted(positions)}")
         shape = np.shape(positions[leaf.stage]) if leaf.stage else ()
@@ -213,12 +248,12 @@ def _meeting(common, arms):
     It is the splitter where one upstream of it moves against it, and None where one downstream of
     does.
     """
-    if any(node.per_frame or node.moves for arm in arms for node in arm[1:]) or any(
-        arm[0].per_frame for arm in arms
+    if any(node.varies or node.moves for arm in arms for node in arm[1:]) or any(
+        arm[0].varies for arm in arms
     ):
         return None
     place, moves = len(common), arms[0][0].moves
-    while place and not moves and not common[place - 1].per_frame:
+    while place and not moves and not common[place - 1].varies:
         place -= 1
         moves = common[place].moves
     return place
@@ -228,7 +263,7 @@ class Sweep:
     """A forward sweep: the fluxes of both beams, ready to be differentiated."""
 
     def __init__(self, propagator, values):
-        self._propagator = propagator
+        self._propagator, self._values = propagator, values
         self._common, frame = _at(propagator._common, values, 0.0)
         self._arms = [_at(arm, values, frame)[0] for arm in propagator._arms]
         light, fresh = _behind(self._common, propagator.source)
@@ -265,10 +300,10 @@ class Sweep:
         returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns).
         A dictionary ``crossings`` receives what the method of that name returns.
         """
-        result = {}
-        by_optic = {}
-        for optic, parameter in wanted:
-            by_optic.setdefault(optic, []).append(parameter)
+        result, by_optic, rates = {}, {}, self._rates()
+        for key in wanted:
+            optic, parameter = rates[key][0] if key in rates else key
+            by_optic.setdefault(optic, {})[parameter] = None
         adjoint, behind = 0.0, []
         # a dark beam has no arm
         alone = crossings if len(self._arms) == 1 else None
@@ -278,8 +313,17 @@ class Sweep:
             inward, pairs = _back(steps, row, [], by_optic, result, alone)
             adjoint, behind = adjoint + inward, behind + pairs
         _back(self._common, adjoint, behind, by_optic, result, crossings)
+        # of a coefficient: what its parameter does in each frame, times how it moves that
+        result |= {key: result[to] * rate for key, (to, rate) in rates.items() if to in result}
         shape = self._propagator.shape
         return {key: np.broadcast_to(value, shape) for key, value in result.items()}
+
+    def _rates(self):
+        found = {}
+        for step in (*self._common, *self._arms[0]):
+            if step.node.leaf._follows:
+                found |= step.node.rates(self._values[step.node.index])
+        return found
 
 
 def _follow(nodes, frame):
@@ -297,7 +341,7 @@ def _at(nodes, values, frame):
     """
     steps = []
     for node in nodes:
-        theta, *own = values[node.index]
+        theta, *own = node.followed(values[node.index])
         if node.leaf.rotates_frame:
             frame = frame - theta
             steps.append(_Step(node, own))

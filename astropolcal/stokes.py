@@ -97,27 +97,10 @@ def aolp_error(q, u, sigma_q, sigma_u, covariance=0.0):
     return np.rad2deg(across / (2 * np.hypot(number(q, "q"), number(u, "u")))) * _DEGREE
 
 
-def _asymptotic(dolp, sigma):
-    """Return the estimate of Wardle and Kronberg."""
-    # two roots, because the squares of tiny values underflow
-    return np.minimum(dolp, np.sqrt(np.maximum(dolp - sigma, 0)) * np.sqrt(dolp + sigma))
-
-
-def _modified_asymptotic(dolp, sigma):
-    """Return the estimate of Plaszczynski et al. with b = sigma."""
-    from scipy.special import exprel
-
-    # exprel(-x) = (1 - exp(-x)) / x, which holds at any signal-to-noise ratio
-    return dolp * (1 - exprel(-(_signal_to_noise(dolp, sigma) ** 2)) / 2)
-
-
 def _signal_to_noise(dolp, sigma):
     """Return dolp / sigma, but at most 1e100, also where there is no noise."""
     quiet = sigma <= 1e-100 * dolp
     return np.where(quiet, 1e100, dolp / np.where(quiet, 1.0, sigma))
-
-
-_DEBIAS = {"mas": _modified_asymptotic, "wardle-kronberg": _asymptotic}
 
 
 def debias_dolp(dolp, sigma, method="mas"):
@@ -157,26 +140,17 @@ def debias_dolp(dolp, sigma, method="mas"):
     >>> float(debias_dolp(0.05, 0.03).round(4))
     0.0416
     """
-    if method not in _DEBIAS:
-        raise ParameterError(f"method = {method!r} must be one of {sorted(_DEBIAS)}")
-    return _DEBIAS[method](
-        *np.broadcast_arrays(checked_error(dolp, "dolp"), checked_error(sigma, "sigma"))
-    )
+    from scipy.special import exprel
 
-
-def _wedge_probability(half_angle, snr):
-    """
-    Return the probability that (q, u) falls within a wedge about its mean.
-
-    The wedge starts at the origin, the mean lies ``snr`` standard deviations
-    away on its axis. The integral of the angular density of Naghizadeh-Khouei
-    and Clarke over the wedge is Owen's T function of its edge.
-    """
-    distance = snr * np.sin(half_angle)
-    slope = np.cos(half_angle) / np.sin(half_angle)
-    from scipy.special import ndtr, owens_t
-
-    return 1 - 2 * owens_t(distance, slope) - ndtr(-distance)
+    if method not in ("mas", "wardle-kronberg"):
+        raise ParameterError(f"method = {method!r} must be one of ['mas', 'wardle-kronberg']")
+    dolp, sigma = np.broadcast_arrays(checked_error(dolp, "dolp"), checked_error(sigma, "sigma"))
+    if method == "wardle-kronberg":
+        # two roots, because the squares of tiny values underflow
+        return np.minimum(dolp, np.sqrt(np.maximum(dolp - sigma, 0)) * np.sqrt(dolp + sigma))
+    # Plaszczynski et al. with b = sigma; exprel(-x) = (1 - exp(-x)) / x, which holds at any
+    # signal-to-noise ratio
+    return dolp * (1 - exprel(-(_signal_to_noise(dolp, sigma) ** 2)) / 2)
 
 
 def aolp_interval(dolp, sigma, probability=0.6827):
@@ -230,13 +204,16 @@ def aolp_interval(dolp, sigma, probability=0.6827):
 
 def _bisect_half_angle(snr, probability):
     """Return the half-angle of the wedge that holds the probability."""
+    from scipy.special import ndtr, owens_t
+
     low = np.zeros(snr.shape)
     # forty standard deviations hold any probability below one in floats
     high = np.minimum(np.pi, 40.0 / np.maximum(snr, 1.0))
     # 60 halvings of at most pi reach the last bit of a float
     for _ in range(60):
         middle = (low + high) / 2
-        inside = _wedge_probability(middle, snr) > probability
+        distance, slope = snr * np.sin(middle), np.cos(middle) / np.sin(middle)
+        inside = 1 - 2 * owens_t(distance, slope) - ndtr(-distance) > probability
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
     return (low + high) / 2
 

@@ -144,7 +144,8 @@ class _Stack:
         last), and to the thicknesses (a list). It is holomorphic in the indices.
         """
         rows = self._rows()
-        to_alpha = self._ambient_slope()
+        upper = self.fields[0][0] * (1 - self.tangential) / self.total
+        to_alpha = _chain(self.ambient.to_alpha(), 0.0, upper)
         indices, thicknesses = [], []
         for film, row, fields in zip(self.films, rows, self.fields[1:], strict=False):
             to_admittance, to_echo = film.slopes(row, fields)
@@ -173,10 +174,6 @@ class _Stack:
         for film in self.films:
             rows.append(film.back(*rows[-1]))
         return rows
-
-    def _ambient_slope(self):
-        upper = self.fields[0][0]
-        return _chain(self.ambient.to_alpha(), 0.0, upper * (1 - self.tangential) / self.total)
 
     def _of_log(self, slope):
         # d ln(r_p / r_s); the sign of r_p cancels
@@ -317,7 +314,10 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
     lam = length_to_um(wavelength)
     if not np.all(lam > 0):
         raise ParameterError(f"wavelength = {wavelength} must be positive")
-    indices = [_ambient(ambient)]
+    entrance = _plain_index(ambient)
+    if not np.all((entrance.imag == 0) & (entrance.real > 0)):
+        raise ParameterError(f"ambient = {ambient}; allowed are real, positive indices")
+    indices = [entrance]
     indices += [_index(material, lam) for material in (*(m for m, _ in films), substrate)]
     stack = _checked_stack(lam, incidence, indices, [_thickness(d) for _, d in films])
     r_s, r_p = stack.amplitudes
@@ -353,13 +353,6 @@ def _plain_index(value):
         raise ParameterError(f"{value!r} is neither a material nor an index") from None
     if not np.all(np.isfinite(index) & (index.real >= 0) & (index.imag >= 0) & (index != 0)):
         raise ParameterError(f"index = {value}; allowed are n + ik with n and k not negative")
-    return index
-
-
-def _ambient(value):
-    index = _plain_index(value)
-    if not np.all((index.imag == 0) & (index.real > 0)):
-        raise ParameterError(f"ambient = {value}; allowed are real, positive indices")
     return index
 
 

@@ -33,6 +33,7 @@ _ISO = re.compile(r"(19|[2-9]\d)\d\d-\d\d-\d\d(T([01]\d|2[0-3]):[0-5]\d:[0-5]\d\
 _COMPACT_DATE = re.compile(r"((?:19|20)\d\d)(\d\d)(\d\d)", re.ASCII)
 # 1968 to 2132: no five digits mean anything else in a date
 _MJD = re.compile(r"[4-9]\d{4}(\.\d*)?", re.ASCII)
+_MJDS = (40000, 100000)
 
 
 def canonical_unit(unit):
@@ -49,14 +50,21 @@ def canonical_unit(unit):
 
 
 def canonical_factor(unit):
-    """Return the number by which a value in a unit, or without one (None), becomes canonical."""
+    """
+    Return the number by which a value in a unit, or without one (None), becomes canonical.
+
+    What is neither angle, length nor dimensionless, such as a rate in deg / day, stays as it is.
+    """
     return 1.0 if unit is None else _factor(u.Unit(unit))
 
 
 @lru_cache
 def _factor(unit):
     # there are a handful of units, and 600 fits ask 600,000 times
-    return float(unit.to(canonical_unit(unit)))
+    try:
+        return float(unit.to(canonical_unit(unit)))
+    except ParameterError:
+        return 1.0
 
 
 def to_unit(value, unit, name="value"):
@@ -100,6 +108,31 @@ def length_to_um(value, name="wavelength"):
     return to_unit(value, u.um, name)
 
 
+def mjd_of(value, name="time"):
+    """
+    Return moments as Modified Julian Dates, UTC.
+
+    Taken are `~astropy.time.Time` of any scale, texts of dates, and numbers in days or without a
+    unit that lie where such dates do.
+    """
+    if isinstance(value, str | Time):
+        with warnings.catch_warnings():
+            # leap seconds of years to come are not known, and do not matter here
+            warnings.simplefilter("ignore", ErfaWarning)
+            value = Time(iso_date(value, name)) if isinstance(value, str) else value
+            found = np.asarray(value.utc.mjd)
+    else:
+        found = to_unit(value, u.day if getattr(value, "unit", None) else None, name)
+    strange = ~((found > _MJDS[0]) & (found < _MJDS[1]))
+    if strange.any():
+        worst = np.ravel(found)[np.argmax(strange)]
+        raise ParameterError(
+            f"{name} = {worst:g} is not a Modified Julian Date; allowed are {_MJDS[0]} to "
+            f"{_MJDS[1]}, and Time of astropy"
+        )
+    return found
+
+
 def plain_number(value, kind=float):
     """
     Return a number, or the one that a text writes in ASCII digits without separators.
@@ -108,13 +141,10 @@ def plain_number(value, kind=float):
     What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
     TypeError.
     """
-    if isinstance(value, str) and _doubtful(value):
+    text = value if isinstance(value, str) else ""
+    if "_" in text or any(c.isdecimal() and not c.isascii() for c in text):
         raise ValueError(f"{value!r} is not written as a plain number")
     return kind(value)
-
-
-def _doubtful(text):
-    return "_" in text or any(c.isdecimal() and not c.isascii() for c in text)
 
 
 def iso_date(value, name="date", error=ParameterError, *, months=False):

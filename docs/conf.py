@@ -8,6 +8,7 @@ packages are resolved only where ``READTHEDOCS`` or ``ASTROPOLCAL_DOCS_ONLINE`` 
 
 import os
 import sys
+import tomllib
 from datetime import UTC, datetime
 from importlib.metadata import distribution
 from pathlib import Path
@@ -56,6 +57,25 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "inspect_global_variables": False,
 }
+
+
+def _unreleased():
+    """Return the fragments of the next version, as towncrier will put them together."""
+    folder = Path(__file__).parent / "changes"
+    settings = tomllib.loads((folder.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    lines = ["In development", "--------------", ""]
+    for kind in settings["tool"]["towncrier"]["type"]:
+        files = sorted(folder.glob(f"*.{kind['directory']}.rst"))
+        lines += [kind["name"], "^" * len(kind["name"]), ""] if files else []
+        for path in files:
+            text = path.read_text(encoding="utf-8").strip().replace("\n", "\n  ")
+            lines += [f"- {text}", ""]
+    return "\n".join(lines) if len(lines) > 3 else ""
+
+
+_generated = Path(__file__).parent / "generated"
+_generated.mkdir(exist_ok=True)
+(_generated / "unreleased.txt").write_text(_unreleased(), encoding="utf-8")
 
 # -- Links to other packages ------------------------------------------------------
 
@@ -115,10 +135,28 @@ html_static_path = [
         distribution("sphinx-mathjax-offline").locate_file(
             f"sphinx-mathjax-offline/static/mathjax/{mathjax_path}"
         )
-    )
+    ),
+    "_static",
 ]
-# the theme would load a counter of visitors from the network on every page
-html_theme_options = {"goatcounter_analytics_url": ""}
+html_css_files = ["pages.css"]
+html_logo = html_favicon = "_static/logo.svg"
+# the header has the logo
+html_sidebars = {"**": ["components/sst-sidebar-nav.html"]}
+html_theme_options = {
+    "logo": {"text": "astropolcal", "alt_text": "Logo of astropolcal"},
+    "navbar_start": "components/navbar-logo.html",
+    "navbar_links": [
+        ["First calibration", "first_calibration"],
+        ["Tutorials", "generated/tutorials/index"],
+        ["Optics", "generated/models/optics"],
+        ["Questions", "faq"],
+        ["Reference", "api"],
+    ],
+    "footer_links": [],
+    # the theme would search other packages, and load a counter of visitors from the network
+    "rtd_search": False,
+    "goatcounter_analytics_url": "",
+}
 # one picture of each plot; the default makes three
 plot_formats = [("png", 110)]
 plot_html_show_formats = False

@@ -40,6 +40,14 @@ def test_without_network_no_other_documentation_is_asked(settings):
     assert not any("intersphinx_toggle" in name for name in found["extensions"])
 
 
+def test_page_of_changes_has_those_of_the_next_version(settings):
+    settings()
+    page = (DOCS / "generated" / "unreleased.txt").read_text(encoding="utf-8")
+    for path in (DOCS / "changes").glob("*.*.rst"):
+        first = path.read_text(encoding="utf-8").strip().splitlines()[0]
+        assert f"- {first}" in page, path.name
+
+
 def test_with_network_links_are_followed_where_there_are_any(settings):
     """A name of a package without an inventory would be an error of every build otherwise."""
     for variable in ADDRESSES:
@@ -74,7 +82,7 @@ def test_nothing_is_loaded_from_the_network(settings):
     found = settings()
     assert found["html_theme_options"]["goatcounter_analytics_url"] == ""
     assert "://" not in found["mathjax_path"]
-    (script,) = found["html_static_path"]
+    script = found["html_static_path"][0]
     assert Path(script).name == found["mathjax_path"]
     assert Path(script).is_file()
 
@@ -87,6 +95,7 @@ def test_equations_are_drawn_by_the_script_beside_the_page(settings, tmp_path):
     (tmp_path / "index.rst").write_text("Title\n=====\n\n.. math:: \\epsilon = \\frac12\n")
     (tmp_path / "conf.py").write_text("extensions = ['sphinx.ext.mathjax']\n")
     names = ("mathjax_path", "html_static_path")
+    (tmp_path / "_static").mkdir()
     app = SphinxTestApp("html", srcdir=tmp_path, confoverrides={n: found[n] for n in names})
     try:
         app.build()

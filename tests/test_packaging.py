@@ -108,7 +108,7 @@ def test_everything_that_is_imported_is_a_dependency(project):
 
 
 def test_installation_page_lists_every_extra(project):
-    for extra in ["mcmc", "materials", "dask", "all", "test", "docs"]:
+    for extra in ["mcmc", "materials", "dask", "completion", "all", "test", "docs"]:
         assert extra in project["optional-dependencies"], extra
         assert re.search(rf"^``{extra}`` +\w", _text("docs", "installation.rst"), re.M), extra
 
@@ -146,7 +146,7 @@ def test_package_data_names_every_file_that_is_no_module(tool):
 
 
 def test_installed_package_has_its_data():
-    for pattern in ["resources/**/*.yaml", "data/*.ecsv", "gap/templates/*.html"]:
+    for pattern in ["resources/**/*.yaml", "data/*.ecsv", "data/*.toml", "gap/templates/*.html"]:
         assert list(Path(astropolcal.__file__).parent.glob(pattern)), pattern
 
 

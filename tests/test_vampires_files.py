@@ -356,3 +356,70 @@ def test_commands_from_simulation_to_a_corrected_star(tmp_path, capsys):
     np.testing.assert_allclose(content["aperture"]["q"], 0.03, atol=2e-4)
     np.testing.assert_allclose(content["aperture"]["u"], -0.02, atol=2e-4)
     capsys.readouterr()
+
+
+# --- raw frames, which headers sort --------------------------------------------------------------
+
+
+@pytest.fixture
+def raw(cubes, tmp_path):
+    """Frames under names that tell neither camera nor state, as cubes of three exposures."""
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    for number, path in enumerate(sorted(cubes.glob("*.fits"), key=lambda p: (p.name[-6], p.name))):
+        with fits.open(path) as hdus:
+            image = hdus[0].data[0]
+            stack = np.stack([image - 1, image, image + 1]).astype(np.float32)
+            # seconds of each of the exposures
+            header = hdus[0].header.copy()
+            header["EXPTIME"] /= 3
+            fits.writeto(folder / f"VMPA{number:08d}.fits", stack, header)
+    return folder
+
+
+def test_raw_frames_are_sorted_by_state_and_camera(raw, cubes):
+    found, named = reduced(raw), reduced(cubes)
+    assert (found.problems, len(found.frames)) == ({}, 16)
+    assert {frame.values["exposures"] for frame in found.frames} == {3}
+    states = found.observations.frames["flc_state"]
+    assert states.tolist().count("A") == states.tolist().count("B") == 8
+
+    def by_position(reduction):
+        return {
+            (f.values["hwp"], f.values["derotator"], f.values["flc_state"]): f.photometry.flux
+            for f in reduction.frames
+        }
+
+    expected = by_position(named)
+    for key, flux in by_position(found).items():
+        # right stays right and left left, whatever the names
+        np.testing.assert_allclose(flux, expected[key], rtol=1e-4)
+
+
+def test_raw_frames_that_cannot_be_sorted_are_named(raw):
+    paths = sorted(raw.glob("*.fits"))
+    headers = [fits.getheader(path) for path in paths]
+    right = [i for i, header in enumerate(headers) if header["U_CAMERA"] == 1]
+    changes = [("U_CAMERA", 3), ("U_FLC", "C"), ("U_FLCSTT", None), ("U_FLC", None)]
+    state = headers[right[2]]["U_FLC"]
+    for i, (keyword, value) in zip(right, changes, strict=False):
+        with fits.open(paths[i], mode="update") as hdus:
+            if keyword == "U_FLCSTT":
+                hdus[0].header[keyword] = {"A": 2, "B": 1}[state]
+            elif value is None:
+                del hdus[0].header[keyword]
+            else:
+                hdus[0].header[keyword] = value
+    problems = {path.rpartition("/")[2]: why for path, why in reduced(raw).problems.items()}
+    words = [
+        "U_CAMERA = 3 in its header; allowed are 1, 2",
+        "U_FLC = 'C', allowed are A, B, 1, 2, NA",
+        f"U_FLC = '{state}', but U_FLCSTT = ",
+        "no state of the modulator (U_FLC) in its header, which others have",
+    ]
+    for i, said in zip(right, words, strict=False):
+        assert said in "; ".join(problems.pop(paths[i].name))
+    # their partners of the other camera
+    assert len(problems) == 4
+    for why in problems.values():
+        assert why[0].startswith("no frame of camera 1 in state ")

@@ -146,27 +146,33 @@ def model_error(fit, lam, n=3):
 # ---- pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors ----
 
 
-def match_wavelengths(grid, chain, wavelength):
-    """Return the wavelengths, and the bin of each; None where the law gives all."""
+def match_wavelengths(grid, chain, wavelength, interpolate=False):
+    """Return the wavelengths, and the weights of those of the grid in each, (n_wanted, n_grid).
+
+    The weights are None where laws give all. Parameters that are known at the wavelengths of the
+    grid only are interpolated linearly if ``interpolate``.
+    """
     if wavelength is None:
-        return grid, np.arange(grid.size)
+        return grid, np.eye(grid.size)
     try:
         lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
     except (TypeError, u.UnitConversionError):
         raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
     bins, off = nearest_bins(lam, grid)
     if not off.any():
-        return lam, bins
+        return lam, np.eye(grid.size)[bins]
     several = [
         f"{leaf.name}.{key}"
         for leaf in leaves(chain)
         for key in leaf.param_names
         if np.size(getattr(leaf, key).value) > 1
     ]
-    if several:
+    if several and not interpolate:
+        nearest = grid[np.argmin(np.abs(grid - lam[off][0]))]
         raise WavelengthRangeError(
             f"{lam[off][0]:.2f} is none of the {grid.size} calibrated wavelengths, and "
-            f"{several[0]} is known at these only: {grid.min():.2f} to {grid.max():.2f}"
+            f"{several[0]} is known at these only: {grid.min():.2f} to {grid.max():.2f}, the "
+            f"nearest is {nearest:.2f}; interpolate=True interpolates it linearly"
         )
     # laws of glass and metal interpolate between calibrated wavelengths, but are not trusted beyond
     outside = (lam < grid.min()) | (lam > grid.max())
@@ -175,7 +181,7 @@ def match_wavelengths(grid, chain, wavelength):
             f"{lam[outside & off][0]:.2f} is outside the calibrated range, "
             f"{grid.min():.2f} to {grid.max():.2f}"
         )
-    return lam, None
+    return lam, between(lam.value, grid.value) if several else None
 
 
 def spread_out(free, slopes, shape, mix, axis=0):
@@ -217,11 +223,11 @@ def between(lam, grid):
     return np.stack([np.interp(lam, grid[order], row) for row in rows.T], axis=1)
 
 
-def errors(calibration, axes, value, slopes, bins):
+def errors(calibration, axes, value, slopes, mix):
     """Return the factor of the covariance, and which elements are open or blind."""
     free, shape = free_of(calibration), value.shape
     # where a law gives all wavelengths no parameter has a value at each
-    mix = np.eye(len(calibration.wavelength))[np.zeros(shape[-3], int) if bins is None else bins]
+    mix = np.zeros((shape[-3], len(calibration.wavelength))) if mix is None else mix
     slopes = per_canonical(free, slopes)
     factor = np.empty((*shape, len(axes.sigmas)))
     is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
@@ -268,15 +274,15 @@ def split_chain(chain):
     return found[:start], found[start:]
 
 
-def at_bins(chain, bins, size):
-    """Return a copy of the chain at some bins of the parameters given per wavelength."""
+def at_wavelengths(chain, mix, size):
+    """Return a copy of the chain with weighted means of the parameters given per wavelength."""
     chain = chain.copy()
-    if bins is None or np.array_equal(bins, np.arange(size)):
+    if mix is None or np.array_equal(mix, np.eye(size)):
         return chain
-    sliced = []
+    mixed = []
     for leaf in leaves(chain):
         several = [k for k in leaf.param_names if np.size(getattr(leaf, k).value) == size > 1]
         own = {key: getattr(leaf, key) for key in several}
-        values = {key: p.value[bins] * (p.unit or 1) for key, p in own.items()}
-        sliced.append(leaf.with_parameters(**values))
-    return join(sliced)
+        values = {key: (mix @ p.value) * (p.unit or 1) for key, p in own.items()}
+        mixed.append(leaf.with_parameters(**values))
+    return join(mixed)

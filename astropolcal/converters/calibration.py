@@ -37,11 +37,12 @@ from astropolcal.converters.nodes import (
     value_from_node,
     without_priors,
 )
-from astropolcal.converters.optics import node_from_optic
+from astropolcal.converters.optics import node_from_optic, spelled_model
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table
 from astropolcal.observations.reading import stated_date
+from astropolcal.optics import Optic
 from astropolcal.version import version
 
 __all__ = []
@@ -49,6 +50,8 @@ __all__ = []
 
 # what is written for those who look into the file, and worked out again on reading
 _DERIVED = ("checksum", "validity", "written_with")
+# what is written as it is
+_PLAIN = ("at_bound", "settings", "fit", "provenance")
 
 
 # ---- writing ---------------------------------------------------------------------
@@ -57,51 +60,38 @@ _DERIVED = ("checksum", "validity", "written_with")
 def node_from_calibration(calibration):
     """Return the node of a calibration, as the newest schema describes it."""
     check_calibration(calibration)
+    chains, posterior = calibration.chains, calibration.posterior
+    priors = node_from_priors(chains)
+    # an optic's node cannot hold priors; copies: to write a calibration must not change it
+    chains = [without_priors(chain) for chain in chains] if priors else chains
     node = {
-        **_chains_and_priors(calibration.chains),
+        "chains": [_chain_node(chain) for chain in chains],
         "wavelength": node_from_value(calibration.wavelength),
         "covariance": _covariance_node(calibration.covariance),
         "identifiability": _identifiability_node(calibration.identifiability),
-        "at_bound": plain(calibration.at_bound, "at_bound"),
         "datasets": [_dataset_node(record) for record in calibration.datasets],
-        "settings": plain(calibration.settings, "settings"),
-        "fit": plain(calibration.fit, "fit"),
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
-        "provenance": plain(calibration.provenance, "provenance"),
-        **_posterior(calibration),
+        **{key: plain(getattr(calibration, key), key) for key in _PLAIN},
     }
+    node |= {"priors": priors} if priors else {}
+    node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
+    versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
     return node | {
         "checksum": _checksum(node),
         "validity": _validity(calibration),
-        "written_with": _versions(),
+        "written_with": {"astropolcal": version} | versions,
     }
-
-
-def _chains_and_priors(chains):
-    """Return the chains, and beside them the priors, which an optic's node cannot hold."""
-    priors = node_from_priors(chains)
-    # copies: to write a calibration must not change it
-    chains = [without_priors(chain) for chain in chains] if priors else chains
-    node = {"chains": [_chain_node(chain) for chain in chains]}
-    return node | {"priors": priors} if priors else node
-
-
-def _posterior(calibration):
-    if calibration.posterior is None:
-        return {}
-    check_posterior(calibration.posterior, calibration.covariance)
-    return {"posterior": node_from_posterior(calibration.posterior)}
 
 
 def _checksum(node):
     content = {key: value for key, value in node.items() if key not in _DERIVED}
-    return checksum(content, expand=node_from_optic)
+    return checksum(content, expand=_expanded)
 
 
-def _versions():
-    names = ("asdf", "asdf-astropy", "astropy")
-    return {"astropolcal": version} | {name: installed(name) for name in names}
+def _expanded(item):
+    """Return what a checksum says of an optic, or of a model that a parameter follows."""
+    return node_from_optic(item) if isinstance(item, Optic) else spelled_model(item)
 
 
 def _validity(calibration):
@@ -137,44 +127,27 @@ def _covariance_node(covariance):
 
 
 def _identifiability_node(finding):
-    node = {
-        "names": list(finding.names),
-        "rank": int(finding.rank),
-        "singular_values": finding.singular_values.copy(),
+    node = plain(vars(finding), "identifiability") | {
         # row by row: some versions of asdf cannot read an empty matrix
         "null_vectors": [row.copy() for row in finding.null_vectors],
-        "identifiable": finding.identifiable.copy(),
         "directions": [_direction_node(direction) for direction in finding.directions],
         "near_null": [_direction_node(direction) for direction in finding.near_null],
-        "sampling": list(finding.sampling),
-        "mirrors": list(finding.mirrors),
     }
     # absent where there are none, as in files of before
-    return node | ({"branches": plain(finding.branches, "branches")} if finding.branches else {})
+    return {key: value for key, value in node.items() if key != "branches" or value}
 
 
 def _direction_node(direction):
-    return {
-        "words": str(direction["words"]),
-        **({"sky": plain(direction["sky"], "sky")} if "sky" in direction else {}),
-        # a list, as a mapping would lose the order
-        "parameters": [
-            {"name": name, "value": plain(value, name)}
-            for name, value in direction["parameters"].items()
-        ],
+    # a list, as a mapping would lose the order
+    values = plain(direction["parameters"], direction["words"]).items()
+    return plain(direction, "direction") | {
+        "parameters": [{"name": name, "value": value} for name, value in values]
     }
 
 
 def _dataset_node(record):
-    return {
-        "name": record.name,
-        "source": record.source,
-        "content_hash": record.content_hash,
-        "meta": plain(record.meta, f"meta of {record.name}"),
-        "n_frames": int(record.n_frames),
-        "n_masked": int(record.n_masked),
-        "accuracy": node_from_table(record.accuracy),
-    }
+    node = {key: value for key, value in vars(record).items() if key != "accuracy"}
+    return plain(node, record.name) | {"accuracy": node_from_table(record.accuracy)}
 
 
 def _tie_node(name, tie):
@@ -215,17 +188,13 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         wavelength=value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
-        at_bound=list(node["at_bound"]),
         datasets=[_dataset(entry) for entry in node["datasets"]],
-        settings=plain(node["settings"]),
-        fit=plain(node["fit"]),
         ties={name: _tie(entry) for name, entry in _by_name(node["ties"], "target").items()},
         stages=[_stage(entry) for entry in node["stages"]],
-        provenance=plain(node["provenance"]),
+        **{key: plain(node[key]) for key in _PLAIN},
         posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
-    check_posterior(calibration.posterior, calibration.covariance)
     validity_of(calibration)
     return calibration
 
@@ -233,7 +202,7 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
 def _to_1_1(node):
     """Version 1.0.0 knew no statement of validity: an entry of that name meant nothing."""
     settings = {key: value for key, value in node["settings"].items() if key != "validity"}
-    return {**node, "settings": settings}
+    return node | {"settings": settings}
 
 
 #: Tag of an older version to the function that carries a node of it to the next one.
@@ -265,19 +234,11 @@ def _covariance(node):
 
 
 def _identifiability(node):
-    names, vectors = list(node["names"]), node["null_vectors"]
-    return Identifiability(
-        names=names,
-        rank=node["rank"],
-        singular_values=np.array(node["singular_values"]),
-        null_vectors=np.array(vectors) if vectors else np.zeros((0, len(names))),
-        identifiable=np.array(node["identifiable"]),
-        directions=[_direction(entry) for entry in node["directions"]],
-        near_null=[_direction(entry) for entry in node.get("near_null", [])],
-        sampling=list(node["sampling"]),
-        mirrors=list(node["mirrors"]),
-        branches=plain(node.get("branches", [])),
-    )
+    found, vectors = plain(node), node["null_vectors"]
+    found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
+    for key in ("directions", "near_null"):
+        found[key] = [_direction(entry) for entry in found.get(key, [])]
+    return Identifiability(**found)
 
 
 def _by_name(entries, key="name"):
@@ -291,11 +252,8 @@ def _by_name(entries, key="name"):
 
 
 def _direction(node):
-    return {
-        "words": node["words"],
-        "parameters": {k: entry["value"] for k, entry in _by_name(node["parameters"]).items()},
-        **({"sky": plain(node["sky"])} if "sky" in node else {}),
-    }
+    values = {name: entry["value"] for name, entry in _by_name(node["parameters"]).items()}
+    return node | {"parameters": values}
 
 
 def _dataset(node):
@@ -325,6 +283,7 @@ def _stage(node):
 # in the unit of its declaration (degree, mm, nm, adu, none): far above all that an instrument has
 _LARGEST = 1e15
 _ACCURACY = ("wavelength", "n", "k", "s_res", "s_mean", "s_cv")
+_MODEL_ERROR = ("wavelength_nm", "relative_percent", "absolute_percent")
 
 
 def check_calibration(calibration):
@@ -348,7 +307,13 @@ def check_calibration(calibration):
     _check_covariance(calibration.covariance, free)
     _check_identifiability(calibration.identifiability, free.names)
     _check_fit(calibration.fit)
-    _check_words(calibration, free.names)
+    unknown = sorted(set(calibration.at_bound) - set(free.names))
+    if unknown:
+        raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is not a free parameter")
+    for record in calibration.datasets:
+        if record.accuracy is not None:
+            _check_accuracy(record.accuracy, f"the accuracy of {record.name}")
+    check_posterior(calibration.posterior, calibration.covariance)
 
 
 def _check_laws(chains, wavelength):
@@ -368,7 +333,7 @@ def _check_values(chains, free):
             bounds = [parameter.bounds]
             if name not in free.by_name:
                 # the bounds of a fit do not matter to what is held or tied, those of the optic do
-                bounds.append(getattr(type(leaf), key).bounds)
+                bounds.append(leaf._declared(key).bounds)
             low = min(-_LARGEST if low is None else low for low, _ in bounds)
             high = max(_LARGEST if high is None else high for _, high in bounds)
             value = np.asarray(parameter.value, dtype=float)
@@ -439,104 +404,31 @@ def _finite(value):
 
 
 def _check_fit(fit):
-    """Check what a schema does not: what is masked, at odds with the fit, or at a bound."""
-    bounds = fit.get("bounds") or {}
-    if not _are_bounds(bounds):
-        raise CalibrationFileError("fit.bounds lacks what an error at a bound is described by")
-    _check_sky(fit)
-    masked = fit.get("masked") or []
-    if not isinstance(masked, list) or not all(isinstance(one, dict) for one in masked):
-        raise CalibrationFileError("fit.masked is not a list of reasons, one entry per dataset")
-    numbers = ("residual_percent", "sigma", "brightness")
-    outliers = fit.get("outliers") or []
-    if not isinstance(outliers, list):
-        raise CalibrationFileError(f"fit.outliers is a {type(outliers).__name__}, not a list")
-    for one in outliers:
-        good = isinstance(one, dict) and {"frames", "dataset", *numbers} <= set(one)
-        if not good or not all(isinstance(one[key], int | float) for key in numbers):
-            raise CalibrationFileError("fit.outliers lacks what a pair of frames is described by")
+    """Check of the accuracy on sky what its schema does not."""
+    errors = fit.get("model_error") or {}
+    lengths = {len(one) for key, one in errors.items() if key in _MODEL_ERROR}
+    if len(lengths) > 1 or not _finite([fit.get("sky_settings"), errors]):
+        raise CalibrationFileError(
+            "fit.sky_settings and fit.model_error must be finite, the latter of equal length"
+        )
 
 
-def _check_sky(fit):
-    """Check what the accuracy on sky is worked out from, and the accuracy that is kept."""
-    settings = {} if (found := fit.get("sky_settings")) is None else found
-    if not isinstance(settings, dict) or not all(
-        _is_numbers(angles) and np.isfinite(angles).all() for angles in settings.values()
-    ):
-        raise CalibrationFileError("fit.sky_settings must be finite angles, some for each stage")
-    keys = ("wavelength_nm", "relative_percent", "absolute_percent")
-    model = fit.get("model_error")
-    if model is not None:
-        lists = [model.get(key) for key in keys] if isinstance(model, dict) else [None]
-        good = all(_is_numbers(one) and len(one) == len(lists[0]) for one in lists)
-        if not good or not np.isfinite(lists).all() or np.min(lists) < 0:
-            raise CalibrationFileError(
-                f"fit.model_error must have {', '.join(keys)}, finite and of equal length"
-            )
-    kept = fit.get("sky_accuracy") or []
-    columns = ("wavelength_nm", "s_q_percent", "s_u_percent", "s_p_percent", "s_chi_deg")
-    if not isinstance(kept, list) or not all(
-        isinstance(one, dict) and all(_is_numbers(one.get(key)) for key in columns) for one in kept
-    ):
-        raise CalibrationFileError(f"fit.sky_accuracy must have {', '.join(columns)}")
-
-
-def _is_numbers(value):
-    """Return whether a value is a list of numbers that is not empty."""
-    plain = isinstance(value, list) and bool(value)
-    return plain and all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
-
-
-def _are_bounds(bounds):
-    """Return whether errors at bounds, and what depends on these, are all there."""
-    if not isinstance(bounds, dict):
-        return False
-    inward, released = (bounds.get(key, {}) for key in ("inward", "released"))
-    if not (isinstance(inward, dict) and isinstance(released, dict)):
-        return False
-    return all(isinstance(value, float) for value in inward.values()) and all(
-        isinstance(one, dict)
-        and all(isinstance(one.get(key), float) for key in ("times", "slack", "without"))
-        and isinstance(one.get("by"), list)
-        and all(isinstance(name, str) for name in one["by"])
-        for one in released.values()
-    )
-
-
-def _check_words(calibration, names):
-    unknown = sorted(set(calibration.at_bound) - set(names))
-    if unknown:
-        raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is not a free parameter")
-    for record in calibration.datasets:
-        known = _ACCURACY if record.accuracy is None else record.accuracy.colnames
-        missing = [name for name in _ACCURACY if name not in known]
-        if missing:
-            raise CalibrationFileError(
-                f"the accuracy of {record.name} has no column {', '.join(missing)}"
-            )
-        _check_accuracy(record)
-
-
-def _check_accuracy(record):
+def _check_accuracy(table, name):
     """Check that the columns of accuracies are numbers, one of each at every wavelength."""
-    for name in _ACCURACY if record.accuracy is not None else ():
-        column = record.accuracy[name]
+    missing = [key for key in _ACCURACY if key not in table.colnames]
+    if missing:
+        raise CalibrationFileError(f"{name} has no column {', '.join(missing)}")
+    for key in _ACCURACY:
+        column = table[key]
         if column.dtype.kind not in "iuf" or column.ndim != 1:
-            raise CalibrationFileError(
-                f"the accuracy of {record.name}: {name} is not a list of numbers"
-            )
+            raise CalibrationFileError(f"{name}: {key} is not a list of numbers")
         # s_res, s_mean and s_cv are shares of the light, in percent
         unit = getattr(column, "unit", None) or u.one
-        if name.startswith("s_") and not unit.is_equivalent(u.percent):
-            raise CalibrationFileError(
-                f"the accuracy of {record.name}: {name} is in {unit}, which is not a fraction"
-            )
-    if record.accuracy is not None:
-        length = u.Quantity(record.accuracy["wavelength"])
-        if not length.unit.is_equivalent(u.um) or not np.all(length.value > 0):
-            raise CalibrationFileError(
-                f"the accuracy of {record.name}: wavelength = {length} must be positive lengths"
-            )
+        if key.startswith("s_") and not unit.is_equivalent(u.percent):
+            raise CalibrationFileError(f"{name}: {key} is in {unit}, which is not a fraction")
+    length = u.Quantity(table["wavelength"])
+    if not length.unit.is_equivalent(u.um) or not np.all(length.value > 0):
+        raise CalibrationFileError(f"{name}: wavelength = {length} must be positive lengths")
 
 
 def content_hash(calibration):

@@ -28,36 +28,19 @@ CALIBRATION_TAG = CALIBRATION_TAGS[-1]
 #: Module of `astropolcal.optics` in which each optic is defined. It repeats the
 #: registry, so that ASDF can find a converter without importing the optics.
 OPTIC_MODULES = {
-    "BeamGain": "polarizers",
-    "Depolarizer": "polarizers",
-    "Diattenuator": "polarizers",
-    "DiattenuatorRetarder": "polarizers",
-    "DriftRetarder": "modulated",
-    "DriftRotator": "modulated",
-    "EllipticalRetarder": "retarders",
-    "FerroelectricLiquidCrystal": "modulated",
-    "FluxGain": "modulated",
-    "HarmonicGain": "modulated",
-    "HarmonicRetarder": "modulated",
-    "HarmonicRotator": "modulated",
-    "KMirror": "mirrors",
-    "LinearPolarizer": "polarizers",
-    "LinearRetarder": "retarders",
-    "MetalMirror": "mirrors",
-    "MuellerElement": "perturbations",
-    "ParityFlip": "mirrors",
-    "Perturbation": "perturbations",
-    "PolarizedBackground": "modulated",
-    "PolarizedSource": "sources",
-    "PowerLawMirror": "mirrors",
-    "Rotator": "retarders",
-    "StarSource": "sources",
-    "StateAnalyser": "states",
-    "StateRetarder": "states",
-    "StrayLight": "modulated",
-    "TwoLayerWaveplate": "retarders",
-    "VectorDiattenuator": "polarizers",
-    "WollastonPrism": "polarizers",
+    name: module
+    for module, names in {
+        "mirrors": "KMirror MetalMirror ParityFlip PowerLawMirror",
+        "modulated": "DriftRetarder DriftRotator FerroelectricLiquidCrystal FluxGain "
+        "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StrayLight",
+        "perturbations": "MuellerElement Perturbation",
+        "polarizers": "BeamGain Depolarizer Diattenuator "
+        "DiattenuatorRetarder LinearPolarizer VectorDiattenuator WollastonPrism",
+        "retarders": "EllipticalRetarder LinearRetarder Rotator TwoLayerWaveplate",
+        "sources": "PolarizedSource StarSource",
+        "states": "StateAnalyser StateRetarder",
+    }.items()
+    for name in names.split()
 }
 
 

@@ -12,17 +12,21 @@ import re
 import struct
 import warnings
 from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import distribution
 from pathlib import Path
 
 import asdf
 import asdf.util
+from asdf.config import AsdfConfig
 from asdf.constants import YAML_END_MARKER_REGEX
 from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
+from asdf.extension import ExtensionProxy
+from asdf.resource import ResourceMappingProxy
 
 from astropolcal.converters.extension import (
     CALIBRATION_TAG,
     CALIBRATION_TAGS,
-    MANIFEST_URI,
     get_extensions,
     get_resource_mappings,
 )
@@ -35,12 +39,16 @@ __all__ = []
 _KEY = "calibration"
 _ALLOWED_TAGS = re.compile(
     r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
-    r"|unit/(quantity|unit))-[0-9.]+"
+    r"|unit/(quantity|unit)|transform/[a-z0-9_]+)-[0-9.]+"
     r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
     rf"|{'|'.join(map(re.escape, CALIBRATION_TAGS))}"
     r"|tag:astropolcal\.org:astropolcal/optics/[a-z_0-9]+-1\.0\.0"
     r"|tag:yaml\.org,2002:[a-z]+"
 )
+# packages that plug the converters and schemas of these tags into ASDF; those of units only where a
+# file has some, as they take a second to import
+_PLAIN = ("asdf-standard", "asdf")
+_UNITS = ("asdf-astropy", "asdf-coordinates-schemas", "asdf-transform-schemas")
 # arrays of more numbers go into binary blocks, the others are readable
 _INLINE = 64
 _BEGIN, _END = b"#ASDF", b"\n...\n"
@@ -65,7 +73,10 @@ def read_calibration(path):
     with _speaking_of(path, "damaged"):
         content = path.read_bytes()
         # cheap checks first: most broken files are truncated or something else
-        _check_ends(content)
+        if not content.startswith(_BEGIN):
+            raise CalibrationFileError("not an ASDF file")
+        if not content.endswith(_END):
+            raise CalibrationFileError("truncated: the end of the file is missing")
         _check_tree(content)
         return _from_bytes(content)
 
@@ -81,8 +92,12 @@ def _to_bytes(calibration):
 
 
 def _from_bytes(content):
+    # the tags are in the text before the blocks of numbers
+    has_units = re.search(
+        rb"[/!]units?/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
+    )
     with (
-        _strict_asdf(),
+        _strict_asdf(_ConfigWithUnits if has_units else _Config),
         asdf.open(
             io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
         ) as file,
@@ -90,45 +105,62 @@ def _from_bytes(content):
         return file[_KEY]
 
 
+class _Config(AsdfConfig):
+    """ASDF with the plug-ins of what a calibration holds; those of all packages take seconds."""
+
+    packages = _PLAIN
+
+    @property
+    def extensions(self):
+        get_ours = get_extensions
+        return _plugged_in("asdf.extensions", ExtensionProxy, get_ours, self.packages)
+
+    @property
+    def resource_mappings(self):
+        get_ours = get_resource_mappings
+        return _plugged_in("asdf.resource_mappings", ResourceMappingProxy, get_ours, self.packages)
+
+
+class _ConfigWithUnits(_Config):
+    packages = _UNITS + _PLAIN
+
+
+@cache
+def _plugged_in(group, proxy, get_ours, packages):
+    """Return what our package and others plug into ASDF."""
+    asked = [("astropolcal", our_version, get_ours)]
+    for name in packages:
+        package = distribution(name)
+        points = package.entry_points.select(group=group)
+        asked += [(name, package.version, point.load()) for point in points]
+    return [
+        proxy(one, package_name=name, package_version=version)
+        for name, version, get in asked
+        for one in get()
+    ]
+
+
 @contextmanager
-def _strict_asdf():
+def _strict_asdf(kind=_ConfigWithUnits):
     """Switch on what ASDF leaves off: validation, and errors for what cannot be converted."""
-    # loaded once and kept by every context, which would load them anew
-    asdf.get_config().extensions  # noqa: B018
     with asdf.config_context() as config, warnings.catch_warnings():
         # other versions of asdf and its plugins do not matter, what is in the file does
         warnings.simplefilter("ignore", AsdfWarning)
         warnings.simplefilter("error", AsdfConversionWarning)
         # without its schema a node would pass unseen
         warnings.filterwarnings("error", "Unable to locate schema", AsdfWarning)
+        config.__class__ = kind
+        config.reset_resources()
         config.validate_on_read = True
         config.warn_on_failed_conversion = False
         config.lazy_tree = False
         config.array_inline_threshold = _INLINE
         config.all_array_storage = None
         config.all_array_compression = "input"
-        _register(config)
         yield
 
 
-def _register(config):
-    """Tell ASDF of our schemas where the package was not installed, only imported."""
-    if MANIFEST_URI in config.resource_manager:
-        return
-    for mapping in get_resource_mappings():
-        config.add_resource_mapping(mapping)
-    for extension in get_extensions():
-        config.add_extension(extension)
-
-
 # ---- what is refused before ASDF opens the file ------------------------------------
-
-
-def _check_ends(content):
-    if not content.startswith(_BEGIN):
-        raise CalibrationFileError("not an ASDF file")
-    if not content.endswith(_END):
-        raise CalibrationFileError("truncated: the end of the file is missing")
 
 
 def _check_tree(content):
@@ -229,10 +261,7 @@ def _speaking_of(path, words, prefix="", reads=True):
         except CalibrationFileError as error:
             raise CalibrationFileError(f"{path}: {prefix}{one_line(error, 500)}") from error
         except ValidationError as error:
-            raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
-
-
-def _where(error):
-    """Return what a schema objects to, and at which place of the file."""
-    place = ".".join(str(part) for part in error.absolute_path)
-    return f"invalid at {one_line(place)}: {one_line(error.message)}"
+            # what a schema objects to, and at which place of the file
+            place = one_line(".".join(map(str, error.absolute_path)))
+            words = f"invalid at {place}: {one_line(error.message)}"
+            raise CalibrationFileError(f"{path}: {prefix}{words}") from error

@@ -235,18 +235,11 @@ def restore_priors(chains, nodes):
 def prior_from_node(node, name):
     """Return the prior of a node."""
     try:
-        return _prior(node, name)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CalibrationFileError(f"prior of {name}: {type(error).__name__}, {error}") from None
-
-
-def _prior(node, name):
-    if node["kind"] == "scipy":
-        try:
+        if node["kind"] == "scipy":
             return _frozen(plain(node))
-        except (TypeError, ValueError) as error:
-            raise CalibrationFileError(f"prior of {name}: {error}") from None
-    values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
+        values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise CalibrationFileError(f"prior of {name}: {one_line(error)}") from None
     # a number of its own type, as it was given
     values = [v if hasattr(v, "unit") else v.item() for v in values]
     return getattr(priors, node["kind"].capitalize())(*values)

@@ -7,12 +7,16 @@ and the settings that rebuild it (name, mount, beam and what else its class has)
 its stage belongs to a frame and is not stored.
 """
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 
 from astropolcal.converters.nodes import prior_from_node, prior_node
 from astropolcal.exceptions import CalibrationFileError, ParameterError
 from astropolcal.optics import OPTICS
+from astropolcal.optics.core import with_value
+from astropolcal.optics.laws import law_of
 
 __all__ = []
 
@@ -25,8 +29,19 @@ def node_from_optic(optic):
     _check_class(optic)
     settings = {key: value for key, value in optic._settings().items() if value is not None}
     return settings | {
-        "parameters": {key: _parameter_node(optic, key) for key in optic.param_names}
+        "parameters": {key: _parameter_node(optic, key) for key in type(optic).param_names}
     }
+
+
+def spelled_model(model):
+    """Return what a checksum says of a model that a parameter follows."""
+    if hasattr(model, "op"):
+        return {"op": model.op, "parts": [spelled_model(model.left), spelled_model(model.right)]}
+    values = {name: np.ravel(getattr(model, name).value) for name in model.param_names}
+    # what is not there, and what a file does not say, is not a number
+    domains = (getattr(model, key, None) for key in ("domain", "x_domain", "y_domain"))
+    limits = [np.array([np.nan] if x is None else x, dtype=float) for x in domains]
+    return {"model": type(model).__name__, "parameters": values, "domains": limits}
 
 
 def _check_class(optic):
@@ -58,7 +73,21 @@ def _parameter_node(optic, key):
         node["wavelength"] = np.array(parameter.grid)
     node |= {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
     known = {} if parameter.prior is None else {"prior": prior_node(parameter.prior, label)}
-    return node | known
+    return node | known | _law_node(optic, key)
+
+
+def _law_node(optic, key):
+    law = optic._follows.get(key)
+    if law is None:
+        return {}
+    names = zip(law.model.param_names, law.names(key), strict=True)
+    node = {
+        "model": law.model,
+        "of": list(law.of),
+        "known": {name: list(map(float, ends)) for name, ends in law.known.items()},
+        "coefficients": {name: _parameter_node(optic, label) for name, label in names},
+    }
+    return {"law": node if law.since is None else node | {"since": law.since}}
 
 
 def _stored(value, label):
@@ -87,16 +116,39 @@ def optic_from_node(name, node):
     except ParameterError as error:
         label = repr(node.get("name", "without a name"))
         raise CalibrationFileError(f"optic {label}: {error}") from None
-    # not through the class: its defaults may fix or bound otherwise than the calibration did
     for key, entry in node["parameters"].items():
-        parameter = getattr(optic, key)
-        parameter.fixed = entry["fixed"]
-        parameter.bounds = tuple(entry["bounds"])
-        if "wavelength" in entry:
-            parameter.wavelength = np.array(entry["wavelength"]) * u.um
-        if "prior" in entry:
-            parameter.prior = prior_from_node(entry["prior"], f"{node.get('name')}.{key}")
+        _restore(optic, key, entry)
     return optic
+
+
+def _restore(optic, key, entry):
+    """Give a parameter what its node says of it beside the value."""
+    # not through the class: its defaults may fix or bound otherwise than the calibration did
+    parameter = getattr(optic, key)
+    parameter.fixed = entry["fixed"]
+    parameter.bounds = tuple(entry["bounds"])
+    if "wavelength" in entry:
+        parameter.wavelength = np.array(entry["wavelength"]) * u.um
+    if "prior" in entry:
+        parameter.prior = prior_from_node(entry["prior"], f"{optic.name}.{key}")
+    if "law" in entry:
+        _restore_law(optic, key, entry["law"])
+
+
+def _restore_law(optic, key, node):
+    label, own = f"{optic.name}.{key}", node["coefficients"]
+    try:
+        unit = optic._declared(key).unit
+        law, found = law_of(label, unit, node["model"], node["of"], node.get("since"))
+        if set(own) != set(found):
+            raise ParameterError(f"{label}: its law has {', '.join(found)}")
+        new = [with_value(found[name], _value(own[name])) for name in found]
+    except ParameterError as error:
+        raise CalibrationFileError(f"law of {error}") from None
+    known = {name: tuple(ends) for name, ends in node["known"].items()}
+    optic._follow(key, replace(law, known=known), new)
+    for name, place in zip(found, law.names(key), strict=True):
+        _restore(optic, place, own[name])
 
 
 def _value(entry):

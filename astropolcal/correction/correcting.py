@@ -20,6 +20,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
+from astropolcal.progress import counting, shown
 
 __all__ = ["correct"]
 
@@ -120,7 +121,7 @@ def correct(
     chunk : int
         Wavelengths that are worked on at a time, more of which need more memory.
     progress : bool
-        Whether to show a progress bar; it appears on a terminal only.
+        Whether to show how far it is; on a terminal only.
     provenance : dict, optional
         What goes into the header of the product besides versions and names of the frames.
 
@@ -474,20 +475,16 @@ def run_blocks(block, shape, *, chunk=1, workers=None, cluster=None, progress=Fa
     Return its results, (n, stop - start, ...), put together in ``shape``. With ``workers`` by
     threads of dask, with ``cluster`` (the address of a scheduler) by its processes.
     """
-    from tqdm import tqdm
-
     for name, value in (("chunk", chunk), ("workers", workers)):
         if value is not None and not value >= 1:
             raise ParameterError(f"{name} = {value}; it must be at least 1")
     out = np.empty(shape)
     ranges = [(i, min(i + chunk, shape[1])) for i in range(0, shape[1], chunk)]
-    with tqdm(
-        total=shape[1], desc="correcting", unit="slice", disable=None if progress else True
-    ) as bar:
+    with shown(progress), counting(shape[1], "wavelengths") as add:
 
         def keep(limits, result):
             out[:, limits[0] : limits[1]] = result
-            bar.update(limits[1] - limits[0])
+            add(limits[1] - limits[0])
 
         if workers is None and cluster is None:
             for limits in ranges:

@@ -282,6 +282,7 @@ class ScienceFrames:
         mirrored=False,
         order=3,
         left_scale=1.0,
+        detectors=None,
         **settings,
     ):
         """
@@ -312,6 +313,9 @@ class ScienceFrames:
             As for `from_arrays`.
         left_scale : array_like
             By what the left beam is multiplied, one number or one per frame.
+        detectors : sequence of (object, object), optional
+            Of the right and left beam in each frame, whose ``variance(pixels)`` gives the variances
+            where the files hold no errors.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 
@@ -338,6 +342,8 @@ class ScienceFrames:
             left_files=left,
             left_scale=left_scale,
             weights=layout.weights,
+            stacked=layout.stacked,
+            detectors=detectors,
         )
         if settings.get("pairs") is None and "hwp" in table.colnames:
             settings["pairs"] = _pairs(table["hwp"], positions, source.names)

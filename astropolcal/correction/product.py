@@ -16,6 +16,7 @@ from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.correction.solve import covariance_index
+from astropolcal.correction.star import COLUMNS, star_words
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path, check_new, understood
@@ -46,6 +47,8 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     hdus += _errors(corrected)
     if maps:
         hdus += _maps(corrected)
+    if corrected.star is not None:
+        hdus.append(fits.BinTableHDU(corrected.star, name="STAR"))
     names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
     hdus.append(fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES"))
     with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
@@ -70,6 +73,9 @@ def _header(corrected):
             value = _printable(corrected.provenance[key])
             # a card holds 80 characters
             header[keyword] = (value, comment) if len(value) + len(comment) < 60 else value
+    if corrected.star is not None:
+        header["STARSUB"] = (corrected.star.meta["star"], "light of the star subtracted")
+        header["HISTORY"] = f"polarization of the star, subtracted: {star_words(corrected.star)}"
     for word in corrected.provenance.get("held", []):
         header["HISTORY"] = f"not free in the calibration, without error: {_printable(word)}"
     for i, words in enumerate(corrected.weak):
@@ -219,7 +225,19 @@ def _read(path, hdus):
         else None,
         "pixel_scale": _stated(path, header, "PIXSCALE", float) if "PIXSCALE" in header else None,
         "provenance": provenance,
+        "star": _star(path, hdus),
     }
+
+
+def _star(path, hdus):
+    """Return the polarization of the star that was subtracted, or None."""
+    if "STARSUB" not in hdus[0].header:
+        return None
+    table = QTable(_table(path, hdus["STAR"]))
+    if len(table) != len(hdus["WAVELENGTH"].data) or not set(COLUMNS) <= set(table.colnames):
+        raise ObservationError(f"{path}: not a readable product: STAR has not what is subtracted")
+    table.meta = {"star": _stated(path, hdus[0].header, "STARSUB", str)}
+    return table
 
 
 def _table(path, hdu):

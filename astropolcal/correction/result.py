@@ -11,6 +11,7 @@ from astropy.table import QTable
 from astropolcal.correction.geometry import azimuthal, azimuthal_variances
 from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
+from astropolcal.correction.star import measured_star, stated_star, without_star
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.stokes import (
     aolp_error,
@@ -58,6 +59,9 @@ class Corrected:
         As in `ScienceFrames`.
     provenance : dict
         Calibration, versions, input files.
+    star : `~astropy.table.QTable` or None
+        Polarization of the star that `without_star` subtracted, with its errors; one row per
+        wavelength.
 
     Examples
     --------
@@ -90,6 +94,7 @@ class Corrected:
     centre: tuple | None = None
     pixel_scale: float | None = None
     provenance: dict = field(default_factory=dict)
+    star: QTable | None = None
 
     # ---- Stokes parameters -------------------------------------------------------
 
@@ -216,9 +221,9 @@ class Corrected:
 
     # ---- spectra -----------------------------------------------------------------
 
-    def aperture(self, radius, centre=None):
+    def aperture(self, radius, centre=None, inner=0.0):
         """
-        Return the sum within a circle, as the spectrum of a point source.
+        Return the sum within a circle or a ring, as the spectrum of a point source.
 
         Parameters
         ----------
@@ -226,6 +231,8 @@ class Corrected:
             Pixels; a pixel counts if its middle is inside. The circle may not leave the images.
         centre : (float, float), optional
             0-based x and y; by default that of the images.
+        inner : float
+            Radius from which on pixels count.
 
         Returns
         -------
@@ -233,12 +240,20 @@ class Corrected:
             Of shape (n_components, n_wavelengths). The statistical errors take the pixels as
             independent.
         """
+        inside = self._circle(radius, centre, inner)
+        covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
+        changed = {"stokes": self.stokes[..., inside].sum(axis=-1), "covariance": covariance}
+        return type(self)(**{**self.__dict__, **changed})
+
+    def _circle(self, radius, centre=None, inner=0.0):
+        """Return the pixels of a circle, or of a ring, that does not leave the images."""
         if self.stokes.ndim != 4:
             raise ParameterError("an aperture needs images; these are spectra")
         rows, columns = np.indices(self.stokes.shape[2:])
         x, y = self._middle() if centre is None else centre
         # whole pixels only, so that the sum has the covariance of a sum
-        inside = np.hypot(columns - x, rows - y) <= radius
+        distance = np.hypot(columns - x, rows - y)
+        inside = (distance <= radius) & (distance >= inner)
         if not radius > 0 or not inside.any():
             raise ParameterError(f"radius = {radius}: no pixel is inside")
         height, width = inside.shape
@@ -249,9 +264,44 @@ class Corrected:
                 f"radius = {radius:g} leaves the images of {width} x {height} pixels; allowed "
                 f"around ({x:g}, {y:g}) are up to {largest:g}"
             )
-        covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
-        changed = {"stokes": self.stokes[..., inside].sum(axis=-1), "covariance": covariance}
-        return type(self)(**{**self.__dict__, **changed})
+        return inside
+
+    def without_star(self, *, annulus=None, dolp=None, aolp=None, errors=None):
+        r"""
+        Return the same without the polarization of the star: :math:`Q - q_\star I` and so on.
+
+        Parameters
+        ----------
+        annulus : (float, float), optional
+            Radii in pixels between which the light is the star's alone, and shows its
+            polarization at each wavelength; a circle if the first is 0.
+        dolp, aolp : float and `~astropy.units.Quantity`, optional
+            In its place the degree, a fraction or a Quantity, and the angle of polarization, from
+            north through east.
+        errors : (float, `~astropy.units.Quantity`), optional
+            Their standard deviations.
+
+        Returns
+        -------
+        Corrected
+            With the table ``star``. The errors of the star's polarization are part of the
+            systematic ones, as they are the same in all pixels. Of a polarization that was
+            measured here, what the calibration errs by in proportion to the intensity cancels.
+
+        Raises
+        ------
+        ParameterError
+            If the annulus leaves the images, or a value is impossible.
+        ObservationError
+            If most pixels of the annulus have no value, or it has no light, or light that is
+            polarized by more than 100 %.
+        """
+        if (annulus is None) == (dolp is None) or (dolp is None) != (aolp is None):
+            raise ParameterError("give either annulus, or dolp and aolp, of the star")
+        if annulus is None:
+            return without_star(self, stated_star(self, dolp, aolp, errors), "stated", False)
+        star = measured_star(self, annulus)
+        return without_star(self, star, "annulus of {:g} to {:g} pixels".format(*annulus), True)
 
     def _middle(self):
         height, width = self.stokes.shape[2:]

@@ -14,7 +14,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows, between, free_of
-from astropolcal.chain import join, leaves, stages
+from astropolcal.chain import join, leaves, stages, warn_beyond
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
@@ -72,6 +72,7 @@ class RowModel(Rows):
             free = free_of(calibration)
         mix = self._mixing(chain, lam, interpolate)
         placed, nodes = _placed(positions, stages(chain))
+        warn_beyond(chain, placed)
         super().__init__(chain, lam, placed, free, mix, nodes)
         self.n_frames = self._shape[1]
 
@@ -257,7 +258,8 @@ def _ideal(leaf, wavelength):
 
 def _normalized(leaf, wavelength):
     """Return the matrices of an optic in its own axes, without its losses."""
-    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *leaf.canonical_values()[1:])
+    own = leaf.canonical_values()[1 : len(type(leaf).param_names)]
+    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *own)
     matrix = np.reshape(matrix, (-1, 4, 4))
     return matrix / matrix[:, :1, :1]
 

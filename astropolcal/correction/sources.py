@@ -130,8 +130,9 @@ class CubeFiles:
     ``centres`` are the place of one point of the sky in the right and left beam, 0-based x and y,
     (2, 2) or (n_frames, 2, 2): side by side, or, with ``left_files``, in the image of each.
     ``size`` rows and columns are cut out about it, turned north up if there are position angles.
-    Inverse variances or errors (``weights``) may follow the cube's ``extension``; ``left_scale``
-    multiplies the left beam.
+    Inverse variances or errors (``weights``) may follow the cube's ``extension``, else those of
+    the ``detectors`` count; ``left_scale`` multiplies the left beam. Of ``stacked`` files the
+    first axis are exposures, of which the mean is taken.
     """
 
     def __init__(
@@ -147,6 +148,8 @@ class CubeFiles:
         left_files=None,
         left_scale=1.0,
         weights="inverse variance",
+        stacked=False,
+        detectors=None,
     ):
         self.files = [str(path) for path in files]
         if not self.files:
@@ -160,21 +163,26 @@ class CubeFiles:
         left = self.files if left_files is None else [str(path) for path in left_files]
         self._beam_files = (self.files, left)
         self._scale = np.broadcast_to(np.asarray(left_scale, dtype=float), (self.n_frames,))
-        self._weights = weights
+        self._weights, self._stacked, self._detectors = weights, stacked, detectors
         # each file once, where both beams are in one
         found = {path: _places(path, extension) for path in dict.fromkeys([*self.files, *left])}
         self._places = [[found[path] for path in files] for files in self._beam_files]
-        self._shape = self._places[0][0][0].shape
+        self._shape = self._of_file(self._places[0][0][0])
         for path, (cube, *_) in found.items():
-            if cube.shape != self._shape or len(cube.shape) != 3 or 0 in cube.shape:
+            if self._of_file(cube) != self._shape or len(cube.shape) != 3 or 0 in cube.shape:
                 raise ObservationError(
                     f"{path}: a cube of shape {cube.shape}; {self.files[0]} has {self._shape}, and "
                     "three axes of some length are needed"
                 )
         self.n_wavelengths = self._shape[0]
-        self.has_variances = all(len(places) > 1 for places in found.values())
+        self._has_errors = all(len(places) > 1 for places in found.values())
+        self.has_variances = self._has_errors or detectors is not None
         self._check_size(size)
         self._check_window(self._shape[1:])
+
+    def _of_file(self, place):
+        """Return the shape of the cube that is taken from a file."""
+        return (1, *place.shape[1:]) if self._stacked and place.shape[0] else place.shape
 
     def _check_size(self, size):
         height, width = self._shape[1:]
@@ -213,14 +221,21 @@ class CubeFiles:
         """Return their variances, NaN where the weight or the error is zero."""
         found = []
         for i in range(self.n_frames)[frames]:
-            # variance = error^2 = 1 / inverse variance
-            power = 2 if self._weights == "error" else -1
-            with np.errstate(divide="ignore", invalid="ignore"):
-                known = self._read(beam, i, wavelengths, 1)
-                variance = np.where(known > 0, known**power, np.nan)
-            variance = variance * self._factor(beam, i) ** 2
+            variance = self._variance(beam, i, wavelengths) * self._factor(beam, i) ** 2
             found.append(self._cut(derotate_variance, i, beam, variance))
         return np.stack(found)
+
+    def _variance(self, beam, i, wavelengths):
+        if not self._has_errors:
+            return self._detectors[i][beam].variance(self._read(beam, i, wavelengths))
+        # variance = error^2 = 1 / inverse variance
+        power = 2 if self._weights == "error" else -1
+
+        def squared(known):
+            return np.where(known > 0, known**power, np.nan)
+
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._read(beam, i, wavelengths, 1, squared)
 
     def _factor(self, beam, i):
         return self._scale[i] if beam == 1 else 1.0
@@ -236,7 +251,18 @@ class CubeFiles:
             order=self._order,
         )
 
-    def _read(self, beam, i, wavelengths, offset=0):
+    def _read(self, beam, i, wavelengths, offset=0, change=None):
+        """Return a cube or, with an offset, what follows it, ``change``d before it is averaged."""
+        if not self._stacked:
+            cube = self._section(beam, i, wavelengths, offset)
+            return cube if change is None else change(cube)
+        cube = self._section(beam, i, slice(None), offset)
+        cube = cube if change is None else change(cube) / len(cube)
+        number = np.isfinite(cube).sum(axis=0, keepdims=True)
+        total = np.nansum(cube, axis=0, keepdims=True)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    def _section(self, beam, i, wavelengths, offset):
         place, path = self._places[beam][i][offset], self._beam_files[beam][i]
         with understood(path, ObservationError, "cannot be read"):
             if place.start is not None:

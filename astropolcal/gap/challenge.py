@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from astropy.stats import binom_conf_interval
 from astropy.table import QTable
-from tqdm import tqdm
 
 from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.files import append_line, atomic_path, understood
@@ -25,6 +24,7 @@ from astropolcal.gap._bench import DETECTOR, Bench, Setup
 from astropolcal.gap._faults import Fault
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
+from astropolcal.progress import shown, steps
 from astropolcal.words import counted
 
 __all__ = ["ChallengeResult", "make_challenge", "run_challenge", "score_answer"]
@@ -363,9 +363,8 @@ def run_challenge(
     checkpoint : path-like, optional
         File to which each record is appended as a line of JSON. A run with the
         same settings goes on from it.
-    progress : bool or callable
-        Whether to show a bar on a terminal, or what is called after each
-        challenge with how many are done and how many there are.
+    progress : bool
+        Whether to show how far it is; on a terminal only.
 
     Returns
     -------
@@ -408,14 +407,9 @@ def _settings(n, seed, snr, kinds, setup):
 
 def _each(function, todo, n, settings, client, progress):
     """Yield what a function gives for each number, as it is ready, and say how far it is."""
-    # disable=None shows the bar on a terminal only
-    hidden, before = None if progress is True else True, n - len(todo)
-    with tqdm(total=n, initial=before, desc="challenges", disable=hidden) as bar:
-        for done, one in enumerate(_outcomes(function, todo, settings, client), before + 1):
-            yield one
-            bar.update()
-            if callable(progress):
-                progress(done, n)
+    with shown(progress):
+        found = _outcomes(function, todo, settings, client)
+        yield from steps(found, "challenges", n, n - len(todo))
 
 
 def _outcomes(function, todo, settings, client):

@@ -8,7 +8,9 @@ All of them say the same: `to_dict` works it out, and the others show it.
 import base64
 import io
 import warnings
+from contextlib import contextmanager
 from copy import deepcopy
+from textwrap import wrap
 
 import astropy.units as u
 import numpy as np
@@ -28,6 +30,8 @@ __all__ = ["causes_table", "summary", "to_dict", "write_html"]
 #: Caption of the figure that stands with the causes, see `~astropolcal.plotting.plot_cause_map`.
 MAP = "Where in the chain the causes are, and of which kind"
 _DPI = 130
+# a figure on a telephone: inches, dots per inch, characters of its title
+_NARROW, _FINE, _TITLE = 4.2, 180, 42
 # pixels of a page to an inch
 _CSS = 96
 _MOST_SCORES = 8
@@ -408,10 +412,48 @@ def _images(figures):
 
 
 def _image(figure):
-    """Return a figure as a data URI, with its width and height in CSS pixels."""
+    """Return a figure as data URIs, wide and narrow, with its width and height in CSS pixels."""
+    width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
+    found = {"source": _source(figure, _DPI), "width": width, "height": height}
+    with _narrow(figure):
+        return found | {"narrow": _source(figure, _FINE)}
+
+
+def _source(figure, dpi):
     # part of the page, which has to be one file that can be sent
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=_DPI)
-    width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
-    source = "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return {"source": source, "width": width, "height": height}
+    figure.savefig(stream, format="png", dpi=dpi)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+@contextmanager
+def _narrow(figure):
+    """Have the panels of a figure below one another, as wide as a telephone."""
+    panels = [axes for axes in figure.axes if axes.get_subplotspec() is not None]
+    places = [axes.get_subplotspec() for axes in panels]
+    size, title = tuple(figure.get_size_inches()), figure.get_suptitle()
+    ticks = [axis.get_tick_params() for axes in panels for axis in (axes.xaxis, axes.yaxis)]
+    own = list(dict.fromkeys(places))
+    rows = max((place.get_gridspec().nrows for place in own), default=1)
+    if len(own) > rows:
+        grid = figure.add_gridspec(len(own), 1)
+        for axes, place in zip(panels, places, strict=True):
+            axes.set_subplotspec(grid[own.index(place)])
+            # those that panels side by side share
+            axes.tick_params(labelbottom=True, labelleft=True)
+    figure.set_size_inches(min(_NARROW, size[0]), size[1] * max(len(own), 1) / rows)
+    _title(figure, "\n".join(part for line in title.split("\n") for part in wrap(line, _TITLE)))
+    try:
+        yield
+    finally:
+        for axes, place, x, y in zip(panels, places, ticks[::2], ticks[1::2], strict=True):
+            axes.set_subplotspec(place)
+            axes.tick_params(labelbottom=x["labelbottom"], labelleft=y["labelleft"])
+        figure.set_size_inches(size)
+        _title(figure, title)
+
+
+def _title(figure, text):
+    # without one there is no room to be kept for it
+    if text:
+        figure.suptitle(text)

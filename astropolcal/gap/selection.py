@@ -14,6 +14,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from astropolcal import progress
 from astropolcal.gap.attribution import ALIKE, scan
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -231,7 +232,7 @@ def _checked(base, best, groups, say):
     while True:
         say("left-out frames")
         steps = [base.without(()), *_growing(best)]
-        history = [_errors(step, groups) for step in steps]
+        history = [_errors(step, groups) for step in progress.steps(steps, "models")]
         worse = _worse(best, steps, history, groups)
         if not worse:
             return best, steps, history
@@ -391,7 +392,7 @@ def _search(best, library, first, say, cells, most_causes):
 def _fitted(grown):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
-    for promised, state, added in grown:
+    for promised, state, added in progress.steps(grown, "fits"):
         share = _HALF if any(other.is_dear for other in found) else _PROMISING
         if promised - state.evidence < share * (most - state.evidence):
             break
@@ -450,11 +451,11 @@ def _exchanged(base, best, library, first, say, cells):
     scans, like = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
-        for one in reversed(best.chosen):
+        say("each cause beside all the others")
+        for one in progress.steps(best.chosen[::-1], "causes"):
             others = [other for other in best.chosen if other is not one]
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
-            say(f"beside all the others: {one.effect.title}")
             found = first if not others else _beside(best.model, one, library, cells, like)
             like = like or (found.probes if others else None)
             scans[one.name] = (others, found)

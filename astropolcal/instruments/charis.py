@@ -195,7 +195,7 @@ class CHARIS(Instrument):
         known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(BOUNDS))}
         self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
         grid = self.grid(wavelength)
-        train = subaru.entrance(source, grid, star, target, subaru.tertiary_mirror(m3, grid))
+        train = subaru.entrance(source, grid, star, target, m3)
         train.append(subaru.two_layer_plate(**subaru.misaligned(0)))
         train.append(subaru.derotator(derotator, derotator_start(grid), BOUNDS[bounds]))
         if "dichroic" in optics_in:

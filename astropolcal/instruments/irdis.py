@@ -12,6 +12,8 @@ differences here, right minus left, have the opposite sign of the published ones
 """
 
 import warnings
+from collections import ChainMap
+from dataclasses import replace
 from pathlib import Path
 
 import astropy.units as u
@@ -24,13 +26,8 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
-from astropolcal.instruments.telescope import (
-    INTERNAL,
-    PARANAL,
-    STARS,
-    misaligned,
-    star_source,
-)
+from astropolcal.instruments.layout import FileLayout, side_by_side
+from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
@@ -335,6 +332,107 @@ def _mirror(name, coating, index):
     )
 
 
+# ---- files -------------------------------------------------------------------------------------
+
+# longitude, latitude (deg) and height (m) of the telescope in the headers
+_SITE = (-70.4045, -24.6268, 2648.0)
+#: What keeps the direction of polarization that is measured fixed to the image.
+SKY_LAW = SkyLaw(
+    plate={"field": (-1.0, 1.0), "pupil": (-0.5, 1.0)},
+    derotator={"field": (-0.5, 0.5), "pupil": (0.0, 0.5)},
+)
+_PLATE, _TURN = (f"{_STAGES[name]} BEGIN" for name in ("hwp_true", "derotator"))
+
+
+class IrdisLayout(FileLayout):
+    """Files whose angles follow from several keywords, see `frame_table`."""
+
+    def from_header(self, header):
+        """Return a header with the angles, and the time, in the middle of the exposure."""
+        filters = dict(zip(FILTERS, CENTRES, strict=True))
+        (row,) = frame_table([header], location_of(_SITE), filters, SKY_LAW)
+        angles = KEYWORDS.keys() & set(row.colnames)
+        known = {KEYWORDS[name]: row[name].to_value(u.deg) for name in angles}
+        with offline():
+            known[self.keywords["mjd"]] = Time(str(row["time"]), scale="utc").mjd
+        return ChainMap(known, header)
+
+    def to_header(self, header):
+        """Return the header of a frame with these angles, that of a star in field tracking."""
+        own = {"ESO DET NDIT": 1} | dict(header)
+        own[_PLATE] += _PLATE_ZERO
+        own |= {f"{keyword} END": own[f"{keyword} BEGIN"] for keyword in _STAGES.values()}
+        names = {angle: name for name, angle in _COMMANDED.items()}
+        commanded = own.pop(_STOKES)
+        # of an angle without a name the position tells
+        own |= {_STOKES: names[commanded]} if commanded in names else {}
+        if _PARALLACTIC not in own:
+            return own
+        # a star that is always up: by its motion the altitude is that of the start
+        own = {_ROTATION: "FIELD", "RA": 0.0, "DEC": -80.0} | own
+        own["ESO TEL PARANG END"] = own[_PARALLACTIC]
+        _, motion = _row(_Header(0, own), None, location_of(_SITE))["motion"]
+        return own | {"ESO TEL ALT": own["ESO TEL ALT"] - motion}
+
+
+#: Column of the observation table to keyword.
+KEYWORDS = {
+    "hwp": _STOKES,
+    "hwp_true": _PLATE,
+    "derotator": _TURN,
+    "parallactic": _PARALLACTIC,
+    "altitude": "ESO TEL ALT",
+}
+# part of the sides of a half that the rectangles of the internal source have
+_LIT = 0.7
+#: Full frames, dark, flat and centred: both halves of the detector side by side.
+LAYOUT = IrdisLayout(
+    keywords=KEYWORDS
+    | {
+        "exposure_time": "EXPTIME",
+        "exposures": "ESO DET NDIT",
+        "mjd": "MJD-OBS",
+        "date": "DATE-OBS",
+        "right_ascension": "RA",
+        "declination": "DEC",
+        "object": "OBJECT",
+        "instrument": "INSTRUME",
+        "filter": _FILTER,
+    },
+    shape=(1, 1024, 2048),
+    cube_extension=0,
+    weights="error",
+    units={"exposure_time": "s", "mjd": "d"},
+    identities=("SPHERE",),
+    prefix="IRDIS_",
+    gain=1.75,
+    read_noise=10.0,
+    saturation=30000.0,
+    pixel_scale=12.25,
+    fwhm=4.0,
+    tracking=SKY_LAW.plate_law("field"),
+    site=_SITE,
+    stacked=True,
+    centred=True,
+    **side_by_side(1024, 1024, _LIT),
+)
+
+
+def layout_of(header):
+    """Return how files with such a header look; without ``NAXIS1`` they are of full frames."""
+    columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
+    if columns % 2 or min(rows, columns // 2) < 16:
+        raise InstrumentError(
+            f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, of "
+            "16 x 16 pixels and more each"
+        )
+    places = side_by_side(rows, columns // 2, _LIT)
+    if str(header.get(_ROTATION, "")).strip() == "PUPIL":
+        # the offset of the plate to the pupil is not known: it is not checked
+        places |= {"tracking": SKY_LAW.plate_law("pupil"), "tracking_tolerance": 90.0}
+    return replace(LAYOUT, shape=(1, rows, columns), **places)
+
+
 class IRDIS(Instrument):
     """
     VLT/SPHERE/IRDIS in dual-beam polarimetric imaging.
@@ -354,26 +452,19 @@ class IRDIS(Instrument):
     name = "irdis"
     aliases = ("SPHERE/IRDIS", "VLT/SPHERE/IRDIS")
     wavelength = CENTRES
-    keywords = {
-        "hwp_true": "ESO INS4 DROT3 BEGIN",
-        "derotator": "ESO INS4 DROT2 BEGIN",
-        "parallactic": "ESO TEL PARANG START",
-        "altitude": "ESO TEL ALT",
-    }
+    keywords = KEYWORDS
+    files = LAYOUT
     references = (
         "van Holstein et al. 2020, A&A 633, A64, doi:10.1051/0004-6361/201834996",
         "de Boer et al. 2020, A&A 633, A63, doi:10.1051/0004-6361/201834989",
+        "IRDAP, https://github.com/robvanholstein/IRDAP (keywords, limit of saturation)",
     )
     sources = (*INTERNAL, *STARS)
     sky_options = ("wavelength", "date")
     changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were recoated"),)
     #: Names of the filters with coefficients, in the order of ``wavelength``.
     filters = FILTERS
-    #: What keeps the direction of polarization that is measured fixed to the image.
-    sky_law = SkyLaw(
-        plate={"field": (-1.0, 1.0), "pupil": (-0.5, 1.0)},
-        derotator={"field": (-0.5, 0.5), "pupil": (0.0, 0.5)},
-    )
+    sky_law = SKY_LAW
     #: Day from which the mirrors of the telescope have their new coating.
     recoating = RECOATING
 
@@ -494,6 +585,10 @@ class IRDIS(Instrument):
             check_all_filters(behind)
         return telescope(filters_at(self.grid(wavelength)), coating_of(coating, date))
 
+    def setup(self, observations):
+        """Return the source from the table's meta, and no optional optics."""
+        return self.source_of(observations), ()
+
     def particulars(self, observations):
         """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
@@ -505,10 +600,23 @@ class IRDIS(Instrument):
         """Return which coating the telescope's mirrors had on a date, "before" or "after"."""
         return coating_on(date)
 
-    @property
-    def location(self):
-        """Site of the telescope, an `~astropy.coordinates.EarthLocation`."""
-        return location_of(PARANAL)
+    def configured(self, header):
+        """Return the instrument with the filter and the shape of a file."""
+        # a new one: the registry hands out instances that others may hold
+        one, filters = type(self)(), dict(zip(FILTERS, CENTRES, strict=True))
+        one.wavelength = np.atleast_1d(filters[_filter(_Header(0, header), filters)])
+        one.files = layout_of(header)
+        return one
+
+    def mode_header(self, wavelength):
+        """Return the filter in the headers of files of a wavelength."""
+        found = [FILTERS[i] for i in filters_at(np.atleast_1d(wavelength))]
+        if len(found) != 1:
+            raise InstrumentError(
+                f"irdis: a file is of one filter, not of {', '.join(found)}; give one wavelength, "
+                "or a calibration of one filter"
+            )
+        return {_FILTER: f"FILT_BBF_{found[0]}"}
 
     def frame_table(self, headers):
         """

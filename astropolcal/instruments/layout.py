@@ -141,8 +141,10 @@ class FileLayout:
         Longitude and latitude in degree, height in metre.
     beam_files : tuple of str
         Marks in the names of the files of the right and of the left beam, where each camera
-        writes files of its own. The shape, and all places, are then those of both images side by
-        side, the left one first.
+        writes files of its own; each ends with the number of its camera. The shape, and all
+        places, are then those of both images side by side, the left one first.
+    partners : dict of str to str
+        File of the right beam to that of the left one, where headers tell and not the names.
     weights : {"inverse variance", "error"}
         What the extension after the cube holds.
     states : dict of str to str
@@ -151,6 +153,12 @@ class FileLayout:
         Ways to read the detector out, by the value of the ``read_mode`` keyword, or that value
         and the number of the ``camera``, such as "slow 1"; ``em`` and ``conventional`` are the
         registers of an EMCCD, which has a keyword ``em_gain``. See `read_out`.
+    stacked : bool
+        Whether the first axis of an image of one wavelength may hold exposures, which are
+        averaged; keyword ``exposures``: of how many an image in the file is the mean.
+    centred : bool
+        Whether the star has been moved to the middle of each beam, so that a correction need not
+        find it.
     optics : dict of str to (str, dict of str to str)
         What headers say of optics in the beam: key of the table's meta to (column,
         {regular expression: word}). The first expression found in the column's text
@@ -193,9 +201,12 @@ class FileLayout:
     hwp_step: float = 11.25
     site: tuple = ()
     beam_files: tuple = ()
+    partners: dict = field(default_factory=dict)
     weights: str = _WEIGHTS[0]
     states: dict = field(default_factory=dict)
     read_outs: dict = field(default_factory=dict)
+    stacked: bool = False
+    centred: bool = False
     optics: dict = field(default_factory=dict)
 
     def __post_init__(self):
@@ -218,6 +229,18 @@ class FileLayout:
                 f"beam_files = {self.beam_files}; the marks of the right and left beam are needed"
             )
 
+    def from_header(self, header):
+        """
+        Return a header in which the keyword of each column holds what the column means.
+
+        Here the same; an instrument that works its angles out of several keywords has its own.
+        """
+        return header
+
+    def to_header(self, header):
+        """Return the header, as the instrument writes it, from which `from_header` gets this."""
+        return header
+
     @property
     def file_shape(self):
         """Shape of the cube in a file, which may be that of one beam only."""
@@ -230,8 +253,14 @@ class FileLayout:
         Return how the detector was read out in a frame.
 
         ``values`` of its header are ``em_gain``, ``read_mode`` and ``camera``, as far as they are
-        known. With an EM gain above one, gain and read noise are those before the multiplication.
+        known. With an EM gain above one, gain and read noise are those before the multiplication;
+        of a mean of several ``exposures`` they are those of the electrons of all.
         """
+        how, n = self._way(values), values.get("exposures", 1)
+        return replace(how, gain=how.gain * n, read_noise=how.read_noise * math.sqrt(n))
+
+    def _way(self, values):
+        """Return how a single exposure was read out."""
         own = ReadOut(self.gain, self.read_noise, self.saturation)
         em_gain, mode = values.get("em_gain"), values.get("read_mode")
         if em_gain is not None:
@@ -265,6 +294,8 @@ class FileLayout:
         """
         if not self.beam_files:
             return None
+        if str(path) in self.partners:
+            return Path(self.partners[str(path)])
         path, (right, left) = Path(path), self.beam_files
         # the last one: a folder or target may have the mark in its name too
         head, found, tail = path.name.rpartition(right)
@@ -280,9 +311,25 @@ class FileLayout:
         if not self.beam_files:
             return files
         # left files without a right one stay, so that the error names them
-        rights = [path for path in files if self.beam_files[0] in Path(path).name]
+        rights = [path for path in files if self.is_right(path)]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]
+
+    def is_right(self, path):
+        """Return whether a file is known to be of the right beam, by its name or by headers."""
+        return str(path) in self.partners or self.beam_files[0] in Path(path).name
+
+
+def side_by_side(rows, columns, lit):
+    """Return the places of beams whose images, of rows and columns, stand side by side.
+
+    The rectangles of the internal source are the middle share ``lit`` of each side.
+    """
+    x, y = (columns - 1) / 2, (rows - 1) / 2
+    return {
+        "internal_apertures": ((x, y), (x + columns, y), lit * columns, lit * rows, 0.0),
+        "star_offset": (float(columns), 0.0),
+    }
 
 
 def header_map(keywords, transforms=(), **times):
@@ -320,10 +367,10 @@ TEXTS = (
 )
 #: Beyond these, in degree, an angle in a header cannot be right.
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
-RANGES |= {"em_gain": (0.0, 1e5)}
+RANGES |= {"em_gain": (0.0, 1e5), "exposures": (1.0, 1e6)}
 # numbers without a unit
 # what a layout means that gives no unit; everything else is in degree
-_UNITS = {"camera": "", "em_gain": "", "exposure_time": "s"}
+_UNITS = {"camera": "", "em_gain": "", "exposures": "", "exposure_time": "s"}
 
 _MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 

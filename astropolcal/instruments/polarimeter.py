@@ -111,8 +111,7 @@ class SubaruPolarimeter(Polarimeter):
 
     def light(self, source, grid, star, target):
         """Return the internal source, or a star and the telescope."""
-        mirror = shared.tertiary_mirror("free", grid)
-        return shared.entrance(source, grid, star, target, mirror)
+        return shared.entrance(source, grid, star, target, "free")
 
     def inner(self, source, optics_in, grid):
         """Return the half-wave plate, the derotator and the camera."""

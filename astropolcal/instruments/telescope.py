@@ -306,10 +306,10 @@ def fold_mirror(size):
     return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))
 
 
-def entrance(source, grid, star, target, mirror):
+def entrance(source, grid, star, target, m3, mirror=tertiary_mirror):
     """Return what stands before the half-wave plate: source, and for a star the telescope."""
     if source in STARS:
-        return [star_source(source, grid, star, target), *telescope(mirror)]
+        return [star_source(source, grid, star, target), *telescope(mirror(m3, grid))]
     return [polarizer() if source == "polarized" else fold_mirror(grid.size)]
 
 

@@ -24,7 +24,7 @@ from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import Instrument, check_choice
-from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut
+from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
 from astropolcal.observations.quality import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
@@ -69,15 +69,6 @@ _READ_OUTS = {
 }
 
 
-def _places(side):
-    """Return what depends on the size of an image."""
-    middle, lit = (side - 1) / 2, _LIT * side
-    return {
-        "internal_apertures": ((middle, middle), (middle + side, middle), lit, lit, 0.0),
-        "star_offset": (float(side), 0.0),
-    }
-
-
 #: The multiband imager; ``layout_of`` has the other modes.
 LAYOUT = FileLayout(
     keywords=KEYWORDS
@@ -110,7 +101,7 @@ LAYOUT = FileLayout(
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
     optics={"flc": ("flc", {r"(?i)^\s*in": "in", r"(?i)^\s*out": "out"})},
-    **_places(_FIELD_SIDE),
+    **side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
 )
 
 
@@ -145,7 +136,9 @@ def layout_of(header):
         )
     keywords = LAYOUT.keywords | ({"filter": _MODE} if multiband else {})
     shape = (len(slices_of(header)), side, 2 * side)
-    return replace(LAYOUT, keywords=keywords, shape=shape, **_places(side))
+    # raw frames of a filter: a cube of exposures in one state
+    places = side_by_side(side, side, _LIT) | {"stacked": not multiband}
+    return replace(LAYOUT, keywords=keywords, shape=shape, **places)
 
 
 def mode_header(wavelength):
@@ -360,7 +353,7 @@ class VAMPIRES(Instrument):
         known |= {"plate": (plate, ("free", "two-layer")), "m3": (m3, subaru.M3_MODELS)}
         self.check_choices(source, optics_in, **known)
         grid = self.grid(wavelength)
-        train = subaru.entrance(source, grid, star, target, _mirror(m3, grid))
+        train = subaru.entrance(source, grid, star, target, m3, _mirror)
         train.append(_half_wave_plate(grid, plate))
         train += [_derotator(grid, derotator), _relay(grid.size)]
         if "flc" in optics_in:

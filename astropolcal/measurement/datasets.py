@@ -75,6 +75,12 @@ class Dataset:
         except WavelengthRangeError as error:
             raise WavelengthRangeError(f"{obs.name}: {error}") from None
 
+    def inputs(self):
+        """Return the lowest and highest of each position in the frames that are used."""
+        used = ~self.observations.mask.all(axis=1)
+        flat = ((name, given[..., used]) for name, given in self._given.items())
+        return {name: (float(given.min()), float(given.max())) for name, given in flat}
+
     def thinned(self, chain, groups):
         """Return the dataset with some of its groups of frames, by ascending numbers."""
         new = copy.copy(self)

@@ -15,6 +15,7 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import FittableModel, Parameter
 
+from astropolcal.chain import leaves
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
@@ -388,6 +389,16 @@ class Measurement(FittableModel):
         self.free.put_back(self.vector() if vector is None else vector)
         self.free.put_wavelengths(self.wavelength)
         return chains
+
+    def note_inputs(self):
+        """Tell the laws that parameters follow which inputs they have in the frames."""
+        chains, ends = self.chains, {}
+        for dataset in self.datasets:
+            for name, (low, high) in dataset.inputs().items():
+                least, most = ends.get(name, (low, high))
+                ends[name] = min(low, least), max(high, most)
+        for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+            leaf._follows = {key: law.with_known(ends) for key, law in leaf._follows.items()}
 
     def residuals(self, vector=None):
         """Return observed minus predicted data, shape (n_data,)."""

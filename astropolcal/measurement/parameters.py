@@ -9,12 +9,14 @@ applied here, so that the Jacobian stays exact.
 """
 
 import copy
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import leaves
+from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement.priors import bind_prior, normal_per_wavelength
 from astropolcal.units import canonical_factor, to_unit
@@ -140,6 +142,52 @@ def parameter_table(chains):
             for key in leaf.param_names:
                 table.setdefault(f"{leaf.name}.{key}", []).append(getattr(leaf, key))
     return table
+
+
+def with_own(chains, names, own, ties=None):
+    """
+    Return copies of chains in which parameters have a value of their own in each group of datasets.
+
+    ``own`` are names of parameters, or these with the group of each dataset, by default its name.
+    An optic is called as before in the first group, and with the name of its group after its own in
+    the others, where what is shared is tied. Those ties are returned too, and of each parameter the
+    names that it has in the groups.
+    """
+    names = names if len(set(names)) == len(names) else range(1, len(names) + 1)
+    own = own if isinstance(own, Mapping) else dict.fromkeys(own, names)
+    table, ties, optics = parameter_table(chains), dict(ties or {}), {}
+    for name, groups in own.items():
+        groups = list(map(str, groups))
+        _check_own(name, groups, table, len(chains), ties)
+        optic, key = name.split(".")
+        optics.setdefault(optic, {})[key] = groups
+    trains, copies = [leaves(chain.copy()) for chain in chains], {}
+    for optic, keys in optics.items():
+        called, first = {}, {}
+        for i, train in enumerate(trains):
+            for leaf in (leaf for leaf in train if leaf.name == optic):
+                mine = {key: groups[i] for key, groups in keys.items()}
+                mark = tuple(dict.fromkeys(mine.values()))
+                label = re.sub(r"\W", "_", "_".join((optic, *mark))) if called else optic
+                leaf.name = called.setdefault(mark, label)
+                for key in leaf.param_names:
+                    # the first dataset of a group leads the others
+                    lead = first.setdefault((key, mine.get(key)), f"{leaf.name}.{key}")
+                    if lead != f"{leaf.name}.{key}" and not getattr(leaf, key).fixed:
+                        ties[f"{leaf.name}.{key}"] = ties.get(f"{optic}.{key}", Tie(lead))
+        copies |= {f"{optic}.{k}": [x for (o, _), x in first.items() if o == k] for k in keys}
+    return [join(train) for train in trains], ties, copies
+
+
+def _check_own(name, groups, table, count, ties):
+    if name not in table:
+        raise ParameterError(f"own: no parameter {name!r}; there are {', '.join(table)}")
+    if len(groups) != count:
+        raise ParameterError(f"own: {name} has {len(groups)} groups; there are {count} datasets")
+    if table[name][0].fixed:
+        raise ParameterError(f"own: {name} is fixed; what has several values has to be free")
+    if name in ties or any(tie.source == name for tie in ties.values()):
+        raise ParameterError(f"own: {name} is part of a tie; allowed are parameters that are not")
 
 
 class FreeParameters:

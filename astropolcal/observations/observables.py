@@ -193,7 +193,31 @@ class Observable(ABC):
         return f"<{type(self).__name__}: {self.description}>"
 
 
-class NormalizedDoubleDifference(Observable):
+class _NormalizedDifference(Observable):
+    """Beam differences of some frames, each with its sign, over the sum of all their fluxes."""
+
+    signs = ()
+
+    def _parts(self, right, left):
+        difference = np.einsum("k,k...->...", self.signs, right - left)
+        return difference, right.sum(axis=0) + left.sum(axis=0)
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        difference, total = self._parts(right, left)
+        return difference / total
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        difference, total = self._parts(right, left)
+        inverse = 1.0 / total
+        x_inverse = difference * (inverse * inverse)
+        up, down = inverse - x_inverse, -inverse - x_inverse
+        d_right = [up if sign > 0 else down for sign in self.signs]
+        return np.stack(d_right), np.stack([down if one is up else up for one in d_right])
+
+
+class NormalizedDoubleDifference(_NormalizedDifference):
     """
     Normalized double difference, x = (X+ - X-) / (I+ + I-), of the CHARIS recalibration paper.
 
@@ -203,23 +227,7 @@ class NormalizedDoubleDifference(Observable):
 
     name = "normalized_double_difference"
     description = "normalized double difference, (X+ - X-) / (I+ + I-)"
-
-    def evaluate(self, right, left):
-        """Return x, shape (W, P); see `Observable.evaluate`."""
-        difference = right - left
-        total = right + left
-        return (difference[0] - difference[1]) / (total[0] + total[1])
-
-    def derivative(self, right, left):
-        """Return dx/dR and dx/dL; see `Observable.derivative`."""
-        difference = right - left
-        total = right + left
-        inverse = 1.0 / (total[0] + total[1])
-        # x / (I+ + I-)
-        x_inverse = (difference[0] - difference[1]) * (inverse * inverse)
-        d_right = np.stack([inverse - x_inverse, -inverse - x_inverse])
-        # exchanging beams and exchanging frames are the same thing here
-        return d_right, d_right[::-1]
+    signs = (1.0, -1.0)
 
 
 class PerFrameDoubleDifference(Observable):
@@ -274,7 +282,7 @@ class RatioMethod(Observable):
         return signed / right, -signed / left
 
 
-class NormalizedSingleDifference(Observable):
+class NormalizedSingleDifference(_NormalizedDifference):
     """
     Normalized single difference of every frame, x = (R - L) / (R + L).
 
@@ -284,19 +292,10 @@ class NormalizedSingleDifference(Observable):
     name = "normalized_single_difference"
     description = "normalized single difference of each frame, (R - L) / (R + L)"
     frames_per_datum = 1
-
-    def evaluate(self, right, left):
-        """Return x, shape (W, P); see `Observable.evaluate`."""
-        return (right[0] - left[0]) / (right[0] + left[0])
-
-    def derivative(self, right, left):
-        """Return dx/dR and dx/dL; see `Observable.derivative`."""
-        total = right + left
-        scale = 2.0 / (total * total)
-        return left * scale, -right * scale
+    signs = (1.0,)
 
 
-class NormalizedTripleDifference(Observable):
+class NormalizedTripleDifference(_NormalizedDifference):
     """
     Normalized triple difference of the frames A+, B+, A-, B-.
 
@@ -310,25 +309,7 @@ class NormalizedTripleDifference(Observable):
     name = "normalized_triple_difference"
     description = "normalized triple difference, (XA+ - XB+ - XA- + XB-) / (sum of all I)"
     frames_per_datum = 4
-
-    @staticmethod
-    def _parts(right, left):
-        a_plus, b_plus, a_minus, b_minus = right - left
-        return (a_plus - b_plus) - (a_minus - b_minus), (right + left).sum(axis=0)
-
-    def evaluate(self, right, left):
-        """Return x, shape (W, P); see `Observable.evaluate`."""
-        difference, total = self._parts(right, left)
-        return difference / total
-
-    def derivative(self, right, left):
-        """Return dx/dR and dx/dL; see `Observable.derivative`."""
-        difference, total = self._parts(right, left)
-        inverse = 1.0 / total
-        x_inverse = difference * (inverse * inverse)
-        # by the sign that a flux has in the numerator
-        up, down = inverse - x_inverse, -inverse - x_inverse
-        return np.stack([up, down, down, up]), np.stack([down, up, up, down])
+    signs = (1.0, -1.0, -1.0, 1.0)
 
 
 class Intensity(Observable):

@@ -20,12 +20,17 @@ from astropy.utils.data import download_file
 from astropy.utils.exceptions import AstropyWarning
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.core import MOVES
-from astropolcal.units import angle_to_rad, plain_number
+from astropolcal.optics.core import MOVES, PLACES
+from astropolcal.units import angle_to_rad, mjd_of, plain_number
 
 __all__ = ["location_of", "pointing"]
 
@@ -394,6 +399,8 @@ def frame_coordinate(observations, name):
         )
     if name == "flc_state":
         return _modulator_state(observations)
+    if name in PLACES:
+        return _place(observations, name)
     time = _time_or_order(observations)
     if name == "sequence":
         # affine in time, so that a drift has the same parameter whatever the unit of the clock
@@ -424,6 +431,30 @@ def frame_coordinate(observations, name):
         now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
         ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def _place(observations, name):
+    """Return the moment (Modified Julian Date) or the place in the field (arcsec) of each frame."""
+    frames = observations.frames
+    if name not in frames.colnames:
+        raise ObservationError(
+            f"{observations.name}: no column {name!r}, which a law of a parameter needs; it has "
+            f"{', '.join(frames.colnames)}"
+        )
+    if name != "time":
+        return numeric_column(frames, name, observations.name, PLACES[name])
+    times, unit = clock(frames), getattr(frames["time"], "unit", None)
+    if isinstance(frames["time"], Time) or times is None:
+        times, unit = _times(observations), None
+    if times is None or np.any(getattr(times, "mask", False)):
+        raise ObservationError(
+            f"{observations.name}: column time; a law of a parameter needs a date in each frame"
+        )
+    times = times if unit is None else times * unit
+    try:
+        return mjd_of(times, f"{observations.name}: time")
+    except ParameterError as error:
+        raise ObservationError(str(error)) from None
 
 
 def angle_or_zero(observations, stage):

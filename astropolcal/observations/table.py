@@ -255,11 +255,6 @@ class Observations:
         return self._variances[2]
 
     @property
-    def has_errors(self):
-        """Whether the table gives errors of the fluxes."""
-        return bool(self._grid.errors)
-
-    @property
     def mask(self):
         """True where a cell is unusable, shape (F, W)."""
         return self._mask
@@ -354,7 +349,8 @@ class Observations:
             fluxes of the beams in the unit of the table, 0 where masked;
             ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the
             fluxes over those of the frame taken before, 1 for the
-            first and where one of the two is masked.
+            first and where one of the two is masked. For laws of parameters also ``"time"``, a
+            Modified Julian Date (UTC), and ``"x"`` and ``"y"``, the place in the field in arcsec.
 
         Returns
         -------
@@ -742,15 +738,8 @@ def some_frames(grid, frames, label):
         raise ObservationError(
             f"{label}: the {counted(len(index), 'frame')} selected have no usable cell"
         )
-    return dataclasses.replace(
-        grid,
-        frames=grid.frames[index],
-        rows=grid.rows[index],
-        flux_right=grid.flux_right[index],
-        flux_left=grid.flux_left[index],
-        errors={name: error[index] for name, error in grid.errors.items()},
-        reason=grid.reason[index],
-    )
+    cells = _picked(grid, (index,))
+    return dataclasses.replace(grid, frames=grid.frames[index], rows=grid.rows[index], **cells)
 
 
 def some_bins(grid, bins, label):
@@ -763,15 +752,14 @@ def some_bins(grid, bins, label):
         )
     if grid.reason[:, chosen].all():
         raise ObservationError(f"{label}: the bins selected have no usable cell")
-    return dataclasses.replace(
-        grid,
-        bin=grid.bin[chosen],
-        wavelength=grid.wavelength[chosen],
-        flux_right=grid.flux_right[:, chosen],
-        flux_left=grid.flux_left[:, chosen],
-        errors={name: error[:, chosen] for name, error in grid.errors.items()},
-        reason=grid.reason[:, chosen],
-    )
+    own = {"bin": grid.bin[chosen], "wavelength": grid.wavelength[chosen]}
+    return dataclasses.replace(grid, **own, **_picked(grid, (slice(None), chosen)))
+
+
+def _picked(grid, place):
+    """Return what a grid has of every frame and wavelength, at some of them."""
+    arrays = {key: getattr(grid, key)[place] for key in ("flux_right", "flux_left", "reason")}
+    return arrays | {"errors": {name: error[place] for name, error in grid.errors.items()}}
 
 
 def _frame_index(frames, n_frames, label):

@@ -119,6 +119,15 @@ class OpticParameter(Parameter):
             )
         self.grid = grid
 
+    @property
+    def law(self):
+        """The model of astropy that it follows, in units, with present values; None without."""
+        law = self.model._follows.get(self.name) if self.model else None
+        if law is None:
+            return None
+        values = [getattr(self.model, name) for name in law.names(self.name)]
+        return law.in_units([p.value for p in values])
+
     def at(self, wavelength, values):
         """Return values of the parameter at wavelengths (um), between its own on straight lines."""
         grid = self.grid
@@ -400,6 +409,27 @@ def with_own_scalars(model, labels):
         new.__dict__[label] = parameter
         parameter.value = float(model.__dict__[label].value)
     return new
+
+
+def with_values(model, values, units=None):
+    """Return a copy of a model with other values, without units or in others."""
+    new = model.copy()
+    units = [None] * len(values) if units is None else units
+    for name, value, unit in zip(new.param_names, values, units, strict=True):
+        parameter = getattr(new, name)
+        parameter._unit = unit
+        parameter.value = np.asarray(value, dtype=float)
+    new._initialize_slices()
+    return new
+
+
+def add_parameters(model, parameters, names):
+    """Give a model parameters of its own, by name, beside those of its class."""
+    for name, parameter in parameters.items():
+        model.__dict__[name] = parameter
+        parameter.model = model
+    model.param_names = names
+    model._initialize_slices()
 
 
 def without_units(model, labels, values, bounds):

@@ -11,6 +11,7 @@ header and is never a parameter.
 
 import inspect
 from abc import abstractmethod
+from copy import copy
 
 import astropy.units as u
 import numpy as np
@@ -18,8 +19,14 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
-from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined, values_text
-from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
+from astropolcal.optics._modelling import (
+    KeywordOnly,
+    add_parameters,
+    copied_attributes,
+    joined,
+    values_text,
+)
+from astropolcal.units import canonical_factor, length_to_um, mjd_of, to_unit
 from astropolcal.words import did_you_mean
 
 __all__ = ["COORDINATES", "Optic"]
@@ -35,26 +42,35 @@ RATES = ("parallactic_rate", "derotator_rate")
 MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
 
 
+#: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
+#: Julian Date (UTC), and the place in the field.
+PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
+
+
 class _Coordinates(tuple):
-    """Names of positions that are numbers; all of the form ``"COLUMN=STATE"`` are among them."""
+    """Names of positions that are numbers; `PLACES` and ``"COLUMN=STATE"`` are among them."""
 
     __slots__ = ()
 
     def __contains__(self, name):
-        return tuple.__contains__(self, name) or (isinstance(name, str) and "=" in name)
+        known = tuple.__contains__(self, name) or name in PLACES
+        return known or (isinstance(name, str) and "=" in name)
 
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
 #: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
 #: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
-#: has that state and 0 in the others.
+#: has that state and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian
+#: Date or `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
 COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
 
 
 def finite_position(value, name, stage=None):
     """Return the position of a stage in radian, or as a number; refuse what is not finite."""
-    number = (stage or name) in COORDINATES
-    position = to_unit(value, None, name) if number else angle_to_rad(value, name)
+    stage = stage or name
+    if stage == "time":
+        return mjd_of(value, name)
+    position = to_unit(value, PLACES.get(stage) if stage in COORDINATES else u.rad, name)
     if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
     return position
@@ -140,6 +156,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     depends_on_beam = False
     #: True for an optic whose mount may name one of `COORDINATES`, which are not angles.
     takes_numbers = False
+    # laws that parameters follow, by their names, and where this copy stands for them
+    _follows, _places = {}, {}
 
     theta = Parameter(
         default=0.0,
@@ -191,24 +209,23 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"parameters are {', '.join(self.param_names)})"
                 )
 
-    @classmethod
-    def _at_the_door(cls, key, value):
+    def _at_the_door(self, key, value):
         """Return ``value`` as a Quantity in the declared unit of parameter ``key``."""
-        unit = cls._declared(key).unit
-        number = to_unit(value, unit, f"{cls.__name__}.{key}")
+        unit, label = self._declared(key).unit, f"{type(self).__name__}.{key}"
+        number = to_unit(value, unit, label)
         if not np.all(np.isfinite(number)):
-            raise ParameterError(f"{cls.__name__}.{key} = {value} must be finite")
+            raise ParameterError(f"{label} = {value} must be finite")
         # the only axis that a parameter may have is that of the wavelengths
         if number.ndim > 1 or number.size == 0:
             raise ParameterError(
-                f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
-                "scalar or one value per wavelength"
+                f"{label} has shape {number.shape}; allowed are a scalar or one value per "
+                "wavelength"
             )
         return number if unit is None else number * unit
 
-    @classmethod
-    def _declared(cls, key):
-        return inspect.getattr_static(cls, key)
+    def _declared(self, key):
+        # a coefficient of a law belongs to the optic, all else to its class
+        return inspect.getattr_static(type(self), key, self.__dict__.get(key))
 
     def __setattr__(self, attr, value):
         # astropy would adopt the unit of the value and leave the bounds behind
@@ -261,7 +278,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                 f"mount = {value!r} must be None or the name of a stage, with or without "
                 "one leading minus"
             )
-        if stage in COORDINATES and not self.takes_numbers:
+        if stage in COORDINATES and (not self.takes_numbers or stage in PLACES):
             raise ParameterError(
                 f"{type(self).__name__}: mount = {value!r} is a number, not the angle of a stage"
             )
@@ -315,8 +332,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     @property
     def own_names(self):
-        """Names of the parameters without ``theta``."""
-        return tuple(key for key in self.param_names if key != "theta")
+        """Names of the parameters without ``theta`` and coefficients of laws."""
+        return tuple(key for key in type(self).param_names if key != "theta")
 
     def _dispersion(self, wavelength):
         """Return what `_matrix` needs of the wavelength (um); computed once in a fit."""
@@ -378,8 +395,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         ParameterError, WavelengthRangeError
             As `mueller`.
         """
-        dispersion, angle, values = self._resolve(wavelength, position)
-        derivatives = self._oriented_derivatives(dispersion, angle, values)
+        found = self._resolve(wavelength, position)
+        derivatives = self._oriented_derivatives(*found, self._rates_at(wavelength, self._places))
         return {
             key: self._per_unit(key, value)
             for key, value in zip(self.param_names, derivatives, strict=True)
@@ -391,10 +408,55 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         inverse = u.dimensionless_unscaled if unit is None else unit**-1
         return derivative * canonical_factor(unit) * inverse
 
-    def _resolve(self, wavelength, position, parameters=None):
-        """Bring wavelength, orientation and values to canonical floats."""
+    def _resolve(self, wavelength, position, parameters=None, places=None):
+        """Bring wavelength, orientation and values to canonical floats, with what laws add."""
         lam, shift, values = self._read(wavelength, position, parameters)
+        values = self._followed(lam, self._places if places is None else places, values)
         return (*self._moved(self._dispersion_at(lam), values[0], shift), values[1:])
+
+    # ---- laws that parameters follow ----------------------------------------
+
+    def _coefficients(self, values):
+        """Yield of each law the place of its parameter, the law and the values of coefficients."""
+        names = type(self).param_names
+        start = len(names)
+        for key, law in self._follows.items():
+            yield names.index(key), law, values[start : start + law.size]
+            start += law.size
+
+    def _followed(self, lam, places, values):
+        """Return the values without coefficients, with what laws add where their inputs stand."""
+        own = list(values[: len(type(self).param_names)])
+        for i, law, coefficients in self._coefficients(values):
+            if law.stands(lam, places):
+                own[i] = own[i] + law.value(lam, places, coefficients)
+        return own
+
+    def _rates_at(self, wavelength, places):
+        """Return of each coefficient the place of its parameter, and by how much it moves it."""
+        if not self._follows:
+            return ()
+        lam, _, values = self._read(wavelength, None, None)
+        return self._rates(lam, places, values)
+
+    def _rates(self, lam, places, values):
+        return [
+            (i, law.rate(lam, places, coefficients, k) if law.stands(lam, places) else 0.0)
+            for i, law, coefficients in self._coefficients(values)
+            for k in range(law.size)
+        ]
+
+    def _follow(self, key, law, coefficients):
+        """Let a parameter follow a law, whose coefficients become parameters of this optic."""
+        if key not in type(self).param_names or key in self._follows:
+            reason = "follows a law already; add the models" if key in self._follows else "is none"
+            raise ParameterError(f"{self.name or type(self).__name__}.{key} {reason}")
+        laws, own = self._follows | {key: law}, type(self).param_names
+        # in the order of the parameters, whichever came first
+        self._follows = {name: laws[name] for name in own if name in laws}
+        more = (name for key, law in self._follows.items() for name in law.names(key))
+        found = dict(zip(law.names(key), coefficients, strict=True))
+        add_parameters(self, found, (*own, *more))
 
     def _dispersion_at(self, wavelength):
         """Return the dispersion, or None without a wavelength where none is needed."""
@@ -442,13 +504,13 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         matrix = self._matrix(dispersion, *values)
         return _rotation_matrix(angle) if self.rotates_frame else _rotate(matrix, angle)
 
-    def _oriented_derivatives(self, dispersion, angle, values):
-        """Yield the derivative to theta, then to each other parameter."""
+    def _oriented_derivatives(self, dispersion, angle, values, rates=()):
+        """Return the derivative to theta, then to each other parameter and coefficient."""
         # a rotator of the frame is T(theta) alone, with no T(-theta) behind it
         matrix = self._oriented(dispersion, angle, values)
-        yield turn(matrix) if self.rotates_frame else rotation_generator(matrix)
-        for derivative in self._derivatives(dispersion, *values):
-            yield _rotate(derivative, angle)
+        found = [turn(matrix) if self.rotates_frame else rotation_generator(matrix)]
+        found += [_rotate(slope, angle) for slope in self._derivatives(dispersion, *values)]
+        return found + [found[i] * np.asarray(rate)[..., None, None] for i, rate in rates]
 
     @property
     def input_units(self):
@@ -597,14 +659,18 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in set(self.param_names) - set(values):
             self._check_unit(key, getattr(self, key).unit)
             current[key] = getattr(self, key).value * (self._declared(key).unit or 1)
-        new = type(self)(**(current | values), **self._settings())
+        values = current | values
+        own = {key: values.pop(key) for key in type(self).param_names}
+        new = type(self)(**own, **self._settings())
+        for key, law in self._follows.items():
+            new._follow(key, law, [with_value(getattr(self, k), values[k]) for k in law.names(key)])
         for key in self.param_names:
             old, fresh = getattr(self, key), getattr(new, key)
             fresh.fixed, fresh.bounds = old.fixed, old.bounds
             fresh.tied, fresh.prior = old.tied, old.prior
             if fresh.shape == old.shape and fresh.grid is None:
                 fresh.grid = old.grid
-        new._position = self._position
+        new._position, new._places = self._position, self._places
         return new
 
     def resampled(self, wavelength):
@@ -690,6 +756,13 @@ def _of_spectrum(spectrum):
     if std is not None:
         std = u.Quantity(std.represent_as(StdDevUncertainty).quantity)[order]
     return wavelength[order], u.Quantity(spectrum.flux)[order], std
+
+
+def with_value(parameter, value):
+    """Return a coefficient of a law with another value, perhaps of another shape."""
+    new = copy(parameter)
+    new._default = new.value = to_unit(value, parameter.unit, parameter.name)
+    return new
 
 
 def _singular(matrix):

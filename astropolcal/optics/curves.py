@@ -23,6 +23,9 @@ _STOKES = ("I", "Q", "U", "V")
 
 def curve_of(chain, optics, what, element=None, against="wavelength", wavelength=None, **positions):
     """Return the curve of an optic or a chain, whose optics are in a list; see `Optic.curve`."""
+    moving = [f"{o.name or 'an optic'}.{key}" for o in optics for key in o._follows]
+    if moving:
+        raise ParameterError(f"no curve: {moving[0]} follows a law; mueller() says what it does")
     laws = _laws(optics[0]) if len(optics) == 1 else ()
     if isinstance(what, str) and what in laws:
         if element is not None or against != "wavelength" or wavelength is not None or positions:

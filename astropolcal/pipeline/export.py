@@ -104,7 +104,11 @@ def _meta(calibration, light, n_frames, n_bins, assumed):
     """Return keyword to (value, comment)."""
     from astropolcal.version import version
 
-    held = calibration.validity
+    held, sets = calibration.validity, calibration.validity.optics_in
+    if calibration.optics_in is not None:
+        sets = [calibration.optics_in]
+    optics = ",".join(sets[0]) or "none" if sets is not None and len(sets) == 1 else None
+    reference = "Q = N-S, U = NE-SW" if light == "sky" else "instrument"
     entries = {
         "INSTRUME": (held.instrument, "instrument that was calibrated"),
         "CALMODE": (held.mode, "mode of the calibration"),
@@ -112,26 +116,15 @@ def _meta(calibration, light, n_frames, n_bins, assumed):
         "CALHASH": (calibration.content_hash, ""),
         "CALFROM": (held.valid_from, "it holds from this moment (UTC)"),
         "CALUNTIL": (held.valid_until, "it holds until this moment (UTC)"),
-        "CALOPTIC": (_optics(calibration), "optional optics in the beam"),
+        "CALOPTIC": (optics, "optional optics in the beam"),
         "CALASSUM": (",".join(assumed) or None, "optics not calibrated, published values"),
         "MUELLIGH": (light, "light enters: sky or internal source"),
-        "MUELREF": (_reference(light), "frame of the incident Stokes parameters"),
+        "MUELREF": (reference, "frame of the incident Stokes parameters"),
         "NFRAMES": (n_frames, "number of frames"),
         "NBINS": (n_bins, "number of wavelengths"),
         "CREATOR": (f"astropolcal {version}", ""),
     }
     return {key: entry for key, entry in entries.items() if entry[0] is not None}
-
-
-def _optics(calibration):
-    sets = calibration.validity.optics_in
-    if calibration.optics_in is not None:
-        return ",".join(calibration.optics_in) or "none"
-    return None if sets is None or len(sets) != 1 else ",".join(sets[0]) or "none"
-
-
-def _reference(light):
-    return "Q = N-S, U = NE-SW" if light == "sky" else "instrument"
 
 
 def write_mueller(table, path, overwrite=False):
@@ -204,26 +197,11 @@ def _plain(table):
 
 def _hdus(table):
     """Return the table as FITS."""
-    columns = []
-    for name in table.colnames:
-        column = table[name]
-        array = np.asarray(getattr(column, "value", column))
-        unit = getattr(column, "unit", None)
-        # FITS: 32-bit integers and 64-bit floats
-        code = "J" if array.dtype.kind in "iu" else "D"
-        size = int(np.prod(array.shape[1:], dtype=int))
-        # TDIM counts the fastest axis first, numpy the slowest
-        dim = f"({','.join(str(n) for n in array.shape[:0:-1])})" if array.ndim > 1 else None
-        columns.append(
-            fits.Column(
-                name=name.upper(),
-                format=f"{size}{code}" if size > 1 else code,
-                unit=None if unit is None else unit.to_string("fits"),
-                dim=dim,
-                array=array,
-            )
-        )
-    hdu = fits.BinTableHDU.from_columns(columns, name="MUELLER")
+    columns = QTable(table, names=[name.upper() for name in table.colnames], meta={})
+    for name in ("FRAME", "BIN"):
+        columns[name] = columns[name].astype(np.int32)
+    hdu = fits.table_to_hdu(columns)
+    hdu.name = "MUELLER"
     for i, column in enumerate(hdu.columns.names, start=1):
         hdu.header.comments[f"TTYPE{i}"] = _COLUMNS.get(column, "position of the stage")[:47]
     for key, (value, comment) in table.meta.items():

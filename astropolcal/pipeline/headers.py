@@ -2,6 +2,7 @@
 """What headers tell of frames, and whether a calibration and which of its chains hold for them."""
 
 import warnings
+from contextlib import suppress
 
 import astropy.units as u
 import numpy as np
@@ -33,14 +34,15 @@ from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
-from astropolcal.observations.pointings import offline, sky_angle
+from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import numeric_column
+from astropolcal.optics.core import PLACES
 
 __all__ = []
 
 _SKY = ("right_ascension", "declination")
 # columns that are no angles of a stage, though their values may be numbers
-_OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
+_OTHERS = {"exposure_time", "exposures", "mjd", *TEXTS} - {*_SKY, "flc_state"}
 
 
 def describe(header, instrument=None, stated=()):
@@ -52,6 +54,9 @@ def describe(header, instrument=None, stated=()):
         found = _recognized(header)
     else:
         found = instruments.get(instrument) if isinstance(instrument, str) else instrument
+    with suppress(InstrumentError):
+        # which keyword holds the mode may depend on the mode
+        found = found.configured(header)
     layout = found.files or found.headers
     if layout is None:
         return {"instrument": found.name}
@@ -59,6 +64,7 @@ def describe(header, instrument=None, stated=()):
     own = _look_up(header, "instrument", layout)
     if "instrument" in stated or own in layout.identities:
         own = None
+    header = layout.from_header(header)
     time = None if "date" in stated else _time(header, layout)
     return {
         "instrument": found.name,
@@ -119,10 +125,13 @@ class FrameAngles:
         self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
         self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
         self._layout = layout
-        self.n_frames = len(headers)
+        self.n_frames, headers = len(headers), [layout.from_header(header) for header in headers]
         table = QTable({"frame": np.arange(self.n_frames)})
         for column in (c for c in layout.keywords if c not in _OTHERS):
             values = [_look_up(header, column, layout) for header in headers]
+            if column == "flc_state":
+                # a word for no modulation is none
+                values = [v if layout.states.get(str(v).strip(), v) else None for v in values]
             if self._complete(column, values):
                 table[column] = self._column(column, values)
         times = [_time(header, layout) for header in headers]
@@ -156,6 +165,8 @@ class FrameAngles:
             except ValueError as error:
                 raise ObservationError(f"{column}: {one_line(error)}") from None
         keyword, layout = self._layout.keywords[column], self._layout
+        if column == "flc_state":
+            return [self._state(i, value) for i, value in enumerate(values)] * u.rad
         # states of a modulator, cameras and such
         if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
             return np.array([str(value).strip() for value in values])
@@ -177,8 +188,19 @@ class FrameAngles:
             angles.append(angle)
         return angles * u.deg
 
+    def _state(self, i, value):
+        """Return 0 or 1 of a state of the modulator, as positions have it."""
+        word = f"{value:g}" if isinstance(value, float) else str(value).strip()
+        state = self._layout.states.get(word, word)
+        if state not in ("A", "B"):
+            keyword = self._layout.keywords["flc_state"]
+            raise ObservationError(f"frame {i}: {keyword} = {value!r}, allowed are A and B")
+        return float(state == "B")
+
     def position(self, column):
-        """Return an angle of every frame in radian."""
+        """Return an angle of every frame in radian, a moment, a place, or the number of a state."""
+        if column in PLACES:
+            return frame_coordinate(self, column)
         if column not in self._table.colnames:
             keyword = self._layout.keywords.get(column)
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"

@@ -336,18 +336,19 @@ class Library:
         new = Entry(path, calibration, held, digest)
         with _locked(self.source):
             self._scan()
-            same = self._confirmed(lambda: self._of_hash(digest))
+            same = self._confirmed(
+                lambda: next((e for e in self.entries if e.content_hash == digest), None)
+            )
             if same is not None:
                 return self.source / same.name
-            for entry in self.entries:
-                _check_pair(entry, new)
+            for pair in (sorted([entry, new], key=_order) for entry in self.entries):
+                # of which some frame could choose neither
+                if _differ(*pair) and _meet(*pair):
+                    raise CalibrationFileError(_overlap(*pair))
             # within the lock, or two writers at once could both find nothing that overlaps
             write_calibration(calibration, path)
             self._scan()
         return path
-
-    def _of_hash(self, digest):
-        return next((entry for entry in self.entries if entry.content_hash == digest), None)
 
     def overlaps(self):
         """Return a sentence for each pair of different files that claim the same moment."""
@@ -376,21 +377,11 @@ class Library:
         rows = []
         for entry in self.entries:
             held, good = entry.validity, entry._quality or _quality(entry.calibration)
-            rows.append(
-                {
-                    "name": entry.name,
-                    "instrument": held.instrument or "",
-                    "mode": held.mode or "",
-                    "valid_from": held.valid_from or "",
-                    "valid_until": held.valid_until or "",
-                    "optics_in": optics_words(held.optics_in).removeprefix("with "),
-                    "datasets": good["datasets"],
-                    "s_res": np.nan if good["s_res"] is None else good["s_res"],
-                    "s_cv": np.nan if good["s_cv"] is None else good["s_cv"],
-                    "converged": good["converged"],
-                    "content_hash": entry.content_hash,
-                }
-            )
+            stated = ("instrument", "mode", "valid_from", "valid_until")
+            row = {"name": entry.name} | {key: getattr(held, key) or "" for key in stated}
+            row["optics_in"] = optics_words(held.optics_in).removeprefix("with ")
+            row |= {key: np.nan if value is None else value for key, value in good.items()}
+            rows.append(row | {"content_hash": entry.content_hash})
         return Table(rows=rows)
 
 
@@ -437,13 +428,6 @@ def _differ(one, other):
     """Return whether two are different ones, of which some frame could choose either."""
     # a copy under another name chooses the same
     return one.content_hash != other.content_hash and _alike(one.validity, other.validity)
-
-
-def _check_pair(one, other):
-    """Refuse two different files of which some frame could choose neither."""
-    first, second = sorted([one, other], key=_order)
-    if _differ(first, second) and _meet(first, second):
-        raise CalibrationFileError(_overlap(first, second))
 
 
 def _meet(first, second):
@@ -612,18 +596,14 @@ def _write_index(folder, files):
 
 def _index(files):
     content = json.dumps(files, sort_keys=True).encode("ascii")
+    # what decides, besides the files, for what they hold
+    known = {*instruments._REGISTRY, *(name for name, *_ in _plugins())}
     return {
         "version": _INDEX_VERSION,
-        "software": _software(),
+        "software": [our_version, sorted(known), [list(plugin) for plugin in _plugins()]],
         "sha256": hashlib.sha256(content).hexdigest(),
         "files": files,
     }
-
-
-def _software():
-    """Return what decides, besides the files, for what they hold."""
-    known = {*instruments._REGISTRY, *(name for name, *_ in _plugins())}
-    return [our_version, sorted(known), [list(plugin) for plugin in _plugins()]]
 
 
 @lru_cache(maxsize=1)

@@ -7,6 +7,7 @@ Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 import astropy.units as u
@@ -15,13 +16,14 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.calibration.result.validity import instrument_of, validity_of
-from astropolcal.calibration.system import at_bins, errors, match_wavelengths
+from astropolcal.calibration.system import at_wavelengths, errors, match_wavelengths
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     join,
     leaves,
     system_mueller,
     system_mueller_derivatives,
+    warn_beyond,
     with_beam,
 )
 from astropolcal.converters.calibration import content_hash
@@ -32,6 +34,9 @@ from astropolcal.exceptions import (
     InstrumentError,
     ParameterError,
 )
+from astropolcal.fitscheck import primary_header
+from astropolcal.optics import COORDINATES
+from astropolcal.optics.core import PLACES, finite_position
 from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,
@@ -144,10 +149,10 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     ----------
     path : path-like, Library or Calibration
         A folder of calibrations, a file, or a calibration that is in memory.
-    header : `~astropy.io.fits.Header` or mapping, optional
-        Primary header of the frame (or of one of several), which tells instrument, mode,
-        date and, as far as the instrument knows, optics in the beam; what is given below comes
-        before it.
+    header : `~astropy.io.fits.Header`, mapping or path-like, optional
+        Primary header of the frame (or of one of several), or its file, which tells instrument,
+        mode, date and, as far as the instrument knows, optics in the beam; what is given below
+        comes before it.
     instrument, mode, date, optics_in
         As for `~astropolcal.pipeline.Library.find`.
     max_age : `~astropy.units.Quantity`, optional
@@ -194,6 +199,7 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     ((22, 4, 4), (22, 16, 16))
     """
     library = _library(path)
+    header = primary_header(header) if isinstance(header, str | PathLike) else header
     if header is not None and not hasattr(header, "get"):
         raise ParameterError(
             f"header = {header!r} is of type {type(header).__name__}; a FITS header or a mapping "
@@ -214,6 +220,15 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     elif date is not None:
         loaded._check(loaded._stated_frame(), light="internal")
     return loaded
+
+
+def _headers(header):
+    """Return headers as a list, those of files read, and whether there is one outside a list."""
+    # a Header of astropy is no Mapping
+    single = isinstance(header, Mapping | str | PathLike) or hasattr(header, "cards")
+    headers = [header] if single else list(() if header is None else header)
+    paths = (str, PathLike)
+    return [primary_header(one) if isinstance(one, paths) else one for one in headers], single
 
 
 def _library(source):
@@ -288,7 +303,14 @@ class LoadedCalibration:
         return self.calibration.wavelength
 
     def system_mueller(
-        self, header=None, *, positions=None, wavelength=None, beam="right", light="sky"
+        self,
+        header=None,
+        *,
+        positions=None,
+        wavelength=None,
+        interpolate=False,
+        beam="right",
+        light="sky",
     ):
         """
         Return the system Mueller matrix of frames, with its covariance.
@@ -297,14 +319,16 @@ class LoadedCalibration:
 
         Parameters
         ----------
-        header : `~astropy.io.fits.Header`, mapping, or sequence of those
-            Primary header of a frame, or those of several.
+        header : `~astropy.io.fits.Header`, mapping, path-like, or sequence of those
+            Primary header of a frame, or the file that has it, or those of several.
         positions : dict of str to `~astropy.units.Quantity`
             In its place the positions of all stages (on sky with the true angle of the
             half-wave plate), scalar or shape (n_frames,).
         wavelength : `~astropy.units.Quantity`, optional
-            By default the calibration's grid. Others than those of the grid are possible where
-            no parameter is given per wavelength, and within the range of the grid.
+            By default the calibration's grid. Others within its range are possible where no
+            parameter is given per wavelength, or with ``interpolate``.
+        interpolate : bool
+            Whether parameters given per wavelength are interpolated linearly.
         beam : {"right", "left"}
             The beam.
         light : {"sky", "internal"}
@@ -335,9 +359,7 @@ class LoadedCalibration:
         """
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
-        # a Header of astropy is no Mapping
-        single = isinstance(header, Mapping) or hasattr(header, "cards")
-        headers = [header] if single else list(() if header is None else header)
+        headers, single = _headers(header)
         if header is not None:
             self._check(self._frames(headers), light)
         elif "date" in self._stated:
@@ -346,17 +368,98 @@ class LoadedCalibration:
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             # the same reader as for tables of observations, so that tracking laws and offsets agree
-            positions = {name: angle * u.rad for name, angle in found.items()}
-        lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
-        chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
+            units = dict.fromkeys(COORDINATES, 1) | PLACES
+            positions = {name: angle * units.get(name, u.rad) for name, angle in found.items()}
+        lam, mix = match_wavelengths(self.wavelength, chain, wavelength, interpolate)
+        chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
+        warn_beyond(chain, {k: finite_position(x, k) for k, x in positions.items() if k in PLACES})
         value = system_mueller(chain, lam, positions)
         slopes = system_mueller_derivatives(chain, lam, positions)
-        parts = errors(self.calibration, self._covariance, value, slopes, bins)
-        shown = {name: _degrees(position) for name, position in positions.items()}
+        parts = errors(self.calibration, self._covariance, value, slopes, mix)
+        shown = {name: _degrees(name, position) for name, position in positions.items()}
         if single:
             value, *parts = (part[0] for part in (value, *parts))
             shown = {name: angle[0] for name, angle in shown.items()}
         return SystemMueller(value, lam, beam, shown, *parts, assumed)
+
+    def correct(
+        self,
+        stokes,
+        header=None,
+        *,
+        positions=None,
+        hwp=None,
+        difference="right-left",
+        **options,
+    ):
+        r"""
+        Correct a Stokes cube that a pipeline has made of frames by differences.
+
+        With X the ``difference`` of the beams, right minus left or the other way round, it holds
+        the mean sum of the beams as I, and :math:`(X_0 - X_{45}) / 2` and :math:`(X_{22.5} -
+        X_{67.5}) / 2` as Q and U, by the commanded angle of the half-wave plate; with a modulator,
+        X of state B counts negative. Frames at other angles, or of several cycles, are taken by
+        least squares. Neither Q nor U may have been rotated.
+
+        Parameters
+        ----------
+        stokes : array_like
+            Shape (n_components, n_wavelengths, ...): I, Q, U. A fourth, V, is taken for true.
+        header : sequence of `~astropy.io.fits.Header`, mapping or path-like
+            Primary headers of all frames that the cube was made of, or their files.
+        positions : dict of str to `~astropy.units.Quantity`
+            In their place the positions of all stages in each frame, as for `system_mueller`.
+        hwp : `~astropy.units.Quantity`, optional
+            Commanded angles of the half-wave plate; by default those of the headers or positions.
+        difference : {"right-left", "left-right"}
+            Of the beams.
+        **options
+            ``wavelength``, ``interpolate`` and ``light``, as for `system_mueller`.
+
+        Returns
+        -------
+        stokes, systematic : `~numpy.ndarray`
+            Of the light that entered, in the frame of the sky, and what the errors of the
+            calibration add to each (standard deviations; infinite where it is open), of the shape
+            of ``stokes``. V is the one that was given.
+
+        Raises
+        ------
+        ParameterError
+            If the cube has another shape, or the angles of the plate do not tell Q and U apart.
+        """
+        given, (headers, _) = np.array(stokes, dtype=float), _headers(header)
+        options |= {"header": headers or None, "positions": positions}
+        beams = [self.system_mueller(beam=b, **options) for b in ("right", "left")]
+        if hwp is None and headers:
+            hwp = FrameAngles(headers, self.instrument).position("hwp") * u.rad
+        hwp = beams[0].positions["hwp"] if hwp is None else hwp
+        size = len(beams[0].wavelength)
+        if given.ndim < 2 or given.shape[0] not in (3, 4) or given.shape[1] != size:
+            raise ParameterError(
+                f"stokes of shape {given.shape}; needed are I, Q, U (and V) at {size} wavelengths"
+            )
+        sums = _demodulation(hwp, beams[0].positions.get("flc_state", 0), difference)
+        # b: beams, f: frames, w: wavelengths, k: measured, s and t: true Stokes parameters, r: rank
+        matrix = np.einsum("kbf,bfws->wks", sums, [m.value[..., 0, :] for m in beams])
+        slopes = np.einsum("kbf,bfwsr->wksr", sums, [m.factor[..., 0, :, :] for m in beams])
+        unknown = [(m.is_open | m.is_blind)[..., 0, :] for m in beams]
+        unknown = np.einsum("kbf,bfws->wks", np.abs(sums), unknown) > 0
+        inverse = np.linalg.inv(matrix[..., :3])
+        flat = given.reshape(len(given), size, -1)
+        rest = flat[:3]
+        if len(flat) == 4:
+            rest = rest - np.einsum("wk,wp->kwp", matrix[..., 3], flat[3])
+        flat[:3] = np.einsum("wks,swp->kwp", inverse, rest)
+        n = len(flat)
+        moved = np.einsum("wjk,wksr->wjsr", inverse, slopes[..., :n, :])
+        # small, and the same for all pixels (p), which only need the products of their light
+        tensor = np.einsum("wjsr,wjtr->wjst", moved, moved)
+        spread = np.sqrt(np.einsum("wjst,swp,twp->jwp", tensor, flat, flat, optimize=True))
+        is_open = np.einsum("wjk,wks,swp->jwp", np.abs(inverse), unknown[..., :n], np.abs(flat)) > 0
+        systematic = np.zeros_like(flat)
+        systematic[:3] = np.where(is_open, np.inf, spread)
+        return flat.reshape(given.shape), systematic.reshape(given.shape)
 
     def _check(self, frames, light):
         """Refuse frames for which the calibration does not hold."""
@@ -366,7 +469,7 @@ class LoadedCalibration:
     def _stated_frame(self):
         """Return a frame without a header, of the date that was stated."""
         mode = self._stated.get("mode", self.validity.mode)
-        return [("the frame", self._stated["date"], mode)]
+        return [("the frame", self._stated.get("date"), mode)]
 
     def _frames(self, headers):
         """Return what to call each frame, its date and its mode; refuse other instruments."""
@@ -401,12 +504,18 @@ class LoadedCalibration:
         if light == "internal":
             return join(inner), ()
         outer = telescope_optics(self.calibration)
-        return self._published(inner) if outer is None else (join([*outer, *inner]), ())
+        if outer is not None:
+            return join([*outer, *inner]), ()
+        frames = self._frames(headers) if headers else self._stated_frame()
+        return self._published(inner, [date for _, date, _ in frames if date is not None])
 
-    def _published(self, inner):
+    def _published(self, inner, dates):
         """Return a chain with the telescope as the instrument publishes it."""
+        told = {"wavelength": self.wavelength, "date": dates or None}
+        known = self.instrument.sky_options if self.instrument else ()
+        options = {key: told[key] for key in known}
         try:
-            chain = self.instrument.on_sky(join(inner)) if self.instrument else None
+            chain = self.instrument.on_sky(join(inner), **options) if self.instrument else None
         except InstrumentError:
             chain = None
         if chain is None:
@@ -427,6 +536,22 @@ class LoadedCalibration:
         return chain, assumed
 
 
-def _degrees(position):
+def _degrees(name, position):
+    if name in PLACES:
+        return finite_position(position, name) * PLACES[name]
     angle = u.Quantity(position)
     return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
+
+
+def _demodulation(hwp, state, difference):
+    """Return by what the beams of each frame are multiplied for I, Q and U, (3, 2, n)."""
+    if difference not in ("right-left", "left-right"):
+        raise ParameterError(f"difference = {difference!r}; allowed are right-left, left-right")
+    theta = 4 * np.atleast_1d(u.Quantity(hwp).to_value(u.rad))
+    sign = np.where(np.asarray(state) > 0, -1.0, 1.0) * (1 if difference == "right-left" else -1)
+    ideal = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    if np.linalg.matrix_rank(ideal, tol=1e-6) < 2:
+        raise ParameterError("the angles of the half-wave plate do not tell Q and U apart")
+    two = np.linalg.pinv(ideal) * sign
+    mean = np.full(len(theta), 1 / len(theta))
+    return np.stack([[mean, mean], *np.stack([two, -two], axis=1)])

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Colours, markers, sizes, and what else all figures have in common."""
 
+from contextlib import contextmanager
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -45,27 +46,28 @@ _SETTINGS = {
     "lines.markersize": 5.5,
     "errorbar.capsize": 2.5,
     "figure.facecolor": "white",
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
     "savefig.facecolor": "white",
 }
 
 
-def style():
-    """Return the context in which figures are drawn; the user's settings come back after it."""
+@contextmanager
+def canvas(figure, width, height, layout="constrained"):
+    """Give the figure to draw into, in our style: the one given, or a new one of this size (inch).
+
+    The user's settings come back after it.
+    """
     import matplotlib as mpl
-
-    return mpl.rc_context(_SETTINGS)
-
-
-def canvas(figure, width, height):
-    """Return the figure to draw into: the one given, or a new one of this size (inch)."""
     from matplotlib.figure import Figure
 
-    if figure is None:
-        return Figure(figsize=(width, height), layout="constrained")
-    if isinstance(figure, Figure) and figure.get_layout_engine() is None:
-        # without it a legend cannot be kept outside the axes
-        figure.set_layout_engine("constrained")
-    return figure
+    with mpl.rc_context(_SETTINGS):
+        if figure is None:
+            figure = Figure(figsize=(width, height), layout=layout)
+        elif isinstance(figure, Figure) and not (layout and figure.get_layout_engine()):
+            # without it a legend cannot be kept outside the axes
+            figure.set_layout_engine(layout)
+        yield figure
 
 
 def looks(count):

@@ -11,38 +11,18 @@ from astropolcal.calibration.noise.scatter import what_is_left_out
 from astropolcal.calibration.validation import paper_accuracies
 from astropolcal.calibration.validation.targets import TARGETS
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    MINUS,
-    PURPLE,
-    SIGMA,
-    VERMILION,
-    canvas,
-    draw_band,
-    draw_line,
-    heading,
-    legend_entries,
-    legend_outside,
-    looks,
-    nanometres,
-    scale_axis,
-    style,
-    wavelength_label,
-)
+from astropolcal.plotting import _style as st
 
 __all__ = ["plot_accuracy", "plot_star_check", "plot_target_accuracy"]
 
 _CURVES = {
     "s_res": (
-        VERMILION,
+        st.VERMILION,
         "o",
-        f"s_res = √(Σr²/(n {MINUS} k)): scatter of one datum about the model",
+        f"s_res = √(Σr²/(n {st.MINUS} k)): scatter of one datum about the model",
     ),
-    "s_mean": (BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
-    "s_cv": (GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
+    "s_mean": (st.BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
+    "s_cv": (st.GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
 }
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
@@ -109,9 +89,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     count = len(records) + len(others)
     grids = [r.accuracy for r in records] + [entry["wavelength_nm"] for entry in standards]
     one_panel = len(records) > 1 and not curves and all(len(lam) == 1 for lam in grids)
-    with style():
-        size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
-        figure = canvas(figure, *size)
+    size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
+    with st.canvas(figure, *size) as figure:
         # one scale, so that datasets can be compared by eye
         share = {"sharex": True, "sharey": True, "squeeze": False}
         panels = figure.subplots(1 if one_panel else count, 1, **share)[:, 0]
@@ -119,15 +98,16 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
             _draw_side_by_side(panels[0], calibration, records, standards)
         else:
             _draw_panels(panels, calibration, records, standards, others, curves)
-            wavelength_label(panels[-1])
+            st.wavelength_label(panels[-1])
         for axes in panels:
             axes.set_ylabel("accuracy (% of polarization)")
         values = [record.accuracy[key].to_value(u.percent) for record in records for key in _CURVES]
         values += [np.array(entry["s_standard_percent"]) for entry in standards]
-        scale_axis(panels[0], np.concatenate([*values, *(value for _, value in curves.values())]))
-        heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
+        values += [value for _, value in curves.values()]
+        st.scale_axis(panels[0], np.concatenate(values))
+        st.heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
         # by label, for the curves of all panels look alike and share one legend
-        legend_outside(figure, list(legend_entries(panels).values()))
+        st.legend_outside(figure, list(st.legend_entries(panels).values()))
     return figure
 
 
@@ -137,28 +117,28 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         name = f"{record.name}: " if len(panels) > 1 else ""
         counts = f"n = {_span(record.accuracy['n'])} data per wavelength"
         axes.set_title(f"{name}{counts}, k = {np.max(record.accuracy['k'])} free parameters")
-        lam = nanometres(record.accuracy["wavelength"])
+        lam = st.nanometres(record.accuracy["wavelength"])
         for key, (color, marker, _) in _CURVES.items():
             values = record.accuracy[key].to_value(u.percent)
             # a curve that is missing is said to be so in the legend, not left out
             label = _label(key, values, calibration)
-            draw_line(axes, lam, values, color=color, marker=marker, label=label)
+            st.draw_line(axes, lam, values, color=color, marker=marker, label=label)
     own = [[e for e in standards if e["source"] == record.source] for record in records]
     looks = zip(cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False)
     looks = {id(entry): look for entry, look in zip(standards, looks, strict=False)}
     for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
         for entry in entries:
             marker, line = looks[id(entry)]
-            look = {"color": PURPLE, "marker": marker, "linestyle": line}
+            look = {"color": st.PURPLE, "marker": marker, "linestyle": line}
             look["label"] = _PREDICTED.format(entry["name"])
-            draw_line(axes, entry["wavelength_nm"], entry["s_standard_percent"], **look)
+            st.draw_line(axes, entry["wavelength_nm"], entry["s_standard_percent"], **look)
     for axes, entry in zip(panels[len(records) :], others, strict=True):
         axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data per wavelength, predicted")
-        look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
-        draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
+        look = {"color": st.GREEN, "alpha": 0.6, "label": _COMPARED}
+        st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
         for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
-            axes.plot(lam, value, color=BLACK, linestyle=line, label=label)
+            axes.plot(lam, value, color=st.BLACK, linestyle=line, label=label)
 
 
 def _label(key, values, calibration):
@@ -170,16 +150,14 @@ def _reference(label, pair):
     """Return a reference curve in nm and percent."""
     try:
         wavelength, accuracy = pair
-        lam, value = nanometres(wavelength), np.atleast_1d(accuracy.to_value(u.percent))
+        lam, value = st.nanometres(wavelength), np.atleast_1d(accuracy.to_value(u.percent))
+        if lam.shape != value.shape:
+            raise ValueError(f"it has {lam.size} wavelengths but {value.size} accuracies")
     except (AttributeError, TypeError, ValueError, u.UnitConversionError) as error:
         raise ParameterError(
             f"reference {label!r} must be a pair (wavelength, accuracy) of quantities, "
             f"the second in percent: {error}"
         ) from None
-    if lam.shape != value.shape:
-        raise ParameterError(
-            f"reference {label!r} has {lam.size} wavelengths but {value.size} accuracies"
-        )
     return lam, value
 
 
@@ -193,10 +171,10 @@ def _draw_side_by_side(axes, calibration, records, standards):
         axes.plot(at, values, marker=marker, ls="", color=color, label=label)
     if standards:
         predicted = [entry["s_standard_percent"][0] for entry in standards]
-        axes.plot(after, predicted, "D", color=PURPLE, label=_PREDICTED.format("a standard"))
+        axes.plot(after, predicted, "D", color=st.PURPLE, label=_PREDICTED.format("a standard"))
         compared = [entry["s_cv_percent"][0] for entry in standards]
-        axes.plot(after, compared, "_", color=GREEN, markersize=14, label=_COMPARED)
-    places = [(r.name, nanometres(r.accuracy["wavelength"])[0]) for r in records]
+        axes.plot(after, compared, "_", color=st.GREEN, markersize=14, label=_COMPARED)
+    places = [(r.name, st.nanometres(r.accuracy["wavelength"])[0]) for r in records]
     places += [(entry["name"], entry["wavelength_nm"][0]) for entry in standards]
     names = [f"{name}\n{lam:.0f} nm" for name, lam in places]
     axes.set_xticks([*at, *after], names, rotation=35, ha="right", fontsize=9.5)
@@ -265,8 +243,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
     if not tables:
         raise ObservationError("the chain has no half-wave plate: no accuracy for targets")
     parts = paper_accuracies(calibration, targets[:1])
-    with style():
-        figure = canvas(figure, 8.5, 11)
+    with st.canvas(figure, 8.5, 11) as figure:
         panels = figure.subplots(3, 1, sharex=True)
         handles = _draw_parts(panels[0], parts[0]) if parts else []
         lines = _draw_targets(panels[1], tables, "s_p")
@@ -276,18 +253,18 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
             axes.set_ylabel(label)
         panels[1].set_title("Degree of polarization of a target")
         panels[2].set_title("Angle of polarization of a target")
-        wavelength_label(panels[2])
-        heading(figure, calibration, "Accuracy for targets")
-        legend_outside(figure, [*handles, *lines])
+        st.wavelength_label(panels[2])
+        st.heading(figure, calibration, "Accuracy for targets")
+        st.legend_outside(figure, [*handles, *lines])
     return figure
 
 
 def _draw_parts(axes, table):
     # the parts are those of the instrument and the same for every target: the first will do
     axes.set_title("Residuals of the calibrations, which know neither telescope nor correlations")
-    lam = nanometres(table["wavelength"])
+    lam = st.nanometres(table["wavelength"])
     handles, values = [], []
-    for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):
+    for (key, label), (color, marker) in zip(_PARTS.items(), st.looks(len(_PARTS)), strict=True):
         value = table[key].to_value(u.percent)
         look = {"color": color, "marker": marker}
         if key == "s_abs":
@@ -298,25 +275,25 @@ def _draw_parts(axes, table):
             label = f"{key}: not known, no such dataset"
             look = {"linestyle": "none", "marker": "none"}
         # what is exactly zero stands for a calibration that is missing
-        handles.append(draw_line(axes, lam, value, label=label, **look))
+        handles.append(st.draw_line(axes, lam, value, label=label, **look))
         values.append(value)
-    scale_axis(axes, np.concatenate(values))
+    st.scale_axis(axes, np.concatenate(values))
     return handles
 
 
 def _draw_targets(axes, tables, key):
     lines, values = [], []
     # apart from the looks of the parts, which share the legend
-    for table, (color, marker) in zip(tables, looks(len(tables) + 4)[4:], strict=True):
-        lam, value = nanometres(table["wavelength"]), table[key].value
+    for table, (color, marker) in zip(tables, st.looks(len(tables) + 4)[4:], strict=True):
+        lam, value = st.nanometres(table["wavelength"]), table[key].value
         # large open markers and wide lines below: of curves that coincide all are seen
         below = len(tables) - 1 - len(lines)
         look = {"color": color, "marker": marker, "linewidth": 1.5 + 2 * below}
         look |= {"markersize": 5.5 + 4.5 * below, "markeredgewidth": 1.5}
         look |= {"markerfacecolor": "none"} if below else {}
-        lines.append(draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
+        lines.append(st.draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
         values.append(value)
-    scale_axis(axes, np.concatenate(values))
+    st.scale_axis(axes, np.concatenate(values))
     return lines
 
 
@@ -384,15 +361,14 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             raise ObservationError("the calibration was checked with no star: nothing to draw")
         entry = calibration.fit["stars"][-1]
     values = {key: np.asarray(value) for key, value in entry.items() if isinstance(value, list)}
-    with style():
-        figure = canvas(figure, 12, 6.4)
+    with st.canvas(figure, 12, 6.4) as figure:
         panels = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
         for (top, bottom), quantity in zip(panels.T, _QUANTITIES, strict=True):
             _draw_star(top, bottom, values, *quantity)
-            wavelength_label(bottom)
+            st.wavelength_label(bottom)
         what = f"{entry['star']}, which no fit saw"
-        heading(figure, calibration, what, [entry["name"]])
-        legend_outside(figure, list(legend_entries(panels.ravel()).values()), columns=2)
+        st.heading(figure, calibration, what, [entry["name"]])
+        st.legend_outside(figure, list(st.legend_entries(panels.ravel()).values()), columns=2)
     return figure
 
 
@@ -404,20 +380,20 @@ def _draw_star(top, bottom, values, key, unit, label, short):
         values[f"{key}{part}_{unit}"][order]
         for part in ("", "_err", "_known", "_known_err", "_error")
     )
-    points = {"color": BLUE, "marker": "o", "linestyle": "none"}
-    observed = f"observed, with 1{SIGMA} errors of the mean"
+    points = {"color": st.BLUE, "marker": "o", "linestyle": "none"}
+    observed = f"observed, with 1{st.SIGMA} errors of the mean"
     top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
     # a star whose polarization no catalogue has is drawn alone
     if np.isfinite(known).any():
-        top.plot(lam, known, color=VERMILION, label="catalogue, with the published errors")
-        draw_band(top, lam, known, spread, VERMILION, 0.2)
-    bottom.axhline(0, color=GREY, linewidth=1)
+        top.plot(lam, known, color=st.VERMILION, label="catalogue, with the published errors")
+        st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
+    bottom.axhline(0, color=st.GREY, linewidth=1)
     bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
     # of the angle no such error is known
     if key == "dolp":
         single = values["s_dolp_percent"][order]
         for sign in (1, -1):
             label_of = "± rms error of a single cycle" if sign > 0 else None
-            bottom.plot(lam, sign * single, color=GREY, linestyle="--", label=label_of)
+            bottom.plot(lam, sign * single, color=st.GREY, linestyle="--", label=label_of)
     top.set_ylabel(label)
-    bottom.set_ylabel(f"obs. {MINUS} catalogue\n({short})")
+    bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")

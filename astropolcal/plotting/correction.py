@@ -4,33 +4,16 @@
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    PURPLE,
-    VERMILION,
-    canvas,
-    draw_band,
-    legend_entries,
-    legend_outside,
-    mean_known,
-    nanometres,
-    note,
-    plain_numbers,
-    style,
-    wavelength_label,
-)
+from astropolcal.plotting import _style as st
 
 __all__ = ["plot_images"]
 
 # of the brightest pixels, those beyond this quantile may saturate the colours
 _QUANTILE = 0.995
-_COLORS = {"q": BLUE, "u": VERMILION, "v": GREEN}
+_COLORS = {"q": st.BLUE, "u": st.VERMILION, "v": st.GREEN}
 _MARKERS = {"q": "o", "u": "s", "v": "^"}
 # statistical and systematic error of the degree
-_LINES = (("o-", BLACK), ("s--", GREEN))
+_LINES = (("o-", st.BLACK), ("s--", st.GREEN))
 _POLARIZED = ("Q", "U", "Q$_\\phi$", "U$_\\phi$")
 
 
@@ -82,8 +65,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
     limit = _top(np.abs([panels[name] for name in _POLARIZED]))
-    with style():
-        figure = canvas(figure, 12.5, 8.2)
+    with st.canvas(figure, 12.5, 8.2) as figure:
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             _panel(figure, axes, name, image, corrected, limit)
@@ -110,13 +92,13 @@ def _panels(corrected, chosen):
     found = corrected.azimuthal()
     images = [corrected[name][chosen] for name in "IQU"]
     images += [found[name][chosen] for name in ("q_phi", "u_phi")]
-    panels = dict(zip(("I", *_POLARIZED), map(mean_known, images), strict=True))
+    panels = dict(zip(("I", *_POLARIZED), map(st.mean_known, images), strict=True))
     error, kind = corrected.error("Q")[chosen], "statistical"
     if not np.isfinite(error).any():
         error, kind = corrected.error("Q", "systematic")[chosen], "systematic"
     # errors of wavelengths are independent if they are statistical, and hardly if not
     power = 2 if kind == "statistical" else 1
-    mean = mean_known(error**power) ** (1 / power) / len(chosen) ** (1 - 1 / power)
+    mean = st.mean_known(error**power) ** (1 / power) / len(chosen) ** (1 - 1 / power)
     return panels | {f"{kind} error of Q": mean}
 
 
@@ -138,7 +120,7 @@ def _panel(figure, axes, name, image, corrected, limit):
     axes.grid(False)
     axes.set_facecolor("0.75")
     axes.set_title(name)
-    axes.plot(0, 0, "+", color=BLACK if name in _POLARIZED else "white")
+    axes.plot(0, 0, "+", color=st.BLACK if name in _POLARIZED else "white")
     low, high = drawn.get_clim()
     with np.errstate(invalid="ignore"):
         beyond = (image > high).any() + 2 * (image < low).any()
@@ -171,7 +153,7 @@ def _axis_label(corrected, direction):
 
 
 def _heading(corrected, wavelength):
-    nm = nanometres(corrected.wavelength)
+    nm = st.nanometres(corrected.wavelength)
     count = corrected.determined[:, :3].all(axis=1).sum()
     of = f"mean of {count} wavelengths, {nm.min():.0f} to {nm.max():.0f} nm"
     of = of if wavelength is None else f"{nm[wavelength]:.0f} nm"
@@ -185,32 +167,31 @@ def plot_spectrum(corrected, *, figure=None):
     """Draw q and u of a point source, their errors, and how well they are determined."""
     if corrected.stokes.ndim != 2:
         raise ParameterError("these are images; take an aperture, or draw them with plot_images")
-    nm = nanometres(corrected.wavelength)
-    with style():
-        figure = canvas(figure, 9.0, 9.5)
+    nm = st.nanometres(corrected.wavelength)
+    with st.canvas(figure, 9.0, 9.5) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.3))
         for name in corrected.components[1:].lower():
             _values(top, nm, corrected, name)
-        top.axhline(0, color=GREY, linewidth=0.8)
+        top.axhline(0, color=st.GREY, linewidth=0.8)
         top.set_ylabel("fraction of I (%)")
         _error_lines(middle, nm, corrected)
-        bottom.plot(nm, corrected.condition, "o-", color=PURPLE)
+        bottom.plot(nm, corrected.condition, "o-", color=st.PURPLE)
         bottom.set_ylabel("condition")
         if np.nanmax(corrected.condition) >= 1e3:
             bottom.set_yscale("log")
         else:
             # 1 is the condition of an ideal instrument, the best there is
             bottom.set_ylim(bottom=1)
-        wavelength_label(bottom)
+        st.wavelength_label(bottom)
         figure.suptitle(f"Corrected polarization ({_MODES[corrected.mode]})")
-        legend_outside(figure, _handles(top, middle), columns=len(corrected.components))
+        st.legend_outside(figure, _handles(top, middle), columns=len(corrected.components))
         figure.align_ylabels()
     return figure
 
 
 def _handles(*all_axes):
     """Return what a legend shows: the errors of each quantity below each other."""
-    found = [sorted(legend_entries([axes]).items(), key=_first) for axes in all_axes]
+    found = [sorted(st.legend_entries([axes]).items(), key=_first) for axes in all_axes]
     # the statistical error comes first, in the order of q, u, v
     return [handle for entries in found for _, handle in entries]
 
@@ -231,7 +212,7 @@ def _values(axes, nm, corrected, name):
     axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
     if (known := np.isfinite(systematic)).any():
         band = np.where(known, systematic, np.nan)
-        draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")
+        st.draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")
 
 
 def _error_lines(axes, nm, corrected):
@@ -243,6 +224,6 @@ def _error_lines(axes, nm, corrected):
     axes.set_ylabel("error of the degree (%)")
     if axes.lines:
         axes.set_yscale("log")
-        plain_numbers(axes)
+        st.plain_numbers(axes)
     else:
-        note(axes, "no errors are known")
+        st.note(axes, "no errors are known")

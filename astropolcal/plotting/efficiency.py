@@ -11,16 +11,7 @@ from astropolcal.calibration.result.comparison import compare
 from astropolcal.chain import stages
 from astropolcal.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import (
-    GREY,
-    canvas,
-    draw_line,
-    legend_outside,
-    looks,
-    nanometres,
-    style,
-    wavelength_label,
-)
+from astropolcal.plotting import _style as st
 
 __all__ = ["plot_comparison", "plot_observability"]
 
@@ -55,15 +46,14 @@ def plot_polarimetric_efficiency(
     ``derotator`` angle: the least over the wavelengths. Without a derotator there are lines against
     the parallactic angle, or against the wavelength downstream of an internal source.
     """
-    lam, moving = nanometres(wavelength), stages(chain)
+    lam, moving = st.nanometres(wavelength), stages(chain)
     at = {"altitude": altitude, "parallactic": parallactic}
     at = {key: angle for key, angle in at.items() if key in moving}
     asked = partial(polarimetric_efficiency, chain, wavelength, **settings)
     # without an altitude axis there is no pointing to map
     turns, maps = has_derotator(chain), "altitude" in at
     panels = (2 if turns else int(not maps)) + maps
-    with style():
-        fig = canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2)
+    with st.canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2) as fig:
         axes = list(fig.subplots(1, panels, squeeze=False)[0])
         if turns:
             values = asked(derotator=_DEROTATOR * u.deg, **at)
@@ -93,10 +83,9 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
     offset = table["offset"].to_value(u.deg)
     # markers tell the lines apart without colour; at all offsets they would be a band
     every = max(1, len(offset) // 12)
-    with style():
-        fig = canvas(figure, 6.5, 5.2)
+    with st.canvas(figure, 6.5, 5.2) as fig:
         ax = fig.subplots()
-        for (color, marker), name in zip(looks(2), ("mean", "least"), strict=True):
+        for (color, marker), name in zip(st.looks(2), ("mean", "least"), strict=True):
             ax.plot(offset, table[name], color=color, marker=marker, markevery=every, label=name)
         words = f"best offset, {_degree(best.offset)}"
         marked = best.offset.to_value(u.deg)
@@ -117,7 +106,7 @@ def _without_derotator(ax, lam, asked, shown, on_sky):
         _lines(ax, lam, angles, asked(parallactic=angles * u.deg), shown)
         ax.set(xlabel="parallactic angle (deg)", xlim=(-180, 180), xticks=np.arange(-180, 181, 90))
         return
-    draw_line(ax, lam, np.atleast_2d(asked())[0], marker="o")
+    st.draw_line(ax, lam, np.atleast_2d(asked())[0], marker="o")
     ax.set(xlabel="wavelength (nm)", ylabel=_SHARE, ylim=(0, 1.02))
 
 
@@ -130,8 +119,8 @@ def _lines(ax, lam, angles, values, shown):
         rows = np.unique(np.linspace(0, lam.size - 1, min(_MOST_LINES, lam.size)).astype(int))
     else:
         # two wavelengths asked for may be nearest to the same one
-        rows = np.unique(np.abs(nanometres(shown)[:, None] - lam).argmin(axis=1))
-    for (color, marker), row in zip(looks(len(rows)), rows, strict=True):
+        rows = np.unique(np.abs(st.nanometres(shown)[:, None] - lam).argmin(axis=1))
+    for (color, marker), row in zip(st.looks(len(rows)), rows, strict=True):
         # markers tell the lines apart without colour; at all points they would be a band
         look = {"color": color, "marker": marker, "markevery": 6, "label": f"{lam[row]:.0f} nm"}
         ax.plot(angles, values[:, row], **look)
@@ -221,15 +210,14 @@ def plot_comparison(members, *, title=None, figure=None):
     """
     table = members if isinstance(members, QTable) else compare(members)
     labels = list(dict.fromkeys(str(label) for label in table["label"]))
-    with style():
-        fig = canvas(figure, 11.5, 8.2)
+    with st.canvas(figure, 11.5, 8.2) as fig:
         axes = fig.subplots(2, 2, sharex=True).ravel()
         handles = [
             _draw_member(axes, table[table["label"] == label], label, *look)
-            for label, look in zip(labels, looks(len(labels)), strict=True)
+            for label, look in zip(labels, st.looks(len(labels)), strict=True)
         ]
         _label_panels(axes)
-        legend_outside(fig, handles, columns=min(4, len(labels)))
+        st.legend_outside(fig, handles, columns=min(4, len(labels)))
         fig.suptitle(title or "Polarization optics downstream of the telescope")
     return fig
 
@@ -265,7 +253,7 @@ def _label_panels(axes):
     axes[2].set_ylim(bottom=-0.03 * axes[2].get_ylim()[1])
     axes[3].set_ylim(-0.02, 1.02)
     for ax in axes[2:]:
-        wavelength_label(ax)
+        st.wavelength_label(ax)
 
 
 # ---- standard stars over a night ---------------------------------------------------------------
@@ -315,9 +303,8 @@ def plot_observability(seen, *, total=None, figure=None):
     _check(seen)
     # UTC, before the first dark hour of the first star
     midnight = np.floor(seen[0].table["time"][0].mjd)
-    stars = list(zip(seen, looks(len(seen)), strict=True))
-    with style():
-        figure = canvas(figure, 8.0, 6.4)
+    stars = list(zip(seen, st.looks(len(seen)), strict=True))
+    with st.canvas(figure, 8.0, 6.4) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
         for star, look in stars:
             hours = (star.table["time"].mjd - midnight) * 24
@@ -328,8 +315,8 @@ def plot_observability(seen, *, total=None, figure=None):
             upper.plot([], [], color=color, marker=marker, label=star.name)[0]
             for star, (color, marker) in stars
         ]
-        dotted = upper.plot([], [], color=GREY, ls=":", label="too low to observe")
-        legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
+        dotted = upper.plot([], [], color=st.GREY, ls=":", label="too low to observe")
+        st.legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
         few = total is not None and total > len(seen)
         which = f"The first {len(seen)} of {total} standard stars" if few else "Standard stars"
         figure.suptitle(f"{which}, night of {seen[0].night}\n{_place(seen[0].site)}")
@@ -365,7 +352,7 @@ def _curve(axes, hours, values, good, color, marker):
 
 def _finish(upper, lower, seen):
     for limit in {float(star.min_altitude.value) for star in seen}:
-        upper.axhline(limit, color=GREY, linestyle="--", linewidth=1)
+        upper.axhline(limit, color=st.GREY, linestyle="--", linewidth=1)
     upper.set(ylabel="altitude (deg)", ylim=(0, 90), yticks=np.arange(0, 91, 15))
     angles = np.concatenate([star.table["parallactic"].value for star in seen])
     low = min(_TICK * np.floor(angles.min() / _TICK), -180)

@@ -12,28 +12,7 @@ from astropolcal.gap.cells import places
 from astropolcal.gap.residuals import frame_blocks
 from astropolcal.optics import GENERATORS
 from astropolcal.optics.perturbations import Dependence
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREY,
-    MINUS,
-    SKY,
-    VERMILION,
-    canvas,
-    color_bar,
-    color_limit,
-    draw_band,
-    draw_line,
-    draw_map,
-    grid,
-    legend_outside,
-    mean_known,
-    name_groups,
-    rms,
-    scale_axis,
-    style,
-    wavelength_label,
-)
+from astropolcal.plotting import _style as st
 
 __all__ = ["plot_cause_map", "plot_gap_frames", "plot_gap_maps", "plot_gap_spectrum"]
 
@@ -69,7 +48,7 @@ def _datasets(diagnosis):
 def _finish(figure, axes, diagnosis, title):
     """Add the legend of a panel, which is that of all, and the title with the verdict."""
     if axes is not None:
-        legend_outside(figure, axes.get_legend_handles_labels()[0], columns=3)
+        st.legend_outside(figure, axes.get_legend_handles_labels()[0], columns=3)
     figure.suptitle(f"{title}\n{_verdict_line(diagnosis)}")
     return figure
 
@@ -109,26 +88,25 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     2
     """
     datasets, channels = _datasets(diagnosis), diagnosis.nominal.problem.channels
-    with style():
-        figure = canvas(figure, 10, 1.6 + 3.3 * len(datasets))
+    with st.canvas(figure, 10, 1.6 + 3.3 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 2, sharex=True, squeeze=False)
         for row, channel, dataset in zip(panels, channels, datasets, strict=True):
             name, _, nm, before, after = dataset
             order = np.argsort(nm)
             noise = np.where(channel.valid, 100 * channel.sigma, np.nan)
             for c, (axes, (title, label)) in enumerate(zip(row, _CHANNELS.values(), strict=True)):
-                floor, one, two = (rms(v[c], axis=1)[order] for v in (noise, before, after))
+                floor, one, two = (st.rms(v[c], axis=1)[order] for v in (noise, before, after))
                 axes.fill_between(nm[order], floor, color="0.85", label="noise")
-                axes.plot(nm[order], floor, color=GREY, linewidth=1)
-                axes.plot(nm[order], two, "o-", color=BLUE, markersize=4, label="after")
+                axes.plot(nm[order], floor, color=st.GREY, linewidth=1)
+                axes.plot(nm[order], two, "o-", color=st.BLUE, markersize=4, label="after")
                 # hollow and larger, so that both are seen where they are the same
                 hollow = {"markerfacecolor": "none", "markersize": 8}
-                axes.plot(nm[order], one, "s--", color=VERMILION, label="before", **hollow)
-                scale_axis(axes, np.concatenate([floor, one, two]))
+                axes.plot(nm[order], one, "s--", color=st.VERMILION, label="before", **hollow)
+                st.scale_axis(axes, np.concatenate([floor, one, two]))
                 axes.set_title(f"{name}\n{title}", loc="left")
                 axes.set_ylabel(f"rms of {label} (%)")
         for axes in panels[-1]:
-            wavelength_label(axes)
+            st.wavelength_label(axes)
         return _finish(figure, panels[0, 0], diagnosis, "Gap between model and data")
 
 
@@ -166,24 +144,23 @@ def plot_gap_frames(diagnosis, *, figure=None):
     'frame'
     """
     datasets = _datasets(diagnosis)
-    with style():
-        figure = canvas(figure, 9, 1.4 + 2.5 * len(datasets))
+    with st.canvas(figure, 9, 1.4 + 2.5 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 1, squeeze=False)[:, 0]
         for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=True):
             thirds = [part for part in np.array_split(np.argsort(nm), 3) if part.size]
-            does = [rms(before[0][part] - after[0][part]) for part in thirds]
+            does = [st.rms(before[0][part] - after[0][part]) for part in thirds]
             third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
-            old, new = (mean_known(gap[0][third]) for gap in (before, after))
+            old, new = (st.mean_known(gap[0][third]) for gap in (before, after))
             x = np.arange(len(old)) + 0.5
-            axes.axhline(0, color=GREY, linewidth=0.8)
+            axes.axhline(0, color=st.GREY, linewidth=0.8)
             look = {"markerfacecolor": "none", "markersize": 6}
-            axes.plot(x, old, "s", color=VERMILION, label="before", **look)
+            axes.plot(x, old, "s", color=st.VERMILION, label="before", **look)
             if diagnosis.causes:
-                axes.plot(x, old - new, color=BLACK, linewidth=1, label="what the causes do")
-                axes.plot(x, new, "o", color=BLUE, markersize=4, label="after")
+                axes.plot(x, old - new, color=st.BLACK, linewidth=1, label="what the causes do")
+                axes.plot(x, new, "o", color=st.BLUE, markersize=4, label="after")
             of = nm[third]
             axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
-            axes.set_ylabel(f"observed {MINUS} model (%)")
+            axes.set_ylabel(f"observed {st.MINUS} model (%)")
             _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
 
@@ -233,17 +210,16 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     c, datasets = list(_CHANNELS).index(channel), _datasets(diagnosis)
     gaps = [(before[c], after[c]) for *_, before, after in datasets]
     sizes = np.concatenate([gap.ravel() for pair in gaps for gap in pair])
-    limit, clipped = color_limit(sizes, _COVERED)
-    with style():
-        figure = canvas(figure, 12, 1.5 + 3.2 * len(datasets))
+    limit, clipped = st.color_limit(sizes, _COVERED)
+    with st.canvas(figure, 12, 1.5 + 3.2 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 2, sharey="row", squeeze=False)
         for row, pair, (name, observations, nm, *_) in zip(panels, gaps, datasets, strict=True):
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
-                drawn = draw_map(axes, gap, nm, limit)
-                axes.set_title(f"{name}, {when}: rms {rms(gap):.2g} %", loc="left")
+                drawn = st.draw_map(axes, gap, nm, limit)
+                axes.set_title(f"{name}, {when}: rms {st.rms(gap):.2g} %", loc="left")
                 _frame_axis(axes, observations)
             row[1].set_ylabel("")
-        color_bar(figure, drawn, panels, clipped)
+        st.color_bar(figure, drawn, panels, clipped)
         return _finish(figure, None, diagnosis, f"Residuals of the {_CHANNELS[channel][0]}")
 
 
@@ -255,10 +231,10 @@ def _frame_axis(axes, observations):
         axes.set_xlabel("frame")
         return
     for edge in starts[1:]:
-        axes.axvline(edge, color=BLACK, linewidth=0.6)
+        axes.axvline(edge, color=st.BLACK, linewidth=0.6)
     angles = [f"{a:.4g}" for a in np.rad2deg(observations.position("derotator")[starts])]
     ends = np.append(starts[1:], len(blocks))
-    name_groups(axes, ends, angles, "frames by derotator angle (deg)")
+    st.name_groups(axes, ends, angles, "frames by derotator angle (deg)")
 
 
 # ---- the causes -----------------------------------------------------------------------------
@@ -313,8 +289,7 @@ def plot_cause_map(diagnosis, *, figure=None):
     rows = _cause_map(diagnosis)
     shown = [k for k in _FAMILIES if k != _OTHER or any(k in row for row in rows.values())]
     table = np.array([[row.get(k, (0.0, ""))[0] for k in shown] for row in rows.values()])
-    with style():
-        figure = canvas(figure, 5.4, 1.6 + 0.5 * len(rows))
+    with st.canvas(figure, 5.4, 1.6 + 0.5 * len(rows)) as figure:
         axes = figure.subplots()
         # one hue from white to dark: it is the same for all kinds of colour vision, and in print
         axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
@@ -323,7 +298,7 @@ def plot_cause_map(diagnosis, *, figure=None):
                 chance, words = row.get(kind, (0.0, ""))
                 if chance < _LEAST:
                     continue
-                look = {"ha": "center", "color": "white" if chance > _DARK else BLACK}
+                look = {"ha": "center", "color": "white" if chance > _DARK else st.BLACK}
                 axes.text(j, i - 0.16, share(chance), va="center", weight="bold", **look)
                 axes.text(j, i + 0.22, words, va="center", fontsize=8, **look)
         axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
@@ -412,16 +387,15 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
     nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
-    with style():
-        figure = canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2))
-        for axes, name in zip(grid(figure, len(panels), columns)[0], panels, strict=True):
+    with st.canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
+        for axes, name in zip(st.grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
                 _curve_panel(axes, diagnosis, effect)
                 continue
             size = _in_percent(sizes[name])
             _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name, size))
             axes.set_ylabel(_label(diagnosis, effect, name, size["unit"]))
-            wavelength_label(axes)
+            st.wavelength_label(axes)
     return figure
 
 
@@ -506,16 +480,16 @@ def _curve_panel(axes, diagnosis, effect):
     error = scale * np.sqrt(np.einsum("ij,ik,kj->j", own, fitted.covariance, own))
     angle = driver not in _DRIVERS and dependence.kind != "direction"
     x, given = (np.rad2deg(values) if angle else values for values in (x, given))
-    axes.axhline(0, color=BLACK, linewidth=0.8)
+    axes.axhline(0, color=st.BLACK, linewidth=0.8)
     if dependence.kind == "direction":
-        axes.errorbar(x, value, error, fmt="o", color=BLUE)
+        axes.errorbar(x, value, error, fmt="o", color=st.BLUE)
         axes.set_xticks(x, labels=["forwards", "backwards"])
         axes.set_xlim(-0.5, 1.5)
     else:
-        draw_band(axes, x, value, error, SKY, 0.5)
-        axes.plot(x, value, color=BLUE)
+        st.draw_band(axes, x, value, error, st.SKY, 0.5)
+        axes.plot(x, value, color=st.BLUE)
         foot = np.full(len(given), 0.02)
-        axes.plot(given, foot, "|", color=GREY, transform=axes.get_xaxis_transform())
+        axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
     axes.set_xlabel(_driver_label(dependence))
     nm = 1000 * problem.wavelength[middle]
     axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
@@ -543,13 +517,13 @@ def _size_panel(axes, nm, size, absent):
     value = np.array(size["value"], dtype=float)
     error = np.array(size["std"], dtype=float)
     # mostly zero; a share that is retained counts from one, what the model held from its value
-    look = {"color": BLACK, "linewidth": 0.8}
-    axes.axhline(absent, **look) if np.ndim(absent) == 0 else draw_line(axes, nm, absent, **look)
-    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=BLUE, elinewidth=1.5)
+    look = {"color": st.BLACK, "linewidth": 0.8}
+    axes.axhline(absent, **look) if np.ndim(absent) == 0 else st.draw_line(axes, nm, absent, **look)
+    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=st.BLUE, elinewidth=1.5)
     if not known.all():
         # x in data, y in shares of the panel: the crosses stay at its foot whatever the scale
-        foot = axes.get_xaxis_transform()
-        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", color=VERMILION, transform=foot)
+        look = {"color": st.VERMILION, "transform": axes.get_xaxis_transform()}
+        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", **look)
         axes.set_title("crosses: not determined", loc="left", fontsize=10)
     if not known.any():
         axes.set_yticks([])

@@ -22,9 +22,7 @@ from astropolcal.plotting._style import (
     canvas,
     element_places,
     heading,
-    legend_outside,
     note,
-    style,
 )
 from astropolcal.units import angle_to_rad
 
@@ -115,8 +113,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     angles = _angles(calibration, hwp)
     words = _wrapped(rows)
     heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
-    with style():
-        figure = canvas(figure, _WIDTH, sum(heights) + 1.6)
+    with canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
@@ -383,7 +380,6 @@ def _say(axes, text):
 # a parameter common to all wavelengths is drawn this much wider than one of a wavelength
 _WIDE = 4.0
 _SIZE, _MARGIN = 8.5, 2.6
-_HATCHED = {"facecolor": "0.88", "edgecolor": "0.62", "hatch": "////"}
 # numbers are written into the cells of a matrix that is not larger than this
 _FEW = 12
 
@@ -393,9 +389,9 @@ def plot_correlations(calibration, *, figure=None):
     Draw the correlation matrix of the free parameters.
 
     Parameters given per wavelength form a block, short wavelengths first;
-    those common to all wavelengths are drawn wider. Rows and columns of
-    parameters without an error, because the data do not determine them or because
-    they sit at a bound, are hatched: there is no correlation to show.
+    those common to all wavelengths are drawn wider. Parameters without an error,
+    because the data do not determine them or because they sit at a bound, have no
+    correlations: they are listed below the matrix.
 
     Parameters
     ----------
@@ -429,12 +425,21 @@ def plot_correlations(calibration, *, figure=None):
     covariance = getattr(calibration, "covariance", calibration)
     if not len(covariance):
         raise ParameterError("no free parameter, so no correlation to draw")
-    groups = [(stem, len(at)) for stem, at in element_places(covariance.names).items()]
     with np.errstate(invalid="ignore"):
         matrix = covariance.correlation
-    with style():
-        figure = canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4)
+    known = np.isfinite(np.diag(matrix))
+    groups, left_out = _by_stem(covariance.names, known), _by_stem(covariance.names, ~known)
+    matrix = matrix[np.ix_(known, known)]
+    with canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4) as figure:
         axes = figure.add_subplot()
+        heading(figure, calibration, "Correlations of the parameters")
+        if left_out:
+            named = ", ".join(_labels(left_out))
+            words = f"not shown, as the data do not determine them or at a bound: {named}"
+            figure.supxlabel(textwrap.fill(words, _COLUMNS), fontsize="medium")
+        if not groups:
+            _say(axes, "no parameter has an error by itself")
+            return figure
         edges = _edges(groups)
         image = _draw_matrix(axes, edges, matrix)
         _name_groups(axes, edges, groups)
@@ -443,9 +448,17 @@ def plot_correlations(calibration, *, figure=None):
             if len(matrix) <= _FEW:
                 _write(axes, middles[j], middles[i], matrix[i, j])
         figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02, label="correlation")
-        _explain_hatching(figure, matrix)
-        heading(figure, calibration, "Correlations of the parameters")
     return figure
+
+
+def _by_stem(names, which):
+    """Return name and number of the parameters that are marked, those of wavelengths together."""
+    places = element_places(names).items()
+    return [(stem, int(which[at].sum())) for stem, at in places if which[at].any()]
+
+
+def _labels(groups):
+    return [f"{stem} ({count})" if count > 1 else stem for stem, count in groups]
 
 
 def _edges(groups):
@@ -456,11 +469,9 @@ def _edges(groups):
 
 
 def _draw_matrix(axes, edges, matrix):
-    # what is not drawn lets the hatched background through
-    axes.patch.set(**_HATCHED)
     axes.grid(False)
     look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
-    image = axes.pcolormesh(edges, edges, np.ma.masked_invalid(matrix), **look)
+    image = axes.pcolormesh(edges, edges, matrix, **look)
     axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
     return image
 
@@ -469,20 +480,10 @@ def _name_groups(axes, edges, groups):
     """Name every group in its middle, and part it from the next."""
     ends = np.cumsum([0] + [count for _, count in groups])
     middles = [(edges[a] + edges[b]) / 2 for a, b in pairwise(ends)]
-    labels = [f"{stem} ({count})" if count > 1 else stem for stem, count in groups]
+    labels = _labels(groups)
     axes.set_xticks(middles, labels, rotation=45, ha="right", rotation_mode="anchor")
     axes.set_yticks(middles, labels)
     axes.tick_params(length=0)
     for border in edges[ends[1:-1]]:
         axes.axhline(border, color="0.25", linewidth=0.6)
         axes.axvline(border, color="0.25", linewidth=0.6)
-
-
-def _explain_hatching(figure, matrix):
-    """Say in a legend what the hatched rows are."""
-    from matplotlib.patches import Patch
-
-    without = int((~np.isfinite(np.diag(matrix))).sum())
-    if without:
-        label = f"{without} of {len(matrix)} parameters: not determined by the data, or at a bound"
-        legend_outside(figure, [Patch(**_HATCHED, label=label)])

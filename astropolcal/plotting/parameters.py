@@ -16,39 +16,18 @@ from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mi
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import _Named, named_by_date, parameter_history, significance
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    SIGMA,
-    SKY,
-    VERMILION,
-    canvas,
-    draw_band,
-    draw_line,
-    draw_points,
-    grid,
-    heading,
-    legend_entries,
-    legend_outside,
-    looks,
-    nanometres,
-    style,
-    wavelength_label,
-)
+from astropolcal.plotting import _style as st
 from astropolcal.words import counted, did_you_mean
 
 __all__ = ["plot_efficiency", "plot_history", "plot_mirrors", "plot_retardances"]
 
 # ---- points and lines of a parameter ----------------------------------------------------------
-_DETERMINED = f"fitted, with 1{SIGMA} error"
+_DETERMINED = f"fitted, with 1{st.SIGMA} error"
 _ALONE = "hollow: not determined alone, so no error"
 _BOUND = "boxed: at a bound, so no error"
 _FIXED = "fixed"
 _STAGE = "fitted per wavelength (first step of two), modulo 360°"
-_LAW = f"law fitted to all wavelengths, with 1{SIGMA} band"
+_LAW = f"law fitted to all wavelengths, with 1{st.SIGMA} band"
 _LAW_ALONE = "law fitted to all wavelengths (no error: not determined alone)"
 _ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
 _FINE = 201
@@ -60,22 +39,22 @@ _TITLE_WIDTH = 58
 
 def _draw_entry(axes, calibration, entry, look):
     """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
-    lam, (color, marker) = nanometres(calibration.wavelength), look
+    lam, (color, marker) = st.nanometres(calibration.wavelength), look
     if not entry["value"].ndim:
         _draw_constant(axes, lam, entry, color)
     elif entry["fixed"] or entry["tied"]:
         label = f"follows {entry['tied']}" if entry["tied"] else _FIXED
-        draw_line(axes, lam, entry["value"], color=color, linestyle=":", label=label)
+        st.draw_line(axes, lam, entry["value"], color=color, linestyle=":", label=label)
     else:
         # the thin line only leads the eye through points of different kind
-        draw_line(axes, lam, entry["value"], color=color, linewidth=0.6, alpha=0.6)
+        st.draw_line(axes, lam, entry["value"], color=color, linewidth=0.6, alpha=0.6)
         value, std, bound = entry["value"], entry["std"], entry["at_bound"]
         known = np.isfinite(std) & ~bound
         label = _ALONE if (~known & ~bound).any() else None
         labels, points = (_DETERMINED, label), {"color": color, "marker": marker}
-        draw_points(axes, lam, value, np.where(known, std, np.nan), labels, **points)
+        st.draw_points(axes, lam, value, np.where(known, std, np.nan), labels, **points)
         if bound.any():
-            box = {"marker": "s", "markersize": 12, "markerfacecolor": "none", "color": BLACK}
+            box = {"marker": "s", "markersize": 12, "markerfacecolor": "none", "color": st.BLACK}
             box |= {"linestyle": "none", "clip_on": False, "label": _BOUND}
             axes.plot(lam[bound], value[bound], **box)
 
@@ -90,7 +69,7 @@ def _draw_constant(axes, lam, entry, color):
         note = ", not determined alone"
     axes.plot(ends, [value, value], color=color, label=kind + note)
     if np.isfinite(std):
-        draw_band(axes, ends, value, std, color, 0.25)
+        st.draw_band(axes, ends, value, std, color, 0.25)
 
 
 # ---- laws in wavelength ----------------------------------------------------------
@@ -98,7 +77,7 @@ def _draw_constant(axes, lam, entry, color):
 
 def _draw_law(axes, calibration, leaf, known, look):
     """Draw a retardance that follows a law, its band, and the stages' points."""
-    lam = np.sort(nanometres(calibration.wavelength))
+    lam = np.sort(st.nanometres(calibration.wavelength))
     # a law is smooth between the wavelengths unless its parameters are given at these
     if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
         lam = np.linspace(lam[0], lam[-1], _FINE)
@@ -108,7 +87,7 @@ def _draw_law(axes, calibration, leaf, known, look):
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
     axes.plot(lam, value, color=look[0], label=label)
     if std is not None:
-        draw_band(axes, lam, value, std, look[0], 0.3)
+        st.draw_band(axes, lam, value, std, look[0], 0.3)
     _draw_stage(axes, calibration, leaf)
     # lines break between the values alone
     words = ", ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in _words(free or own))
@@ -148,14 +127,14 @@ def _slope(leaf, key, lam):
 
 def _draw_stage(axes, calibration, leaf):
     """Draw the retardances of the first stage that fitted one per wavelength."""
-    lam = nanometres(calibration.wavelength)
+    lam = st.nanometres(calibration.wavelength)
     for stage in calibration.stages:
         value = stage["parameters"].get(f"{leaf.name}.retardance")
         if value is not None and np.size(value) == lam.size:
             value = u.Quantity(value, u.deg).value
             # a turn more or less is the same retarder: draw the one near the law
             value = value - 360 * np.round((value - _retardance(leaf, lam)) / 360)
-            axes.plot(lam, value, "o", color=GREY, label=_STAGE)
+            axes.plot(lam, value, "o", color=st.GREY, label=_STAGE)
             return
 
 
@@ -173,7 +152,8 @@ def _mark_half_wave(axes):
     low, high = axes.dataLim.intervaly
     for half in (180, -180):
         if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
-            axes.axhline(half, color=BLACK, linestyle="--", linewidth=1, label="half wave (±180°)")
+            look = {"color": st.BLACK, "linestyle": "--", "linewidth": 1}
+            axes.axhline(half, label="half wave (±180°)", **look)
 
 
 # ---- legend -----------------------------------------------------------------------
@@ -181,7 +161,7 @@ def _mark_half_wave(axes):
 
 def _legend(figure, axes, calibration):
     """Put one legend for all panels below them: each label once, in neutral colours."""
-    entries = legend_entries(axes)
+    entries = st.legend_entries(axes)
     # the kinds of points and lines come first
     labels = sorted(entries, key=lambda label: _ORDER.index(label) if label in _ORDER else 9)
     handles = {label: _neutral(entries[label], label) for label in labels}
@@ -189,7 +169,7 @@ def _legend(figure, axes, calibration):
     if _ALONE in handles and free:
         words = f"{_ALONE} (the data do not determine {counted(free, 'combination')} of parameters)"
         handles[_ALONE].set_label(words)
-    return legend_outside(figure, list(handles.values()))
+    return st.legend_outside(figure, list(handles.values()))
 
 
 def _neutral(handle, label):
@@ -198,7 +178,7 @@ def _neutral(handle, label):
 
     line = handle[0] if isinstance(handle, tuple) else handle
     look = {"linestyle": line.get_linestyle(), "linewidth": line.get_linewidth(), "label": label}
-    look |= {"color": GREY if label == _STAGE else BLACK}
+    look |= {"color": st.GREY if label == _STAGE else st.BLACK}
     if label == _BOUND:
         look |= {"marker": "s", "markersize": 11, "markerfacecolor": "none"}
     elif line.get_linestyle() == "None":
@@ -409,21 +389,20 @@ def _draw_all(figure, calibration, title, panels, draw):
     """Draw panels, two a row where there are more than two, with one legend for all."""
     columns = 2 if len(panels) > 2 else 1
     height = 2.0 + 3.1 * -(-len(panels) // columns)
-    with style():
-        figure = canvas(figure, 11.9 if columns == 2 else 8.5, height)
-        axes, lowest = grid(figure, len(panels), columns, sharex=True)
-        for one, panel, look in zip(axes, panels, looks(len(panels)), strict=True):
+    with st.canvas(figure, 11.9 if columns == 2 else 8.5, height) as figure:
+        axes, lowest = st.grid(figure, len(panels), columns, sharex=True)
+        for one, panel, look in zip(axes, panels, st.looks(len(panels)), strict=True):
             draw(one, panel, look)
         for one in lowest:
-            wavelength_label(one)
-        heading(figure, calibration, title)
+            st.wavelength_label(one)
+        st.heading(figure, calibration, title)
         _legend(figure, axes, calibration)
     return figure
 
 
 # ---- mirrors --------------------------------------------------------------------------------
 # dashes of their own: a thin metal line must not look like a fit
-_METAL_LOOKS = dict(zip(METALS, ((SKY, "--"), (ORANGE, "-."), (GREEN, ":")), strict=True))
+_METAL_LOOKS = dict(zip(METALS, ((st.SKY, "--"), (st.ORANGE, "-."), (st.GREEN, ":")), strict=True))
 _MIRROR_LAW_ALONE = "fitted law, not determined: a choice of the law"
 _MIRROR_LABELS = {"diattenuation": "diattenuation (%)", "retardance": "retardance (°)"}
 
@@ -484,8 +463,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     reference = _published(calibration) if reference is None else reference
     retards = any("retardance" in table.colnames for table in tables)
     rows = ["diattenuation", "retardance"][: 1 + retards]
-    with style():
-        figure = canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows))
+    with st.canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows)) as figure:
         # mirrors side by side on one scale
         panels = figure.subplots(len(rows), len(names), sharex=True, sharey="row", squeeze=False)
         for column, table in zip(panels.T, tables, strict=True):
@@ -500,8 +478,8 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
                 axes.tick_params(labelleft=True)
                 lowest = axes
             lowest.tick_params(labelbottom=True)
-            wavelength_label(lowest)
-        heading(figure, calibration, "Mirrors")
+            st.wavelength_label(lowest)
+        st.heading(figure, calibration, "Mirrors")
         _mirror_legend(figure, panels)
     return figure
 
@@ -515,34 +493,34 @@ def _published(calibration):
 
 def _draw_mirror(axes, calibration, table, key, reference):
     table = table[np.argsort(table["wavelength"])]
-    lam, name = nanometres(table["wavelength"]), table.meta["name"]
+    lam, name = st.nanometres(table["wavelength"]), table.meta["name"]
     for metal, (color, line) in _METAL_LOOKS.items():
         axes.plot(lam, table[f"{key}_{metal}"].value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):
         value = getattr(mirror, key)(table["wavelength"])
         value = value.to_value(u.deg) if key == "retardance" else 100 * value
-        axes.plot(lam, value, color=BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
+        axes.plot(lam, value, color=st.BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
     value, std = table[key].value, table[f"{key}_err"].value
     # with a law in wavelength the diattenuation is computed and no parameter
     if f"{name}.diattenuation" in calibration.parameter_values():
         held = key == "retardance" and table.meta["held"]
         hollow = "held, not fitted" if held else "no error: not determined alone, or at a bound"
-        draw_points(axes, lam, value, std, (_DETERMINED, hollow), color=BLUE, marker="o")
+        st.draw_points(axes, lam, value, std, (_DETERMINED, hollow), color=st.BLUE, marker="o")
         return
     known = np.isfinite(std).all()
-    label = f"fitted law, with 1{SIGMA} band" if known else _MIRROR_LAW_ALONE
+    label = f"fitted law, with 1{st.SIGMA} band" if known else _MIRROR_LAW_ALONE
     line = "-" if known else (0, (5, 1))
-    axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=BLUE)
-    draw_band(axes, lam, value, std, BLUE, 0.3)
+    axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=st.BLUE)
+    st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
 
 
 def _mirror_legend(figure, panels):
-    entries = legend_entries(panels.ravel())
+    entries = st.legend_entries(panels.ravel())
     # sorting is stable: what was calibrated stays in its order, the metals come last
     for label in sorted(entries, key=lambda label: label in METALS):
         handle = entries[label] = entries.pop(label)
         handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
-    legend_outside(figure, list(entries.values()), columns=2)
+    st.legend_outside(figure, list(entries.values()), columns=2)
 
 
 # ---- history --------------------------------------------------------------------------------
@@ -609,10 +587,9 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
             f"{len(own)} parameters to draw; allowed are 1 to {_MOST_PANELS}, choose with "
             "parameters="
         )
-    with style():
-        columns = min(len(own), 2)
-        fig = canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6)
-        axes, lowest = grid(fig, len(own), columns, sharex=True)
+    columns = min(len(own), 2)
+    with st.canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6) as fig:
+        axes, lowest = st.grid(fig, len(own), columns, sharex=True)
         for ax, (name, rows) in zip(axes, own.items(), strict=True):
             _draw_history(ax, rows, name, _MOST_LINES if shown is None else shown)
             _mark_changes(ax, calibrations, rows, name)
@@ -621,7 +598,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
         for ax in lowest:
             ax.tick_params(axis="x", labelrotation=25)
             ax.set_xlabel(f"valid from (UTC{aside})")
-        note = f"{SIGMA}: by how much neighbours differ, over all wavelengths"
+        note = f"{st.SIGMA}: by how much neighbours differ, over all wavelengths"
         fig.suptitle(f"{title or 'Calibrated parameters over time'}\n{note}")
     return fig
 
@@ -635,7 +612,7 @@ def _draw_history(ax, own, name, most):
     # a single date has no range to take a share of: one day
     width = max(np.ptp(own["date"].mjd), 1.0) * _SPREAD if several else 0.0
     offsets = np.linspace(-width, width, lam.size) if lam.size > 1 else [0.0]
-    for wavelength, shift, (color, marker) in zip(lam, offsets, looks(lam.size), strict=True):
+    for wavelength, shift, (color, marker) in zip(lam, offsets, st.looks(lam.size), strict=True):
         here = own[own["wavelength"].value == wavelength] if several else own
         # retardances of the wavelengths differ by tens of degrees, their changes by tenths
         value = here["value"] - np.mean(here["value"]) if several else here["value"]
@@ -643,7 +620,7 @@ def _draw_history(ax, own, name, most):
         dates = Time(here["date"].mjd + shift, format="mjd").datetime
         ax.plot(dates, value, color=color, lw=0.8, alpha=0.6, zorder=1)
         points = {"color": color, "marker": marker, "zorder": 3}
-        draw_points(ax, dates, value, here["std"], (label, None), **points)
+        st.draw_points(ax, dates, value, here["std"], (label, None), **points)
     unit = f" ({own['unit'][0]})" if own["unit"][0] else ""
     ax.set(title=name, ylabel=f"{'difference to the mean' if several else 'value'}{unit}")
     ax.margins(y=0.18)
@@ -669,29 +646,31 @@ def _mark_changes(ax, calibrations, own, name):
             continue
         middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
         look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-        look |= {"xytext": (0, -4), "ha": "center", "va": "top", "color": GREY}
+        look |= {"xytext": (0, -4), "ha": "center", "va": "top", "color": st.GREY}
         look |= {"color": "black", "fontweight": "bold"} if found.p_value < _SEEN else {}
-        ax.annotate(f"{found.sigma:.1f} {SIGMA}", (middle, 1), **look)
+        ax.annotate(f"{found.sigma:.1f} {st.SIGMA}", (middle, 1), **look)
 
 
 def draw_accuracies(group, goal=None, *, figure=None):
     """Draw the accuracies of the calibrations of `~astropolcal.pipeline.health` against date."""
     dated = [one for one in group["calibrations"] if one["date"] is not None]
-    with style():
-        fig = canvas(figure, 7.2, 4.0)
+    with st.canvas(figure, 7.2, 4.0) as fig:
         ax = fig.subplots()
         dates = Time([one["date"] for one in dated], scale="tai").datetime
         for key, color, marker, label in (
-            ("s_cv_percent", BLUE, "o", "left-out frames (s_cv)"),
-            ("s_res_percent", VERMILION, "s", "residuals of the fit (s_res)"),
+            ("s_cv_percent", st.BLUE, "o", "left-out frames (s_cv)"),
+            ("s_res_percent", st.VERMILION, "s", "residuals of the fit (s_res)"),
         ):
             values = np.array([one[key] for one in dated], dtype=float)
             ax.plot(dates, values, color=color, marker=marker, lw=1, label=label)
         if goal is not None:
-            ax.axhline(goal, color=BLACK, ls="--", lw=1, label="goal")
+            ax.axhline(goal, color=st.BLACK, ls="--", lw=1, label="goal")
         for one in group["events"]:
             ax.axvspan(
-                *Time([one["from"], one["to"]], scale="tai").datetime, color=GREY, alpha=0.2, lw=0
+                *Time([one["from"], one["to"]], scale="tai").datetime,
+                color=st.GREY,
+                alpha=0.2,
+                lw=0,
             )
         ax.set(ylabel="accuracy (% of polarization)", xlabel="date of the calibration data (UTC)")
         ax.set_ylim(bottom=0)

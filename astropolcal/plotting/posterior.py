@@ -5,7 +5,7 @@ import numpy as np
 
 from astropolcal.calibration.posterior.samples import ENOUGH, autocorrelation, need
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas, style
+from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas
 
 __all__ = ["plot_corner", "plot_traces"]
 
@@ -76,9 +76,9 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         raise ParameterError(f"no corner plot: {', '.join(stuck)} did not move")
     labels, shifts = _labels(posterior, columns, samples)
     marks = posterior.fitted[columns] if fitted and posterior.fitted is not None else None
-    with style():
-        size = 1.2 + _INCH * len(columns)
-        figure = _corner_canvas(figure, size)
+    size = 1.2 + _INCH * len(columns)
+    # corner sets margins of its own, which a layout engine would undo
+    with canvas(figure, size, size, layout=None) as figure:
         corner.corner(
             samples - shifts,
             fig=figure,
@@ -90,7 +90,8 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
             levels=1 - np.exp([-0.5, -2.0, -4.5]),
             fill_contours=True,
             plot_datapoints=False,
-            bins=_bins(len(samples)),
+            # enough samples in each to draw contours
+            bins=int(np.clip(np.sqrt(len(samples)) / 3, 12, 50)),
             color=BLUE,
             max_n_ticks=4,
             hist_kwargs={"linewidth": 1.5},
@@ -98,23 +99,6 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         marks = None if marks is None else marks - shifts
         _finish_corner(figure, posterior, columns, samples - shifts, marks)
     return figure
-
-
-def _bins(n_samples):
-    """Return how many bins a side leave enough samples in each to draw contours."""
-    return int(np.clip(np.sqrt(n_samples) / 3, 12, 50))
-
-
-def _corner_canvas(figure, size):
-    """Return a figure whose panels corner may place itself."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    # corner sets margins of its own, which a layout engine would undo
-    if isinstance(figure, Figure):
-        figure.set_layout_engine(None)
-    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        return Figure(figsize=(size, size)) if figure is None else figure
 
 
 def _columns(posterior, parameters, most):
@@ -238,8 +222,7 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     columns = _columns(posterior, parameters, MAX_TRACES)
     thinned = posterior.is_thinned
     beside = _histogram if thinned else _correlation
-    with style():
-        figure = canvas(figure, 10, 1.6 + 1.7 * len(columns))
+    with canvas(figure, 10, 1.6 + 1.7 * len(columns)) as figure:
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
             _trace(trace, posterior, column)

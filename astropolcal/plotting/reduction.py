@@ -6,24 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    MINUS,
-    VERMILION,
-    canvas,
-    grid,
-    legend_outside,
-    save,
-    style,
-)
+from astropolcal.plotting import _style as st
 from astropolcal.reduction.frames import open_cube
 from astropolcal.reduction.photometry import BEAMS
 
 __all__ = ["plot_apertures"]
 
-_COLORS = {"right": VERMILION, "left": BLUE}
+_COLORS = {"right": st.VERMILION, "left": st.BLUE}
 _LINES = {"right": "-", "left": "--"}
 _MARKERS = {"right": "o", "left": "s"}
 _MAX_PANELS = 12
@@ -68,9 +57,8 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
     k, at = _slice(reduction, wavelength)
     columns = min(4, len(chosen))
     rows = -(-len(chosen) // columns)
-    with style():
-        figure = canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2)
-        axes, lowest = grid(figure, len(chosen), columns, sharex=True, sharey=True)
+    with st.canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2) as figure:
+        axes, lowest = st.grid(figure, len(chosen), columns, sharex=True, sharey=True)
         gaps = [_draw_frame(*panel, reduction, k) for panel in zip(axes, chosen, strict=True)]
         for panel in lowest:
             panel.set_xlabel("x (pixel)")
@@ -78,7 +66,7 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
             panel.set_ylabel("y (pixel)")
         count = f"{len(chosen)} of {len(reduction.frames)} frames"
         figure.suptitle(f"Apertures at {at} ({count}; square-root scale)")
-        legend_outside(figure, _handles(reduction.source, any(gaps)), columns=4)
+        st.legend_outside(figure, _handles(reduction.source, any(gaps)), columns=4)
     return figure
 
 
@@ -181,8 +169,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
     k, at = _slice(reduction, wavelength)
     star = reduction.source == "star"
     clock, label = _clock(reduction.frames)
-    with style():
-        figure = canvas(figure, 9.0, 11.0 if star else 6.0)
+    with st.canvas(figure, 9.0, 11.0 if star else 6.0) as figure:
         axes = figure.subplots(5 if star else 2, 1, sharex=True)
         _draw_fluxes(axes[0], axes[1], reduction, clock, k)
         if star:
@@ -190,7 +177,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
         axes[-1].set_xlabel(label)
         figure.suptitle(f"The run at {at}")
         figure.align_ylabels()
-        legend_outside(figure, _run_handles(reduction, k), columns=4)
+        st.legend_outside(figure, list(st.legend_entries(axes[:2]).values()), columns=4)
     return figure
 
 
@@ -217,20 +204,22 @@ def _draw_fluxes(top, below, reduction, clock, k):
     flux = _cells(reduction, k, "flux")
     error = np.sqrt(_cells(reduction, k, "variance"))
     for beam, name in enumerate(BEAMS):
-        top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **_look(name))
+        look = _look(name) | {"label": f"{name} beam"}
+        top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **look)
     top.set_ylabel(f"flux ({reduction.frames[0].unit})")
     total = flux.sum(axis=0)
     # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2
     scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
     single = (flux[0] - flux[1]) / total
-    below.errorbar(clock, single, scatter, fmt="D", color=GREEN, ms=5, lw=0, elinewidth=1.2)
+    look = {"fmt": "D", "color": st.GREEN, "ms": 5, "lw": 0, "elinewidth": 1.2}
+    below.errorbar(clock, single, scatter, label="single difference", **look)
     below.axhline(0.0, color="0.6", lw=0.8)
-    below.set_ylabel(f"(right {MINUS} left) /\n(right + left)")
+    below.set_ylabel(f"(right {st.MINUS} left) /\n(right + left)")
     failed = clock[np.isnan(flux[0])]
     for axes in (top, below) if failed.size else ():
         # at the foot of the panel, whatever the fluxes are
-        look = {"color": BLACK, "transform": axes.get_xaxis_transform()}
-        axes.plot(failed, np.full(failed.size, 0.05), "x", **look)
+        look = {"color": st.BLACK, "transform": axes.get_xaxis_transform()}
+        axes.plot(failed, np.full(failed.size, 0.05), "x", label="masked frame", **look)
 
 
 def _look(name):
@@ -240,7 +229,7 @@ def _look(name):
 
 
 def _draw_places(panels, reduction, clock, k):
-    labels = (f"x {MINUS} median\n(pixel)", f"y {MINUS} median\n(pixel)", "FWHM (pixel)")
+    labels = (f"x {st.MINUS} median\n(pixel)", f"y {st.MINUS} median\n(pixel)", "FWHM (pixel)")
     for panel, key, label in zip(panels, ("x", "y", "fwhm"), labels, strict=True):
         panel.set_ylabel(label)
         for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
@@ -248,16 +237,6 @@ def _draw_places(panels, reduction, clock, k):
             if key != "fwhm" and np.isfinite(values).any():
                 values = values - np.nanmedian(values)
             panel.plot(clock, values, **_look(name))
-
-
-def _run_handles(reduction, k):
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], label=f"{name} beam", **_look(name)) for name in BEAMS]
-    handles.append(Line2D([], [], color=GREEN, marker="D", ls="", label="single difference"))
-    if any(frame.photometry.reasons[k] for frame in reduction.frames):
-        handles.append(Line2D([], [], color=BLACK, marker="x", ls="", label="masked frame"))
-    return handles
 
 
 def save_quicklook(reduction, folder):
@@ -271,4 +250,4 @@ def save_quicklook(reduction, folder):
         reason = getattr(error, "strerror", None) or error
         raise ObservationError(f"{folder}: cannot be made: {reason}") from None
     plots = {"apertures.png": plot_apertures, "run.png": plot_run}
-    return [save(plot(reduction), folder / n, ObservationError) for n, plot in plots.items()]
+    return [st.save(plot(reduction), folder / n, ObservationError) for n, plot in plots.items()]

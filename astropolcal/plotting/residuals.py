@@ -6,29 +6,10 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import stages
+from astropolcal.chain import stages, standing
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
 from astropolcal.observations.quality import clusters, is_star
-from astropolcal.optics import COORDINATES
-from astropolcal.plotting._style import (
-    BLUE,
-    COLORS,
-    GREY,
-    MINUS,
-    SIGMA,
-    canvas,
-    color_bar,
-    color_limit,
-    degrees,
-    draw_map,
-    heading,
-    legend_outside,
-    looks,
-    name_groups,
-    nanometres,
-    rms,
-    style,
-)
+from astropolcal.plotting import _style as st
 from astropolcal.propagation import Propagator
 
 __all__ = ["plot_double_differences"]
@@ -68,7 +49,7 @@ class DataGrid:
         if not self.part.n_data:
             raise ObservationError(f"{self.part.observations.name}: no datum is left to draw")
         self.observable = measurement.observable
-        self.wavelength = nanometres(self.part.observations.wavelength)
+        self.wavelength = st.nanometres(self.part.observations.wavelength)
         self.observed = self._grid(self.part.observed)
         self.residual = self._grid(residuals[measurement.segments[dataset]])
         self.sigma = self._grid(self.part.sigma)
@@ -118,14 +99,15 @@ class DataGrid:
         if "flc_state" not in stages(self.chain):
             return np.full(self.part.frames.shape[0], "")
         state = self.part.observations.position("flc_state")[self.part.frames] > 0.5
-        names = np.where(state, "B", "A")
-        return np.array([f" {MINUS} ".join(one if len(set(one)) > 1 else one[:1]) for one in names])
+        # the states of the frames, or the one that all of them have
+        names = [one if len(set(one)) > 1 else one[:1] for one in np.where(state, "B", "A")]
+        return np.array([f" {st.MINUS} ".join(one) for one in names])
 
     def _one_series(self, angle, member, state):
-        angles = [degrees(value) for value in np.median(angle[:, member], axis=1)]
+        angles = [st.degrees(value) for value in np.median(angle[:, member], axis=1)]
         # where the states of a modulator make the difference the plate is static
         still = state and len(set(angles)) == 1
-        plate = angles[0] if still else f" {MINUS} ".join(angles)
+        plate = angles[0] if still else f" {st.MINUS} ".join(angles)
         label = f"{plate}, {state}" if state else plate
         others = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
         positions = {stage: angle.mean(axis=1) for stage, angle in others.items()}
@@ -147,8 +129,7 @@ class DataGrid:
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
         # between the data there is neither a time nor a flux: such optics do nothing there
-        others = [s for s in stages(self.chain) if s in COORDINATES and s != "flc_state"]
-        positions |= {stage: np.zeros(1) for stage in others}
+        positions |= {stage: np.full(1, x.value) for stage, x in standing(self.chain).items()}
         if "flc_state" in stages(self.chain):
             state = self.part.observations.position("flc_state")
             positions["flc_state"] = np.repeat(state[self.part.frames[series.data[0]]], n)
@@ -175,7 +156,7 @@ class DataGrid:
 
     def nearest_bins(self, wavelengths):
         """Return the bins nearest to wavelengths, each once."""
-        wanted = nanometres(wavelengths)
+        wanted = st.nanometres(wavelengths)
         low, high = self.wavelength.min(), self.wavelength.max()
         for value in wanted:
             if not 0.99 * low <= value <= 1.01 * high:
@@ -247,12 +228,11 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     drawn = DataGrid(calibration, dataset)
     bins = drawn.spread_bins(_PANELS) if wavelengths is None else drawn.nearest_bins(wavelengths)
     series = drawn.series()
-    with style():
-        columns = min(2, len(bins))
-        rows = -(-len(bins) // columns)
-        # as high as a legend of all settings beside the panels, and a title above it
-        height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
-        figure = canvas(figure, 3.0 + 4.4 * columns, height)
+    columns = min(2, len(bins))
+    rows = -(-len(bins) // columns)
+    # as high as a legend of all settings beside the panels, and a title above it
+    height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
+    with st.canvas(figure, 3.0 + 4.4 * columns, height) as figure:
         pairs = _panels(figure, len(bins), rows, columns)
         fine = _fine(drawn.abscissa[0])
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
@@ -264,7 +244,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
                 if curve is not None:
                     pair[0].plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
         _label(pairs, drawn, columns)
-        heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
+        st.heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
         _legend(figure, drawn, series, bins, spread[bins])
     return figure
 
@@ -285,7 +265,7 @@ def _panels(figure, count, rows, columns):
 
 def _looks(count):
     """Return the looks of the series: where colours recur, lines are dashed and markers open."""
-    pairs = zip(looks(count), np.arange(count) // len(COLORS) % 2, strict=True)
+    pairs = zip(st.looks(count), np.arange(count) // len(st.COLORS) % 2, strict=True)
     return [
         {"color": color, "marker": marker}
         | {"markerfacecolor": "white" if again else color, "linestyle": "--" if again else "-"}
@@ -295,7 +275,7 @@ def _looks(count):
 
 def _draw_heading(pair, wavelength, s_res):
     top, bottom = pair
-    bottom.axhline(0, color=GREY, linewidth=1)
+    bottom.axhline(0, color=st.GREY, linewidth=1)
     known = np.isfinite(s_res)
     top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
     if known:
@@ -334,7 +314,7 @@ def _label(pairs, grid, columns):
             bottom.set_xlabel(grid.abscissa[1])
         if first:
             top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
-            bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
+            bottom.set_ylabel(f"obs. {st.MINUS} model\n(%)")
 
 
 def _legend(figure, grid, series, bins, s_res):
@@ -342,7 +322,7 @@ def _legend(figure, grid, series, bins, s_res):
     from matplotlib.patches import Patch
 
     def entry(label, marker="", line=""):
-        return Line2D([], [], color=GREY, marker=marker, linestyle=line, label=label)
+        return Line2D([], [], color=st.GREY, marker=marker, linestyle=line, label=label)
 
     # what is not drawn has no entry in the legend
     curves = any(one.positions is not None for one in series)
@@ -351,18 +331,18 @@ def _legend(figure, grid, series, bins, s_res):
         for one, look in zip(series, _looks(len(series)), strict=True)
     ]
     bars = np.isfinite(grid.sigma[bins]).any()
-    seen = f"observed, with 1{SIGMA} errors" if bars else "observed (no errors given)"
+    seen = f"observed, with 1{st.SIGMA} errors" if bars else "observed (no errors given)"
     handles.append(entry(seen, "o"))
     handles += [entry("model", line="-")] if curves else []
     if any(one.positions is None for one in series):
         handles.append(entry("model at data", "x"))
     if np.isfinite(s_res).any():
         handles.append(Patch(color="0.92", label="± s_res"))
-    frames = f"plus {MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
+    frames = f"plus {st.MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
     plate = "half-wave plate\nas commanded" if grid.is_star else "half-wave plate"
     # at the top a long title would run into it
     place = "outside right center"
-    legend_outside(figure, handles, place=place, title=f"{plate},\n{frames}")
+    st.legend_outside(figure, handles, place=place, title=f"{plate},\n{frames}")
 
 
 # ---- maps of the residuals -------------------------------------------------------------------
@@ -383,18 +363,19 @@ def plot_residuals(calibration, *, figure=None):
     Datasets of one wavelength each are bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
-    draw = _draw_bars if all(grid.wavelength.size == 1 for grid in grids) else _draw_maps
-    with style():
-        figure = draw(figure, grids)
+    count = len(grids)
+    bars = all(grid.wavelength.size == 1 for grid in grids)
+    height = 2.2 + 1.4 * max(count, 2) if bars else 0.8 + 5.4 * count
+    with st.canvas(figure, 10.5, height) as figure:
+        (_draw_bars if bars else _draw_maps)(figure, grids)
         names = [grid.part.observations.name for grid in grids]
-        heading(figure, calibration, f"Residuals of the {grids[0].quantity}", names)
+        st.heading(figure, calibration, f"Residuals of the {grids[0].quantity}", names)
     return figure
 
 
 def _draw_maps(figure, grids):
     scales, shared = _scales(grids)
     n = len(grids)
-    figure = canvas(figure, 10.5, 0.8 + 5.4 * n)
     spec = figure.add_gridspec(2 * n, 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * n)
     for i, (grid, (limit, clipped)) in enumerate(zip(grids, scales, strict=True)):
         main = figure.add_subplot(spec[2 * i + 1, 0])
@@ -404,38 +385,36 @@ def _draw_maps(figure, grids):
         if n > 1:
             above.set_title(grid.part.observations.name, loc="left")
         if not shared:
-            color_bar(figure, drawn, [main, above, right], clipped, ", own scale\n")
+            st.color_bar(figure, drawn, [main, above, right], clipped, ", own scale\n")
     if shared:
-        color_bar(figure, drawn, figure.axes, clipped)
-    return figure
+        st.color_bar(figure, drawn, figure.axes, clipped)
 
 
 def _scales(grids):
     """Return colour scale of each map, whether data lie beyond it, and if it is that of all."""
     residuals = [100 * grid.residual.ravel() for grid in grids]
-    own = [color_limit(one, _COVERED) for one in residuals]
+    own = [st.color_limit(one, _COVERED) for one in residuals]
     ends = [limit for limit, _ in own]
     if max(ends) > _ONE_SCALE * min(ends):
         return own, False
-    return [color_limit(np.concatenate(residuals), _COVERED)] * len(grids), True
+    return [st.color_limit(np.concatenate(residuals), _COVERED)] * len(grids), True
 
 
 def _draw_bars(figure, grids):
     """Draw the residuals at one wavelength, a panel per dataset, all with the same scale."""
-    figure = canvas(figure, 10.5, 2.2 + 1.4 * max(len(grids), 2))
     panels = figure.subplots(len(grids), 1, sharey=True, squeeze=False)[:, 0]
     below = None
     for axes, grid in list(zip(panels, grids, strict=True))[::-1]:
         order, _, ends = _layout(grid)
         percent = 100 * grid.residual[0, order]
-        axes.bar(np.arange(len(order)) + 0.5, percent, width=0.9, color=BLUE)
+        axes.bar(np.arange(len(order)) + 0.5, percent, width=0.9, color=st.BLUE)
         for masked in np.flatnonzero(~np.isfinite(percent)):
             axes.axvspan(masked, masked + 1, color="0.75", linewidth=0)
-        axes.axhline(0, color=GREY, linewidth=1)
+        axes.axhline(0, color=st.GREY, linewidth=1)
         for end in ends[:-1]:
             axes.axvline(end, color="black", linewidth=0.8)
         axes.set_xlim(0, len(order))
-        size = f"{grid.wavelength[0]:.1f} nm, rms {rms(percent):.2g} %"
+        size = f"{grid.wavelength[0]:.1f} nm, rms {st.rms(percent):.2g} %"
         axes.set_title(f"{grid.part.observations.name}: {size}", loc="left", fontsize=10)
         _name_axis(axes, grid)
         # what stands below the next panel need not be said twice
@@ -444,29 +423,28 @@ def _draw_bars(figure, grids):
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
         below = words
-    figure.supylabel(f"observed {MINUS} model (%); grey: masked", fontsize=11)
+    figure.supylabel(f"observed {st.MINUS} model (%); grey: masked", fontsize=11)
     size = max(100 * _HEADROOM * max(np.nanmax(np.abs(grid.residual)) for grid in grids), 1e-12)
     panels[0].set_ylim(-size, size)
-    return figure
 
 
 def _draw_dataset(main, above, right, grid, limit):
     order, _, ends = _layout(grid)
     percent = 100 * grid.residual[:, order]
-    drawn = draw_map(main, percent, grid.wavelength, limit)
+    drawn = st.draw_map(main, percent, grid.wavelength, limit)
     main.vlines(ends[:-1], *main.get_ylim(), color="black", linewidth=0.8)
     _name_axis(main, grid)
-    above.stairs(rms(percent, axis=0), np.arange(len(order) + 1), color=BLUE, fill=True)
+    above.stairs(st.rms(percent, axis=0), np.arange(len(order) + 1), color=st.BLUE, fill=True)
     above.tick_params(labelbottom=False)
     above.set_ylabel("rms (%)")
-    lam, each = np.argsort(grid.wavelength), rms(percent, axis=1)
-    right.plot(each[lam], grid.wavelength[lam], "o-", color=BLUE)
+    lam, each = np.argsort(grid.wavelength), st.rms(percent, axis=1)
+    right.plot(each[lam], grid.wavelength[lam], "o-", color=st.BLUE)
     right.set_xlabel("rms (%)")
     right.tick_params(labelleft=False)
     for axes in (above, right):
         axes.margins(0)
     # exact data have no bars
-    above.set_ylim(0, _HEADROOM * np.nanmax(rms(percent, axis=0)) or 1)
+    above.set_ylim(0, _HEADROOM * np.nanmax(st.rms(percent, axis=0)) or 1)
     right.set_xlim(0, 1.1 * np.nanmax(each) or 1)
     return drawn
 
@@ -487,8 +465,8 @@ def _layout(grid):
 
 def _name_axis(axes, grid):
     order, group, ends = _layout(grid)
-    angles = [degrees(np.median(grid.derotator[order][group == g])) for g in range(len(ends))]
+    angles = [st.degrees(np.median(grid.derotator[order][group == g])) for g in range(len(ends))]
     labels = [series.label for series in grid.series()]
     within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
     words = f"derotator angle; at each, left to right, half-wave plate at\n{within}"
-    name_groups(axes, ends, angles, words)
+    st.name_groups(axes, ends, angles, words)

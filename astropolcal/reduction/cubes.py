@@ -19,7 +19,6 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
-from tqdm import tqdm
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import (
@@ -32,6 +31,7 @@ from astropolcal.files import atomic_path, check_new
 from astropolcal.instruments.layout import TEXTS, unit_of
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import offline, tracked
+from astropolcal.progress import shown, steps
 from astropolcal.reduction.images import Detector, Scene, choice, number, per_wavelength, pixels
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
 
@@ -276,7 +276,7 @@ def simulate_cubes(
     seed : int, optional
         Seed of all that is random.
     progress : bool
-        Whether to show a progress bar; it appears on a terminal only.
+        Whether to show how far it is; on a terminal only.
 
     Returns
     -------
@@ -338,13 +338,15 @@ def simulate_cubes(
     response, bad = detector._defects(of_pixels, layout.shape)
     names = file_names(Path(directory), layout, files, n_frames)
     brightest = 0.0
-    for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
-        falling = scene.light(beams[:, i], centres[i], widths[i])
-        brightest = max(brightest, float((falling + reading.background).max()))
-        cube, weight = reading.expose(falling, response, seeds[i])
-        # as extraction marks pixels without a value
-        cube[bad], weight[bad] = np.nan, 0.0
-        write_cube(*names[i], cube, weight, header_of(frames[i], layout) | more, layout)
+    with shown(progress):
+        for i in steps(range(n_frames), "cubes"):
+            falling = scene.light(beams[:, i], centres[i], widths[i])
+            brightest = max(brightest, float((falling + reading.background).max()))
+            cube, weight = reading.expose(falling, response, seeds[i])
+            # as extraction marks pixels without a value
+            cube[bad], weight[bad] = np.nan, 0.0
+            header = layout.to_header(header_of(frames[i], layout) | more)
+            write_cube(*names[i], cube, weight, header, layout)
     if brightest > how.saturation and not detector.saturate:
         _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
@@ -620,11 +622,16 @@ def write_cube(cube, raw_header, image, weight, header, layout):
             own = in_cube | ({} if camera is None else {camera: number})
             _save(_hdus(own, *(part[side] for part in parts), layout), path)
     if raw_header is not None:
-        _save(fits.HDUList([fits.PrimaryHDU(header=fits.Header(list(header.items())))]), raw_header)
+        _save(fits.HDUList([fits.PrimaryHDU(header=_cards(header))]), raw_header)
+
+
+def _cards(header):
+    # longer names are those of the convention of ESO, of which astropy otherwise warns
+    return fits.Header([(k if len(k) <= 8 else f"HIERARCH {k}", v) for k, v in header.items()])
 
 
 def _hdus(header, image, weight, layout):
-    header, second = fits.Header(list(header.items())), ("IVAR", "adu-2")
+    header, second = _cards(header), ("IVAR", "adu-2")
     if layout.weights == "error":
         with np.errstate(divide="ignore"):
             # where nothing is known the weight is 0, and so is this

@@ -36,8 +36,6 @@ _ARRAYS = (
 class Frame(FrameHeader):
     """What is known of one file."""
 
-    # of the fluxes
-    unit: str = ""
     photometry: Photometry | None = None
     # of the fluxes, by which copies are recognized
     digest: str = ""
@@ -157,7 +155,8 @@ def _read_beams(path, hdus, layout):
     data = hdus[number].data
     if data is not None and data.ndim == 2 and wanted[0] == 1:
         data = data[None]
-    if data is None or data.shape != wanted:
+    several = layout.stacked and wanted[0] == 1 and np.shape(data)[1:] == wanted[1:]
+    if data is None or (data.shape != wanted and not several):
         shape = "no data" if data is None else f"shape {data.shape}"
         raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")
     if data.dtype.kind not in "fiu":
@@ -171,6 +170,12 @@ def _read_beams(path, hdus, layout):
         good &= np.asarray(weight.reshape(cube.shape)) > 0
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
+    if cube.shape != wanted:
+        # one saturated exposure spoils the mean, and is to be seen in it
+        full = np.where(good, cube, -np.inf).max(axis=0) >= layout.saturation
+        seen = good.sum(axis=0, keepdims=True)
+        cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.maximum(seen, 1)
+        cube, good = np.where(full, layout.saturation, cube), seen > 0
     return hdus[0].header, hdus[number].header, cube, good
 
 
@@ -182,8 +187,7 @@ def _check_header(frame, layout, source):
     frame.errors += [
         f"no keyword {keywords[column]} in its header"
         for column in ("hwp", "derotator")
-        if column not in values
-        and not any(error.startswith(keywords[column]) for error in frame.errors)
+        if column not in values and not frame.errors
     ]
     with suppress(ObservationError):
         time = observation_time(values)
@@ -252,20 +256,15 @@ def match_beams(frame, layout, cube, detector):
     return replace(detector, left=left.in_units_of(detector)), cube
 
 
-def beam_scale(path, layout, values, unit=None):
+def beam_detectors(path, layout, values, unit=None):
     """
-    Return by what the left image is multiplied to count electrons as the right one does.
+    Return the detectors of the right and the left beam, the same where one file holds both.
 
-    1 where one file holds both beams. ``values`` are those of the right beam's header, ``unit`` its
-    BUNIT.
+    ``values`` are those of the right beam's header, ``unit`` the BUNIT of both.
     """
-    path = layout.left_file(path)
-    if path is None:
-        return 1.0
-    other = read_header(path, layout).values
-    gains = [detector_of(layout, unit, v.get("exposure_time"), v).gain for v in (other, values)]
-    # electrons per adu on the left over those on the right
-    return gains[0] / gains[1]
+    left = layout.left_file(path)
+    both = (values, values if left is None else read_header(left, layout).values)
+    return [detector_of(layout, unit, known.get("exposure_time"), known) for known in both]
 
 
 def _contradictions(right, left, name):

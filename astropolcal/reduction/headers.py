@@ -20,7 +20,7 @@ from astropy.coordinates import FK5, SkyCoord
 from astropy.time import Time
 from erfa import ErfaError
 
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.instruments.layout import (
@@ -53,6 +53,8 @@ class FrameHeader:
     # why it cannot be used; and what is odd, but does not matter
     errors: list = field(default_factory=list)
     doubts: list = field(default_factory=list)
+    # of the pixels; None if the header does not say
+    unit: str | None = None
 
 
 def frame_number(name, layout, header=None):
@@ -104,18 +106,37 @@ def read_header(path, layout, *, header=None, raw=None):
     """
     header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
+    frame.unit = header.get("BUNIT")
+    # what is in the file goes before what a header says of it
+    stack = header.get("NAXIS3", 1) if header.get("NAXIS") == 3 else 1
+    if layout.stacked and layout.shape[0] == 1 and stack > 1:
+        frame.values["exposures"] = float(stack)
+    columns = list(layout.keywords)
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            header = layout.from_header(header)
+        frame.doubts += [str(warning.message) for warning in told]
+    except AstropolcalError as error:
+        frame.errors.append(str(error).removeprefix("frame 0: "))
+        columns = [column for column in columns if column not in ANGLES]
     headers = [header]
     # only for these is a raw header opened
     missing = [c for c in layout.raw_columns if look_up(headers, c, layout)[1] is None]
     if raw is not None and missing:
         # behind the cube: its own keywords come first
         headers += _raw_header(frame, raw)
-    for column in layout.keywords:
+    for column in columns:
         keyword, value = look_up(headers, column, layout)
-        if value is not None:
+        if value is not None and column not in frame.values:
             _convert(frame, column, keyword, value, layout)
         if column in ANGLES and column in frame.values:
             _compare(frame, column, stated(headers, column, layout), layout)
+        if column == "flc_state":
+            told = list(stated(headers, column, layout))
+            if len({layout.states.get(str(v), str(v).strip()) for _, v in told} - {""}) > 1:
+                words = ", but ".join(f"{keyword} = {value!r}" for keyword, value in told)
+                frame.errors.append(f"{words}: which state of the modulator?")
     return frame
 
 

@@ -23,8 +23,10 @@ from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
 from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
+from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames
+from astropolcal.reduction.sorting import sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -171,7 +173,7 @@ def reduce_run(
     meta=None,
     workers=None,
     resume=None,
-    progress=None,
+    progress=False,
     hwp_sequence=None,
     keep_repeats=False,
     **options,
@@ -201,8 +203,8 @@ def reduce_run(
         Number of processes; by default one for 100 files, up to that of the CPUs.
     resume : path-like, optional
         Journal of what is done: files in it are not measured again.
-    progress : callable, optional
-        Called with the number of files done and of all.
+    progress : bool
+        Whether to show how far it is; on a terminal only.
     hwp_sequence : sequence of float, optional
         Commanded angles in degree, which replace those of the headers, in turn and
         in the order of the frames; for headers that are known to be wrong.
@@ -253,26 +255,27 @@ def reduce_run(
         raise ObservationError("no files to reduce")
     # before the work is done: the table would be refused
     stated_date(meta or {}, "reduced")
-    files = instrument.files.frame_files(files)
+    n_files = len(files)
+    files, layout, lost = sort_beams(files, instrument.files)
     task = {
-        "layout": instrument.files,
+        "layout": layout,
         "source": photometry,
-        "raw": None if raw is None else raw_frames(raw, instrument.files),
+        "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
     }
     frames = _measure_all(files, task, workers, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
-        check_stars(frames, instrument.files)
-    reduction = Reduction(instrument, photometry, options=options)
+        check_stars(frames, layout)
+    reduction = Reduction(instrument, photometry, problems=lost, options=options)
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
-    frames = consistent(frames, reduction, instrument.files, hwp_sequence is None)
+    frames = consistent(frames, reduction, layout, hwp_sequence is None)
     if photometry == "internal" and not keep_repeats:
         frames = without_repeats(frames, reduction)
     if not frames:
-        raise ObservationError(_nothing(len(files), reduction.problems) + _hint(task, reduction))
+        raise ObservationError(_nothing(n_files, reduction.problems) + _hint(task, reduction))
     reduction.frames = frames
     for frame in frames:
         if frame.values.get("light") == "uneven":
@@ -357,14 +360,12 @@ def _measure_all(files, task, workers, resume, progress):
     found = {path: frame for path, frame in found.items() if frame is not None}
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
-    done = len(found)
-    for frame in _results(todo, task, _count(workers, len(todo))):
-        found[frame.path] = frame
-        # at once: a run that is killed keeps what is done
-        journal.add(frame)
-        done += 1
-        if progress is not None:
-            progress(done, len(set(files)))
+    results = _results(todo, task, _count(workers, len(todo)))
+    with shown(progress):
+        for frame in steps(results, "cubes", len(set(files)), len(found)):
+            found[frame.path] = frame
+            # at once: a run that is killed keeps what is done
+            journal.add(frame)
     return [found[path] for path in dict.fromkeys(files)]
 
 

@@ -11,7 +11,7 @@ from astropy.table import QTable
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.fitscheck import primary_header
 from astropolcal.pipeline.headers import told_beam
-from astropolcal.reduction.frames import beam_scale, check_stars, reduce_frame
+from astropolcal.reduction.frames import beam_detectors, check_stars, reduce_frame
 from astropolcal.reduction.headers import (
     add_pointing,
     configured,
@@ -68,14 +68,16 @@ def read_night(files, instrument):
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
     """
-    Return angles of all frames, places of the star, exposures, and scales of the left beam.
+    Return angles of all frames, places of the star, exposures, and detectors of both beams.
+
+    The places are None where the star is in the middle of each beam.
 
     ``raw`` is a folder of raw frames, ``centre`` the place of the star where it is known. ``ways``
     are what a user can do about a file that lacks ``"raw"`` or ``"centre"``, to be said.
     """
     ways = {"raw": "", "centre": ""} | (ways or {})
     known = None if raw is None else raw_frames(raw, layout)
-    found = _read(files, layout, known, centre)
+    found = _read(files, layout, known, centre is None and not layout.centred)
     for file, frame in zip(files, found, strict=True):
         foreign = not_of_instrument(frame.values, layout)
         if foreign:
@@ -83,7 +85,7 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
         if frame.errors:
             way = ways["raw"] if raw is None and layout.raw_columns else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
-    if centre is None:
+    if centre is None and not layout.centred:
         # (beam, x and y): the star stands still over the slices within a fraction of a pixel
         centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
         seen = np.isfinite(np.asarray(centre)).all(axis=(1, 2))
@@ -93,13 +95,15 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
     # frames of equal exposures need no scale, known or not
     exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
     differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
-    left = [beam_scale(file, layout, f.values) for file, f in zip(files, found, strict=True)]
-    return _angles(found), centre, exposure / np.median(exposure) if differ else None, left
+    detectors = [
+        beam_detectors(file, layout, f.values, f.unit) for file, f in zip(files, found, strict=True)
+    ]
+    return _angles(found), centre, exposure / np.median(exposure) if differ else None, detectors
 
 
-def _read(files, layout, raw, centre):
-    """Return what is known of the files."""
-    if centre is None:
+def _read(files, layout, raw, find):
+    """Return what is known of the files, with the places of a star that is to be found."""
+    if find:
         # finds the star, which takes the time of this step
         frames = [reduce_frame(file, layout, source="star", raw=raw) for file in files]
         check_stars(frames, layout)

@@ -5,7 +5,6 @@ import argparse
 import multiprocessing
 import signal
 import sys
-import time
 from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, GapError
@@ -27,9 +26,6 @@ examples:
 A run that was interrupted goes on if it is started again with the same
 checkpoint.
 """
-# seconds between two lines of progress where there is no terminal for a bar
-_BETWEEN = 10
-
 
 OPTIONS = """
 action {run,make,score} ? =run  run: make, diagnose and score (default); make DIR: write cases to
@@ -117,8 +113,6 @@ def _options(arguments):
             n_wavelengths=arguments.wavelengths,
             n_derotator=arguments.derotator_angles,
         ),
-        # a bar on a terminal, else lines
-        "progress": not is_quiet(arguments) and (sys.stderr.isatty() or _Progress()),
     }
 
 
@@ -148,20 +142,6 @@ def _workers(count):
             process.terminate()
         raise
     pool.shutdown()
-
-
-class _Progress:
-    """Reports from time to time how many challenges are done, and after how many seconds."""
-
-    def __init__(self):
-        self.started = self.said = time.monotonic()
-
-    def __call__(self, done, n):
-        now = time.monotonic()
-        if now - self.said >= _BETWEEN:
-            self.said = now
-            seconds = f"{now - self.started:3.0f} s"
-            show(f"astropolcal: {seconds}  {done} of {n} challenges", file=sys.stderr)
 
 
 def _report(result):

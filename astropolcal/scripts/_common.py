@@ -22,6 +22,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
+from astropolcal.progress import clear
 from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
@@ -324,6 +325,25 @@ def angles(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
 
 
+def sky_position(text, option):
+    """Return the position that RA,DEC mean; of names a server would have to be asked."""
+    from astropy.coordinates import SkyCoord
+
+    from astropolcal.observations.pointings import sky_angle
+
+    try:
+        right_ascension, declination = text.split(",")
+        angles = sky_angle("right_ascension", right_ascension), sky_angle("", declination)
+        if not (text.isascii() and np.isfinite(angles).all()):
+            raise ValueError
+        return SkyCoord(*angles, unit=u.deg)
+    except (ValueError, u.UnitsError):
+        raise ParameterError(
+            f"{option} {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00; allowed is a "
+            "declination from -90 to 90"
+        ) from None
+
+
 def number_or(*words):
     """Return the type of an option that takes one of some words or a number."""
 
@@ -353,6 +373,7 @@ def is_quiet(arguments):
 
 def show(text, file=None):
     """Print lines; names of files may hold what a terminal would act on."""
+    clear()
     print(printable(text), file=file, flush=file is not None)
 
 

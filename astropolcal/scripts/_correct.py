@@ -2,6 +2,7 @@
 """``astropolcal correct``: from science cubes to Stokes parameters."""
 
 import argparse
+import copy
 from pathlib import Path
 
 import astropy.units as u
@@ -69,6 +70,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
     zenith (default: 0)
 --mirrored  east is to the right of north
+--subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
+    measures it between two radii in pixels, DEG%%,DEG (0.8+-0.1,45+-3) states degree in percent and
+    angle, with their errors
 --open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not
     determine: infinite (default), ignore, or the standard deviation of the angle that each is
     named after, in degrees
@@ -110,7 +114,29 @@ def _point(text):
     return x, y
 
 
+def _star(text):
+    """Return the arguments of `Corrected.without_star`."""
+    try:
+        if text.startswith("annulus="):
+            inner, outer = (plain_number(part) for part in text.removeprefix("annulus=").split(","))
+            return {"annulus": (inner, outer)}
+        (dolp, s_dolp), (aolp, s_aolp) = (_with_error(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither annulus=IN,OUT nor DOLP,AOLP such as 0.8+-0.1,45+-3"
+        ) from None
+    if not 0 <= dolp <= 100:
+        raise argparse.ArgumentTypeError(f"{text!r}: {dolp:g} %; allowed are 0 to 100 %")
+    return {"dolp": dolp / 100, "aolp": aolp * u.deg, "errors": (s_dolp / 100, s_aolp * u.deg)}
+
+
+def _with_error(text):
+    value, _, error = text.partition("+-")
+    return plain_number(value), plain_number(error or "0")
+
+
 TYPES = {
+    "star": _star,
     "names": lambda text: [name.strip() for name in text.split(",") if name.strip()],
     "point": _point,
     "sigma": number_or("infinite", "ignore"),
@@ -131,9 +157,8 @@ def run(arguments):
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
-    # one a frame: files of left beams follow those of the right ones
-    files = instrument.files.frame_files(files)
-    table, centres, scale, left_scale = survey_frames(
+    files, instrument = _sorted(files, instrument)
+    table, centres, scale, detectors = survey_frames(
         files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
     frames = ScienceFrames.from_files(
@@ -146,7 +171,8 @@ def run(arguments):
         position_angle=_position_angles(table, arguments),
         mirrored=arguments.mirrored,
         scale=scale,
-        left_scale=left_scale,
+        left_scale=[left.gain / right.gain for right, left in detectors],
+        detectors=detectors,
         # date and mode were checked when the calibration was chosen
         date=None,
         mode=calibration.validity.mode,
@@ -159,19 +185,33 @@ def run(arguments):
         weights="variance" if arguments.weights == "variance" else None,
         any_date=True,
         n_samples=arguments.samples,
-        progress=not arguments.quiet,
         provenance=provenance,
         **{name: getattr(arguments, name) for name in _PASSED_ON},
     )
-    result.write(arguments.output, overwrite=True)
-    # for the report, too, not only for --spectrum
+    # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
+    if arguments.subtract_star is not None:
+        result = result.without_star(**arguments.subtract_star)
+    result.write(arguments.output, overwrite=True)
     _write_others(result, star, arguments)
     summary = _summary(result, star, arguments, len(files))
     if arguments.json:
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
         _report(summary, result.systematic, arguments)
+
+
+def _sorted(files, instrument):
+    """Return one file per frame, and the instrument that knows those of the left beams."""
+    from astropolcal.reduction.sorting import sort_beams
+
+    files, layout, lost = sort_beams(files, instrument.files)
+    for path, why in lost.items():
+        raise ObservationError(f"{path}: {'; '.join(why)}")
+    # the registry hands out instances that others may hold
+    instrument = copy.copy(instrument)
+    instrument.files = layout
+    return files, instrument
 
 
 def _check_options(arguments):
@@ -191,6 +231,12 @@ def _check_options(arguments):
     if arguments.radius is not None and arguments.radius > largest > 0:
         raise ParameterError(
             f"--radius {arguments.radius:g}: leaves the images of --size {arguments.size}; "
+            f"allowed are up to {largest:g} pixels"
+        )
+    _, outer = (arguments.subtract_star or {}).get("annulus", (0, 0))
+    if outer > largest > 0:
+        raise ParameterError(
+            f"--subtract-star annulus=...,{outer:g}: leaves the images of --size {arguments.size}; "
             f"allowed are up to {largest:g} pixels"
         )
 
@@ -318,7 +364,17 @@ def _summary(result, star, arguments, n_frames):
         "leakage_u": result.leakage[:, 2],
         "held": [] if result.systematic is None else result.systematic.held,
         "aperture": {"radius": _radius(arguments)} | spectrum,
-    }
+    } | _subtracted(result.star)
+
+
+def _subtracted(table):
+    """Return the star that was subtracted, for the summary."""
+    if table is None:
+        return {}
+    from astropolcal.correction.star import star_words
+
+    values = {name: u.Quantity(table[name]).value for name in table.colnames[1:]}
+    return {"subtracted_star": {"from": table.meta["star"], "words": star_words(table)} | values}
 
 
 def _report(summary, systematic, arguments):
@@ -349,6 +405,9 @@ def _verdict(summary, systematic):
         )
         for words, key, unit, scale in (("DoLP", "s_p", " %", 100), ("AoLP", "s_chi", " deg", 1))
     )
+    # the unit once: the line is short
+    if not told:
+        degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
     verdict, advice = "Usable", "astropolcal info tells what the product holds"
     if not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
@@ -387,6 +446,8 @@ def _lines(summary, systematic):
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
             values = scale * aperture[f"{error}_{kind}"]
             lines.append(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
+    if star := summary.get("subtracted_star"):
+        lines.append(f"  subtracted from all light: {star['words']} ({star['from']})")
     return lines
 
 

@@ -1,18 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal diagnose``: which effect a model lacks, and how far that explains the gap."""
 
-import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.progress import stage
 from astropolcal.scripts._common import (
     MODEL,
     check_suffix,
     edit_chains,
     instrument_of,
-    is_quiet,
     printer,
     read_datasets,
     show,
@@ -79,13 +77,13 @@ def run(arguments):
         for name, effect in EFFECTS.items():
             show(wrapped(f"{name:<{width}}{effect.title}", indent=width))
         return
-    say, progress = printer(arguments), None if is_quiet(arguments) else _Progress()
+    say = printer(arguments)
     check_suffix("--save", arguments.save, ".asdf")
     if arguments.report and Path(arguments.report).suffix.lower() not in _PAGES:
         raise AstropolcalError(
             f"--report {arguments.report}: the name must end with {' or '.join(_PAGES)}"
         )
-    options = {"effects": _effects(arguments.effects), "progress": progress}
+    options = {"effects": _effects(arguments.effects), "progress": stage}
     nominal, datasets, instrument = _nominal(arguments)
     options |= {"changes": arguments.changes, "nested": arguments.nested}
     diagnosis = diagnose(nominal, datasets, **options)
@@ -117,17 +115,6 @@ def _ending(content, written):
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
     words = wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
     return [*words, *written_lines(written)]
-
-
-class _Progress:
-    """Says what is done next, and after how many seconds."""
-
-    def __init__(self):
-        self.started = time.monotonic()
-
-    def __call__(self, line):
-        text = f"astropolcal: {time.monotonic() - self.started:3.0f} s  {line}"
-        show(wrapped(text, indent=20), file=sys.stderr)
 
 
 # ---- effects --------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.scripts._common import give, printer, say_written
-from astropolcal.units import iso_date, plain_number
+from astropolcal.scripts._common import give, printer, say_written, sky_position
+from astropolcal.units import iso_date
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
@@ -36,7 +36,7 @@ file CAL.asdf ? Input  calibration
 --parallactic DEG float  default: 0
 --derotator DEG + float  angles of the table (default: 0 to 90 in steps of 15)
 --wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
---target RA,DEC  for the best derotator offset: position in degree
+--target RA,DEC  for the best derotator offset: degrees, or 05:26:06,+16:42:00
 --night START/END  times in UTC, with --target
 --law MODE  what the derotator stabilizes, such as field (default: pupil)
 --date DATE  of the telescope's mirrors, where that matters
@@ -182,23 +182,8 @@ def _track(arguments, instrument):
     location = instrument.location
     if location is None:
         raise InstrumentError(f"{instrument.name}: its site is not known")
-    return pointing(_target(arguments.target), _times(arguments.night), location)
-
-
-def _target(text):
-    from astropy.coordinates import SkyCoord
-
-    try:
-        # degrees only: names would ask a server
-        ra, dec = (plain_number(part) for part in text.split(","))
-        if not np.isfinite([ra, dec]).all():
-            raise ValueError
-        return SkyCoord(ra, dec, unit=u.deg)
-    except ValueError:
-        raise ParameterError(
-            f"--target {text}: write RA,DEC in degree, such as 75.2,28.3; allowed is a "
-            "declination from -90 to 90"
-        ) from None
+    target = sky_position(arguments.target, "--target")
+    return pointing(target, _times(arguments.night), location)
 
 
 def _times(text):

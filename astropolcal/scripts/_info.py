@@ -58,7 +58,8 @@ def run(arguments):
         lines, content = _library(path)
     elif Path(path).suffix.lower() == ".asdf":
         lines, content = _calibration(path, arguments)
-    elif _is_fits(path):
+    # a FITS file, or one that by its name claims to be one
+    elif str(path).lower().endswith(_FITS_NAMES) or _begins(path, b"SIMPLE  ="):
         lines, content = _wrapped(*describe_fits(path))
     else:
         lines, content = _table(path)
@@ -154,11 +155,6 @@ def _library(folder):
 def _percent(value):
     # NaN is not equal to itself
     return f"{value:.3f} %" if value == value else "-"
-
-
-def _is_fits(path):
-    """Return whether a file is, or by its name claims to be, a FITS file."""
-    return str(path).lower().endswith(_FITS_NAMES) or _begins(path, b"SIMPLE  =")
 
 
 def _begins(path, mark, unknown=False):

@@ -4,6 +4,7 @@
 import argparse
 import sys
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ examples:
 OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
 -o --output OBS.ecsv Output required  the table; overwritten if it exists
---instrument NAME =charis  default: charis
+--instrument NAME  default: the one that the headers name, else charis
 --raw DIR Frames  folder of raw frames, for keywords that the cubes lack
 --source KIND =internal  internal (default), polarized, unpolarized (internal source with and
     without its polarizer), star, 'unpolarized standard star', 'polarized standard star'
@@ -68,30 +69,23 @@ TYPES = {"pair": _pair, "radius": number_or("fwhm", "growth")}
 
 def run(arguments):
     """Reduce the cubes and write the table."""
-    from tqdm import tqdm
-
     from astropolcal import instruments
     from astropolcal.reduction import reduce_run
 
     check_suffix("-o", arguments.output, ".ecsv")
     files = cube_files(arguments.cubes)
-    instrument = instruments.get(arguments.instrument)
-    with tqdm(
-        total=len(files), desc="reducing", unit="cube", disable=True if arguments.quiet else None
-    ) as bar:
-        reduction = reduce_run(
-            files,
-            instrument,
-            source=arguments.source,
-            raw=arguments.raw,
-            meta=dict(arguments.meta),
-            workers=arguments.workers,
-            resume=arguments.resume,
-            hwp_sequence=arguments.hwp_sequence,
-            # tqdm counts steps, the reduction the total
-            progress=lambda done, _: bar.update(done - bar.n),
-            **_options(arguments),
-        )
+    instrument = instruments.get(arguments.instrument or _recognized(files))
+    reduction = reduce_run(
+        files,
+        instrument,
+        source=arguments.source,
+        raw=arguments.raw,
+        meta=dict(arguments.meta),
+        workers=arguments.workers,
+        resume=arguments.resume,
+        hwp_sequence=arguments.hwp_sequence,
+        **_options(arguments),
+    )
     reduction.write(arguments.output, overwrite=True)
     # after the table, which is what the time went into
     figures = []
@@ -103,6 +97,18 @@ def run(arguments):
         summary = {"output": str(arguments.output)} | reduction.summary()
         write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
     _report(reduction, arguments, figures)
+
+
+def _recognized(files):
+    """Return the name of the instrument that one of the first headers names."""
+    from astropolcal.fitscheck import primary_header
+    from astropolcal.pipeline.headers import describe
+
+    # all are of one run; those that cannot be read are told of later
+    for path in files[:5]:
+        with suppress(AstropolcalError):
+            return describe(primary_header(path), stated=("date", "mode"))["instrument"]
+    return "charis"
 
 
 def _options(arguments):

@@ -123,7 +123,8 @@ def _sample(calibration, arguments):
             burn_in=arguments.burn,
             seed=arguments.seed,
             checkpoint=arguments.checkpoint,
-            progress=not arguments.quiet,
+            # as for all commands, and not at all where that is not wanted
+            progress=False,
         )
     except FitError as error:
         # about the option instead of the argument
@@ -154,15 +155,14 @@ def _words(calibration, arguments, written):
 
 
 def _table(posterior):
-    """Return the run in words, and what is common to all wavelengths as a table."""
+    """Return what is common to all wavelengths as a table, and the run in words."""
     parameters = posterior.report()["parameters"]
     # values of a wavelength end in [i]; hundreds of them do not fit a terminal
     common = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
     # if only such values varied, they are all there is
     shown = common or parameters
     width = max(map(len, shown)) + 2
-    lines = [wrapped(line, indent=2) for line in posterior.words().splitlines()]
-    lines += ["", " " * width + "".join(f"{text:>11}" for text in _COLUMNS)]
+    lines = [" " * width + "".join(f"{text:>11}" for text in _COLUMNS)]
     for name, entry in shown.items():
         numbers = "".join(f" {entry[key]:z10.5f}" for key in _COLUMNS)
         lines.append(f"{name:<{width}}{numbers} {entry['unit']}".rstrip())
@@ -173,4 +173,5 @@ def _table(posterior):
         lines.append(
             f"{counted(rest, 'value')} given per wavelength {are} in the file and in the JSON"
         )
+    lines += ["", *(wrapped(line, indent=2) for line in posterior.words().splitlines())]
     return lines

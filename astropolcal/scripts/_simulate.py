@@ -206,7 +206,6 @@ def _write_cubes(arguments, instrument, chain, wavelength, frames):
         image=_image(arguments),
         detector=DetectorModel(noise=not arguments.no_noise, **options),
         seed=arguments.seed,
-        progress=not arguments.quiet,
     )
 
 

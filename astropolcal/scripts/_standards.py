@@ -6,7 +6,7 @@ import math
 import astropy.units as u
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import give, wrapped
+from astropolcal.scripts._common import give, sky_position, wrapped
 from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
@@ -186,9 +186,11 @@ def _many(arguments):
 
     site = None if arguments.site is None else _site(arguments.site)
     radius = 15.0 if arguments.radius is None else arguments.radius
-    near = arguments.near and {"center": _position(arguments.near), "radius": radius * u.deg}
+    near = {}
+    if arguments.near:
+        near = {"center": sky_position(arguments.near, "--near"), "radius": radius * u.deg}
     found = standards.search(
-        **(near or {}),
+        **near,
         kind=arguments.kind,
         band=arguments.band,
         magnitude=_numbers(arguments.magnitude, "--magnitude", 2),
@@ -351,20 +353,6 @@ def _numbers(text, option, count):
     if len(values) != count or not all(map(math.isfinite, values)):
         raise ParameterError(f"{option} {text}: give {count} numbers with commas between them")
     return values
-
-
-def _position(text):
-    from astropy.coordinates import SkyCoord
-
-    try:
-        ra, dec = text.split(",")
-        # 05:26:06 are hours, 81.5 degrees
-        unit = (u.hourangle if ":" in ra else u.deg, u.deg)
-        return SkyCoord(ra, dec, unit=unit)
-    except (ValueError, u.UnitsError):
-        raise ParameterError(
-            f"--near {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00"
-        ) from None
 
 
 def _site(text):

@@ -9,7 +9,9 @@ import argparse
 import os
 import re
 import sys
+import threading
 import warnings
+from _thread import interrupt_main
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
@@ -56,6 +58,25 @@ class _OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"astropolcal: error: {_one_line(message)} (see {self.prog} --help)\n")
 
 
+class _PrintCompletion(argparse.Action):
+    """Print what a shell runs to complete our commands, options and files."""
+
+    def __call__(self, parser, namespace, shell, option_string=None):
+        try:
+            import shtab
+        except ImportError:
+            parser.error(f'{option_string} needs shtab: pip install "astropolcal[completion]"')
+        from astropolcal.scripts._common import Folder, Input, Output
+
+        commands = next(iter(parser._subparsers._group_actions)).choices
+        for action in (action for each in commands.values() for action in each._actions):
+            if isinstance(action.type, type) and issubclass(action.type, (Input, Output)):
+                folder = issubclass(action.type, Folder)
+                action.complete = shtab.DIRECTORY if folder else shtab.FILE
+        print(shtab.complete(parser, shell))
+        parser.exit()
+
+
 def _did_you_mean(text, known):
     from astropolcal.words import did_you_mean
 
@@ -75,6 +96,9 @@ def build_parser():
 
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
+    words = "print what completes commands, options and files in a shell (needs shtab)"
+    shells = {"choices": ("bash", "zsh", "tcsh"), "help": words}
+    parser.add_argument("--print-completion", action=_PrintCompletion, **shells)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in _COMMANDS:
         add_command(commands, name, import_module(f"astropolcal.scripts._{name}"))
@@ -114,6 +138,7 @@ def main(argv=None):
     vampires
     0
     """
+    shown, sys.unraisablehook = sys.unraisablehook, _insist
     try:
         status = _run(argv)
         # what is left in the buffer: at exit it would be too late to say why it is lost
@@ -132,15 +157,27 @@ def main(argv=None):
         words = _one_line(f"{where}: cannot be written: {error.strerror or error}")
         print(f"astropolcal: error: {words}", file=sys.stderr)
         status = 2
+    finally:
+        sys.unraisablehook = shown
     # do not complain again at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return status
+
+
+def _insist(lost):
+    """Interrupt again: what Python calls by itself, as while it imports, drops an interruption."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        # once that is over
+        threading.Timer(0.1, interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
+    from astropolcal.progress import shown
     from astropolcal.scripts._common import check_paths
 
     with warnings.catch_warnings():
@@ -151,7 +188,7 @@ def _run(argv):
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            with _earth(arguments):
+            with _earth(arguments), shown(not getattr(arguments, "quiet", False)):
                 arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
@@ -179,6 +216,9 @@ def _one_line(message):
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
+    from astropolcal.progress import clear
+
+    clear()
     print(f"astropolcal: warning: {_one_line(message)}", file=sys.stderr)
 
 

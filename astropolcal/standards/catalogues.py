@@ -303,16 +303,8 @@ def _normal(name):
 def _tables():
     # stars and measurements in two tables: a star has one position and many measurements
     files = ("standards.ecsv", "standards_polarization.ecsv")
-    return tuple(_read(_DATA / name) for name in files)
-
-
-def _read(path):
-    table = QTable.read(path, format="ascii.ecsv")
-    for column in table.itercols():
-        # astropy reads an empty text as masked
-        if hasattr(column, "filled"):
-            table[column.info.name] = column.filled("")
-    return table
+    # astropy reads an empty text as masked
+    return tuple(QTable.read(_DATA / name, format="ascii.ecsv").filled("") for name in files)
 
 
 @lru_cache(maxsize=1)
@@ -330,6 +322,7 @@ def _star(row, polarization):
     measured = polarization[polarization["name"] == row["name"]]
     measured.remove_column("name")
     law, errors = _law(row, measured)
+    varies = {"p": row["p_scatter"], "theta": row["theta_scatter"]}
     texts = ("spectral_type", "law_reference", "law_doi", "note")
     return StandardStar(
         name=str(row["name"]),
@@ -341,7 +334,7 @@ def _star(row, polarization):
         law=law,
         law_errors=errors,
         aliases=tuple(a for a in str(row["aliases"]).split(";") if a),
-        variability=_variability(row),
+        variability=varies if np.isfinite(row["p_scatter"]) else {},
         **{key: str(row[key]) for key in texts},
     )
 
@@ -362,10 +355,3 @@ def _law(row, measured):
     # errors of some parameters only would give a covariance that is too small
     complete = len(errors) == len(law.param_names) and all(map(np.isfinite, errors.values()))
     return law, errors if complete else {}
-
-
-def _variability(row):
-    """Return how much a star varies, empty if it is not known to."""
-    if not np.isfinite(row["p_scatter"]):
-        return {}
-    return {"p": row["p_scatter"], "theta": row["theta_scatter"]}

@@ -80,7 +80,10 @@ def unpolarized_error(star):
     # P^2 / 2 each; that of its estimate p^2 / 2 - sigma^2 is sigma^4 for a small P
     square = np.average(degree**2 / 2 - error**2, weights=error**-4)
     value = np.sqrt(np.min(error) ** 2 + max(square, 0.0))
-    words = "; ".join(_measured_words(row) for row in table)
+    rows = zip(table["reference"], degree, error, table["wavelength"].to_value(u.um), strict=True)
+    spread = " +- {2:.3g}" if np.any(stated) else ""
+    form = f"{{0}}: {{1:.3g}}{spread} % at {{3:.3g}} um"
+    words = "; ".join(form.format(name, 100 * p, 100 * e, at) for name, p, e, at in rows)
     if not np.any(stated):
         words += f"; no error is stated, {100 * _UNSTATED:g} % is assumed"
     if "emission-line" in star.note:
@@ -88,19 +91,13 @@ def unpolarized_error(star):
     return UnpolarizedError(round(max(float(value), _LEAST), 7), words)
 
 
-def _measured_words(row):
-    """Return a measurement in words."""
-    degree, error = row["p"].to_value(u.percent), row["p_err"].to_value(u.percent)
-    spread = f" +- {error:.3g}" if np.isfinite(error) else ""
-    where = row["wavelength"].to_value(u.um)
-    return f"{row['reference']}: {degree:.3g}{spread} % at {where:.3g} um"
-
-
 # --- polarized ---------------------------------------------------------------------------
 
 
 def interstellar(star):
     """Return the Serkowski law of a polarized star, with an error of every parameter."""
+    from scipy.linalg import block_diag
+
     if star.kind != "polarized":
         raise ParameterError(f"{star.name} is {star.kind}; ask for unpolarized_error() instead")
     if star.law is None and not np.any(np.isfinite(star.polarization["theta"])):
@@ -109,8 +106,7 @@ def interstellar(star):
     shape, within, words = (_published if complete else _fitted)(star)
     angle, turned, angle_words = _turned(star, shape[1], complete)
     words = [*words, *angle_words, f"theta: +- {_ZERO_POINT:g} deg for its zero"]
-    covariance = np.zeros((5, 5))
-    covariance[:3, :3], covariance[3:, 3:] = within, turned
+    covariance = block_diag(within, turned)
     words += _vary(star, covariance)
     law = SerkowskiLaw(
         shape[0], shape[1] * u.um, shape[2], angle[0] * u.deg, angle[1] * u.deg / u.um

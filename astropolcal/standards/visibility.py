@@ -12,6 +12,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
 from astropolcal.standards.catalogues import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
@@ -231,48 +232,30 @@ def telescope_information(
         raise ParameterError(f"there are {psi.size} parallactic angles and {turn.size} altitudes")
     columns = _design(psi, turn, offset) / _positive(frame_error, "frame_error")
     if star_error is not None:
-        columns = np.vstack([columns, _prior(columns.shape[1], star_error)])
+        # a star known beforehand is two more measurements, of its q and u
+        known = np.eye(2, columns.shape[1]) / _positive(star_error, "star_error")
+        columns = np.vstack([columns, known])
     return TelescopeInformation(_NAMES[: columns.shape[1]], _covariance(columns))
 
 
 def _design(psi, turn, offset):
     """Return the derivatives of all q' and u' by the parameters, shape (2 n, 3 or 5)."""
     # in the frame of the instrument; the turn itself changes no information
-    star, mirror = _rotation(psi - turn), _rotation(-turn)[..., :1]
+    star, mirror = (rotation_matrix(a * u.rad)[..., 1:3, 1:3] for a in (psi - turn, -turn))
     # columns: star q, star u, diattenuation, and with an offset its q and u
-    parts = [star, mirror]
+    parts = [star, mirror[..., :1]]
     if offset:
         parts.append(np.broadcast_to(np.eye(2), star.shape))
     return np.concatenate(parts, axis=-1).reshape(2 * len(psi), -1)
 
 
-def _rotation(angle):
-    """Return the matrices that turn (q, u) by an angle, shape (n, 2, 2)."""
-    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
-    return np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], axis=-2)
-
-
-def _prior(width, star_error):
-    # a star known beforehand is two more measurements, of its q and u
-    rows = np.zeros((2, width))
-    rows[:, :2] = np.eye(2) / _positive(star_error, "star_error")
-    return rows
-
-
 def _covariance(columns):
     """Return the covariance of least squares; infinite where nothing is determined."""
-    # all right vectors are there even if one frame gives fewer rows than columns; with more rows
-    # the full matrix of left ones would have the square of their number
-    short = columns.shape[0] < columns.shape[1]
-    _, size, directions = np.linalg.svd(columns, full_matrices=short)
-    # one frame gives two rows for three or more columns: the missing singular values are zero
-    size = np.concatenate([size, np.zeros(columns.shape[1] - len(size))])
-    good = size > _RANK * size.max()
-    half = directions[good] / size[good, None]
-    covariance = half.T @ half
+    inverse = np.linalg.pinv(columns, rcond=_RANK)
+    covariance = inverse @ inverse.T
     # a parameter that takes part in an open direction has an infinite error, not that of a
-    # pseudo-inverse; null vectors are exact to about the root of the rank tolerance
-    lost = np.any(np.abs(directions[~good]) > np.sqrt(_RANK), axis=0)
+    # pseudo-inverse: the projector on what is determined shortens it
+    lost = np.diagonal(inverse @ columns) < 1 - _RANK
     covariance[lost, :] = covariance[:, lost] = np.inf
     return covariance
 

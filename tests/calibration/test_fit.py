@@ -434,6 +434,10 @@ def test_undetermined_parameters_are_null_in_json(make):
 
 def test_parameter_table_has_a_row_a_free_value(calibrated):
     table = calibrated.parameters
+    lines = str(table).splitlines()
+    assert lines[0].split() == ["name", "value", "std", "unit", "status"]
+    assert len(lines) == len(table) + 2
+    assert not any("..." in line or len(line) > 80 for line in lines)
     assert len(table) == len(calibrated.covariance)
     assert list(table["name"]) == calibrated.covariance.names
     np.testing.assert_allclose(table["std"], calibrated.covariance.stds)

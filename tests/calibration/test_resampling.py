@@ -154,12 +154,6 @@ def test_every_dataset_keeps_its_number_of_blocks(make):
     assert bootstrap(cal, 5, "pair", seed=1).n_blocks == 28
 
 
-def test_progress_is_told(white):
-    told = []
-    bootstrap(white, 4, seed=1, progress=lambda done, wanted: told.append((done, wanted)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
 def test_bounds_are_kept(make):
     truth = make.truth(make.chain("linear", wavelength=LAM))
     data = make.observe(truth, wavelength=LAM, seed=1)

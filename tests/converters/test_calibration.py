@@ -278,26 +278,41 @@ def spoiled_accuracy(name, values):
     return spoil
 
 
+def errors_of_the_model(absolute):
+    known = {"wavelength_nm": [1200.0, 1600.0], "relative_percent": [1.0, 1.0]}
+    return known | {"absolute_percent": absolute}
+
+
+def test_accounts_of_a_fit_that_no_schema_allows(cal, tmp_path):
+    outlier = {"frames": "1 2", "dataset": "a", "residual_percent": 1, "brightness": 1}
+    bound = {"times": 1.0, "slack": 1.0, "by": []}
+    for key, value in [
+        ("masked", {"a": 1}),
+        ("masked", ["x"]),
+        ("outliers", {"a": 1}),
+        ("outliers", [outlier]),
+        ("outliers", [outlier | {"sigma": "x"}]),
+        ("bounds", []),
+        ("bounds", {"inward": {"hwp.theta": "x"}}),
+        ("bounds", {"released": {"hwp.theta": bound}}),
+        ("sky_settings", {"derotator": []}),
+        ("sky_settings", {"derotator": ["x"]}),
+        ("model_error", errors_of_the_model([-1.0, 1.0])),
+        ("model_error", {"wavelength_nm": [1200.0]}),
+        ("sky_accuracy", [{"wavelength_nm": [1200.0]}]),
+    ]:
+        spoiled = copy.deepcopy(cal)
+        spoiled.fit[key] = value
+        with pytest.raises(CalibrationFileError, match=f"invalid at .*fit.{key}"):
+            spoiled.write(tmp_path / "spoiled.asdf")
+
+
 def test_parts_that_do_not_belong_together(cal):
     for spoil, words in [
         (lambda c: c.chains.append(c.chains[0]), "2 chains but 1 datasets"),
         (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is not a free"),
-        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is not a list of reasons"),
-        (lambda c: c.fit.update(masked=["x"]), "fit.masked is not a list of reasons"),
-        (lambda c: c.fit.update(outliers={"a": 1}), "fit.outliers is a dict, not a list"),
-        (
-            lambda c: c.fit.update(outliers=[{"frames": [1]}]),
-            "lacks what a pair of frames is described",
-        ),
-        (
-            lambda c: c.fit.update(
-                outliers=[
-                    {"frames": [1], "dataset": "a", "residual_percent": 1, "sigma": "x"}
-                    | {"brightness": 1}
-                ]
-            ),
-            "fit.outliers lacks what a pair of frames is described by",
-        ),
+        (lambda c: c.fit.update(sky_settings={"derotator": [np.nan]}), "must be finite"),
+        (lambda c: c.fit.update(model_error=errors_of_the_model([1.0])), "of equal length"),
         (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is not a list of numbers"),
         (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is not a list of numbers"),
         (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is not a fraction"),

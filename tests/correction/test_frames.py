@@ -139,7 +139,9 @@ def layout(**changes):
         **changes,
     )
     charis = instruments.get("charis")
-    return SimpleNamespace(name="lab", files=files, wavelength=LAM, positions=charis.positions)
+    lab = SimpleNamespace(name="lab", files=files, wavelength=LAM, positions=charis.positions)
+    lab.configured = lambda header: lab
+    return lab
 
 
 TABLE = QTable({"hwp": HWP, "derotator": [60] * 4 * u.deg})
@@ -184,6 +186,18 @@ def test_what_files_give(cubes):
     turned = from_files(paths, position_angle=[0, 1, 2, 3] * u.deg, pixel_scale=7.0)
     assert turned.north_up
     assert turned.pixel_scale == 7.0
+
+
+def test_files_without_errors_have_those_of_the_detectors(cubes):
+    values, paths = cubes
+    assert not from_files(paths, centres=[(27, 11), (10, 8)]).source.has_variances
+    # twice the pixels on the right, thrice on the left, which counts half
+    pair = [SimpleNamespace(variance=lambda x, k=k: k * x) for k in (2.0, 3.0)]
+    frames = from_files(
+        paths, centres=[(27, 11), (10, 8)], detectors=[pair] * len(paths), left_scale=0.5
+    )
+    found = frames.source.variances(1, slice(0, 4), slice(0, 2))
+    np.testing.assert_allclose(found, 0.25 * 3.0 * values[:, :, 7:10, 9:12])
 
 
 def test_places_of_the_beams(cubes):

@@ -65,6 +65,7 @@ def test_light_goes_through_the_chain_as_the_package_says():
                 np.testing.assert_allclose(flux, expected[..., 0, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_each_kind_of_fault_stands_out_as_asked():
     for kind in sorted(set(KINDS) - {"none", "absorbed", "frame", "mechanism"}):
         data, _, case = make_challenge(5, kind=kind, setup=SMALL, snr=20)
@@ -330,18 +331,16 @@ def test_the_diagnosis_keeps_quiet_where_there_is_nothing():
 
 
 def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
-    made, said, path = [], [], tmp_path / "run.jsonl"
+    made, path = [], tmp_path / "run.jsonl"
     monkeypatch.setattr(challenge, "_run_one", lambda i, s: made.append(i) or record(i))
     run_challenge(2, 5, checkpoint=path)
     whole = path.read_text()
     path.write_text(whole + '{"index": 2, "ki')
     with ThreadPoolExecutor(2) as pool:
-        progress = lambda *numbers: said.append(numbers)  # noqa: E731
-        result = run_challenge(4, 5, checkpoint=path, client=pool, progress=progress)
+        result = run_challenge(4, 5, checkpoint=path, client=pool)
     assert sorted(made) == [0, 1, 2, 3]
     assert [r["index"] for r in result.records] == [0, 1, 2, 3]
     assert path.read_text().startswith(whole)
-    assert said == [(3, 4), (4, 4)]
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 """The page of a diagnosis in a browser, and what a reader with a screen reader needs."""
 
 import base64
+import html
+import json
 import re
 import shutil
 import subprocess
@@ -72,9 +74,9 @@ def browser():
     return found
 
 
-def rendered(browser, path, folder):
+def rendered(browser, path, folder, *more):
     """Return the document after loading, and what the browser had to say about it."""
-    command = [browser, *QUIET, f"--user-data-dir={folder}", "--dump-dom", path.as_uri()]
+    command = [browser, *QUIET, *more, f"--user-data-dir={folder}", "--dump-dom", path.as_uri()]
     result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     return result.stdout, [line for line in result.stderr.splitlines() if "CONSOLE" in line]
 
@@ -128,6 +130,62 @@ def test_a_page_that_asks_for_the_network_would_be_noticed(browser, page, tmp_pa
     asking.write_text(page.read_text(encoding="utf-8").replace("</main>", f"{picture}</main>"))
     _, complaints = rendered(browser, asking, tmp_path / "profile")
     assert any("Content Security Policy" in line for line in complaints)
+
+
+# a window cannot be as narrow as a telephone, a frame in it can
+_FRAMES = """<body><script>
+const seen = {};
+async function look(width) {
+  const frame = document.createElement("iframe");
+  frame.style = `border: 0; width: ${width}px; height: 900px`;
+  const loaded = new Promise(resolve => { frame.onload = resolve; });
+  frame.src = "gap.html";
+  document.body.append(frame);
+  await loaded;
+  const page = frame.contentDocument, box = each => each.getBoundingClientRect();
+  const beyond = [...page.querySelectorAll("body *")].filter(
+    each => !each.parentElement.closest(".scroll") && box(each).right > width + 1);
+  seen[width] = {
+    room: page.documentElement.clientWidth, content: page.documentElement.scrollWidth,
+    text: box(page.querySelector("main")).width, beyond: beyond.map(each => each.outerHTML),
+    images: [...page.images].map(image => [box(image).width, box(image).height]),
+    title: [...page.querySelectorAll("h1 > *")].map(each => box(each).height),
+    tables: [...page.querySelectorAll(".scroll.wide")].map(
+      each => [each.scrollWidth > each.clientWidth,
+               frame.contentWindow.getComputedStyle(each, "::before").content]),
+  };
+}
+(async () => {
+  for (const width of [400, 800, 1400]) await look(width);
+  document.title = JSON.stringify(seen);
+  document.body.innerHTML = "";
+})();
+</script></body>"""
+
+
+@pytest.mark.slow
+def test_page_fits_a_telephone_a_tablet_and_a_desktop(browser, page, tmp_path):
+    path = page.with_name("frames.html")
+    path.write_text(_FRAMES)
+    more = ["--allow-file-access-from-files", "--virtual-time-budget=20000"]
+    dom, _ = rendered(browser, path, tmp_path / "profile", *more)
+    seen = json.loads(html.unescape(re.search(r"<title>(.*)</title>", dom)[1]))
+    for width, found in seen.items():
+        assert found["beyond"] == [], width
+        assert found["content"] <= found["room"] <= int(width), width
+    narrow, middle, wide = seen.values()
+    # figures fill the telephone, and their panels are below one another
+    assert {width for width, _ in narrow["images"]} == {narrow["text"]}
+    shapes = [[high / width for width, high in found["images"]] for found in (narrow, wide)]
+    assert sum(one > 2 * other for one, other in zip(*shapes, strict=True)) >= 2
+    assert max(width for width, _ in wide["images"]) > 800
+    assert max(width for width, _ in middle["images"]) <= middle["text"]
+    # one line each for what it is about and what came out
+    assert max(narrow["title"]) < 40
+    # what is wider than the telephone says that it can be moved
+    assert any(is_wide for is_wide, _ in narrow["tables"])
+    assert all("sideways" in hint for _, hint in narrow["tables"])
+    assert all(hint == "none" for _, hint in wide["tables"])
 
 
 # ---- without one ---------------------------------------------------------------------------

@@ -280,7 +280,7 @@ def test_the_first_lines_are_the_summary(found, content):
 class Page(HTMLParser):
     """Collects what a page consists of, and checks that its tags match."""
 
-    void = {"meta", "img", "link", "br"}
+    void = {"meta", "img", "link", "br", "source"}
 
     def __init__(self, text):
         super().__init__()
@@ -291,7 +291,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         attrs = dict(attrs)
-        self.links += [attrs[key] for key in ("src", "href") if key in attrs]
+        self.links += [attrs[key] for key in ("src", "srcset", "href") if key in attrs]
         if tag == "img":
             self.images.append(attrs)
         if tag not in self.void:
@@ -313,7 +313,11 @@ def test_page_is_self_contained_and_complete(found, content, tmp_path):
     figure = Figure(figsize=(3, 2))
     figure.subplots().plot([1, 2])
     path = tmp_path / "gap.html"
+    figure.suptitle("a title")
+    before = figure.get_size_inches().tolist(), figure.axes[0].get_subplotspec()
     write_html(found, path, figures={"Gap <of> the run": figure, MAP: figure})
+    after = figure.get_size_inches().tolist(), figure.axes[0].get_subplotspec()
+    assert after == before, "the figures are the caller's"
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     for sentence in content["sentences"]:

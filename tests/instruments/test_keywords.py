@@ -106,8 +106,8 @@ def test_what_is_no_number():
             convert("hwp", value, LAYOUT, u.deg)
 
 
-def test_ranges_are_of_angles_and_gains():
-    assert set(RANGES) == {*ANGLES, "em_gain"}
+def test_ranges_are_of_angles_gains_and_counts():
+    assert set(RANGES) == {*ANGLES, "em_gain", "exposures"}
     assert RANGES["altitude"] == (0.0, 90.0)
     assert not set(ANGLES) & set(TEXTS)
 

@@ -307,7 +307,6 @@ def test_half_of_the_single_errors(table):
 def test_no_errors_at_all(table):
     table.remove_columns(["flux_right_err", "flux_left_err"])
     obs = Observations.from_table(table)
-    assert not obs.has_errors
     assert np.isnan(obs.variance_right).all()
     assert not obs.mask.any()
 

@@ -311,15 +311,20 @@ def test_common_parameters_are_wider(elliptical):
     assert widths[0] > 3 * widths[-1]
 
 
-def test_undetermined_rows_are_hatched(undetermined):
+def test_undetermined_parameters_are_listed_and_not_drawn(undetermined):
     figure = plot_correlations(undetermined)
-    without = np.isnan(undetermined.covariance.stds)
-    assert without.any()
-    assert np.isnan(drawn(figure)[without]).all()
-    assert figure.axes[0].patch.get_hatch()
-    (legend,) = figure.legends
-    text = legend.get_texts()[0].get_text()
-    assert text.startswith(f"{without.sum()} of {without.size} parameters: not determined")
+    known = np.isfinite(undetermined.covariance.stds)
+    assert 0 < known.sum() < known.size
+    matrix = undetermined.covariance.correlation[np.ix_(known, known)]
+    np.testing.assert_allclose(drawn(figure), matrix)
+    listed = " ".join(figure.get_supxlabel().split())
+    for name, is_known in zip(undetermined.covariance.names, known, strict=True):
+        assert (name.partition("[")[0] in listed) or is_known, name
+
+
+def test_no_parameter_with_an_error_is_said():
+    nothing = Covariance(["hwp.theta"], [u.deg], [[np.nan]])
+    assert "no parameter has an error" in all_words(plot_correlations(nothing))
 
 
 def test_small_matrices_have_numbers():

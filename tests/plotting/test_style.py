@@ -47,7 +47,7 @@ def test_neighbouring_colours_and_all_lines_differ_from_the_paper():
 
 def test_the_users_settings_come_back():
     before = dict(mpl.rcParams)
-    with _style.style():
+    with _style.canvas(None, 4, 3):
         assert mpl.rcParams["axes.grid"]
         assert dict(mpl.rcParams) != before
     assert dict(mpl.rcParams) == before
@@ -57,20 +57,22 @@ def test_the_users_settings_come_back():
 
 
 def test_a_figure_keeps_legends_out_of_its_panels():
-    new = _style.canvas(None, 4, 3)
-    assert new.get_size_inches().tolist() == [4, 3]
     own = Figure(figsize=(9, 9))
-    assert _style.canvas(own, 4, 3) is own
-    assert own.get_size_inches().tolist() == [9, 9]
+    with _style.canvas(None, 4, 3) as new, _style.canvas(own, 4, 3) as kept:
+        assert new.get_size_inches().tolist() == [4, 3]
+        assert kept is own
+        assert own.get_size_inches().tolist() == [9, 9]
     for figure in (new, own):
         assert type(figure.get_layout_engine()).__name__ == "ConstrainedLayoutEngine"
 
 
 def test_a_layout_that_was_chosen_is_kept():
     own = Figure(layout="tight")
-    assert type(_style.canvas(own, 1, 1).get_layout_engine()).__name__ == "TightLayoutEngine"
+    with _style.canvas(own, 1, 1) as kept:
+        assert type(kept.get_layout_engine()).__name__ == "TightLayoutEngine"
     (part,) = np.ravel(Figure().subfigures(1, 1))
-    assert _style.canvas(part, 1, 1) is part
+    with _style.canvas(part, 1, 1) as kept:
+        assert kept is part
 
 
 def test_headings():

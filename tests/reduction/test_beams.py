@@ -7,7 +7,7 @@ from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.frames import Frame, beam_scale, match_beams, open_cube
+from astropolcal.reduction.frames import Frame, beam_detectors, match_beams, open_cube
 from astropolcal.reduction.photometry import detector_of
 
 KEYWORDS = {
@@ -54,7 +54,8 @@ def test_both_images_count_the_same_electrons(files):
     # 2 electrons of read noise, 2e4 adu of 0.25 electrons
     assert detector.left.read_noise * detector.gain == pytest.approx(2.0)
     assert detector.left.saturation * detector.gain == pytest.approx(5000.0)
-    assert beam_scale(frame.path, LAYOUT, frame.values) == pytest.approx(0.5)
+    right, left = beam_detectors(frame.path, LAYOUT, frame.values)
+    assert left.gain / right.gain == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +96,7 @@ def test_missing_left_file_is_named(files):
     with pytest.raises(ObservationError, match=words), open_cube(path, LAYOUT):
         pass
     with pytest.raises(ObservationError, match=r"cam2.fits: no such file"):
-        beam_scale(path, LAYOUT, {})
+        beam_detectors(path, LAYOUT, {})
 
 
 def test_damaged_left_file_is_named(files):
@@ -106,11 +107,13 @@ def test_damaged_left_file_is_named(files):
         pass
 
 
-def test_one_file_needs_no_scale():
-    layout = FileLayout(KEYWORDS, (1, 8, 16))
-    assert beam_scale("n_00000001.fits", layout, {}) == 1.0
+def test_one_file_has_one_detector():
+    right, left = beam_detectors("n_00000001.fits", FileLayout(KEYWORDS, (1, 8, 16)), {})
+    assert right == left
 
 
 def test_unit_of_the_files_is_that_of_the_scale(files):
     """In electrons the images of both cameras count alike already."""
-    assert beam_scale(files(), LAYOUT, {"read_mode": "slow", "camera": 1.0}, "electron") == 1.0
+    values = {"read_mode": "slow", "camera": 1.0}
+    right, left = beam_detectors(files(), LAYOUT, values, "electron")
+    assert right.gain == left.gain == 1.0

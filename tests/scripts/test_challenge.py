@@ -102,14 +102,3 @@ def test_an_interruption_ends_the_workers_at_once(capsys):
     for future in futures:
         with pytest.raises((CancelledError, BrokenProcessPool)):
             future.result(timeout=20)
-
-
-def test_progress_without_a_terminal_is_a_line_now_and_then(capsys):
-    progress = _challenge._Progress()
-    progress(1, 9)
-    progress.said -= _challenge._BETWEEN
-    progress(2, 9)
-    progress(3, 9)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("astropolcal: ")
-    assert line.endswith("2 of 9 challenges")

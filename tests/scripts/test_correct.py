@@ -105,6 +105,33 @@ def test_cubes_to_product(night, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_star_is_subtracted_and_told(night, tmp_path, capsys):
+    out, summary = tmp_path / "out.fits", tmp_path / "s.json"
+    paths, cal = sorted((night / "cubes").glob("*.fits"))[:4], night / "charis.asdf"
+    common = [*paths, "--calibration", cal, "-o", out, "--size", 31, "--full", "--json", summary]
+    common += ["--centre", "69.9,84.7"]
+    command(*common, "--subtract-star", "annulus=0,12")
+    content = json.loads(summary.read_text())
+    # the star as it is, and what is left of it
+    np.testing.assert_allclose(content["aperture"]["q"], Q, atol=1e-4)
+    np.testing.assert_allclose(content["subtracted_star"]["u"], U, atol=1e-4)
+    left = Corrected.read(out)
+    np.testing.assert_allclose(left.aperture(10).q, 0, atol=1e-4)
+    assert left.star.meta["star"] == fits.getheader(out)["STARSUB"] == "annulus of 0 to 12 pixels"
+    degree, angle = 100 * np.hypot(Q, U), np.rad2deg(np.arctan2(U, Q)) / 2 % 180
+    words = content["subtracted_star"]["words"]
+    assert f"subtracted from all light: {words} (annulus of 0" in capsys.readouterr().out
+    np.testing.assert_allclose(
+        [float(w) for w in (words.split()[0], words.split()[5])], [degree, angle], rtol=0.01
+    )
+    command(*common, "--subtract-star", f"{degree}+-0.1,{angle}+-1")
+    np.testing.assert_allclose(Corrected.read(out).aperture(10).u, 0, atol=1e-4)
+    with pytest.raises(SystemExit):
+        command(*common, "--subtract-star", "101,3")
+    assert "'101,3': 101 %; allowed are 0 to 100 %" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_modes_differ(night, tmp_path):
     words = [night / "cubes", "--calibration", night / "charis.asdf", "-q", "--size", 21]
     for mode in ("stokes", "ip"):
@@ -204,6 +231,8 @@ def test_bad_input(night, tmp_path, monkeypatch):
             ["--camera-angle", "0", "--rotation", "none"],
             "--camera-angle 0: is for --rotation fixed",
         ),
+        (["--subtract-star", "annulus=2,3"], "annulus=...,3: leaves the images of --size 5; allow"),
+        (["--subtract-star", "annulus=2,1"], "two radii in pixels are needed"),
         (["--seed", "3"], "--seed 3: is for --samples N"),
         (["--samples", "20", "--seed", "-1"], "seed = -1; allowed are whole numbers from 0 up"),
         (["-o", "out.asdf"], r"-o out\.asdf: the name must end with \.fits"),
@@ -288,14 +317,14 @@ def told(monkeypatch):
 
 
 def test_angles_that_some_frame_knows_are_columns(told):
-    table, centres, scale, left = told({"hwp": 0.0, "altitude": 60.0}, {"hwp": 45.0})
+    table, centres, scale, detectors = told({"hwp": 0.0, "altitude": 60.0}, {"hwp": 45.0})
     assert table["hwp"].to_value(u.deg).tolist() == [0.0, 45.0]
     assert np.isnan(table["altitude"].value).tolist() == [False, True]
     assert set(table.colnames) == {"hwp", "altitude"}
     assert centres == (70.0, 85.0)
     assert scale is None
     # one file holds both beams
-    assert left == [1.0, 1.0]
+    assert all(right == left for right, left in detectors)
 
 
 def test_true_plate_angle_is_used_of_all_frames_or_of_none(told):

@@ -2,7 +2,6 @@
 """``astropolcal diagnose``."""
 
 import json
-import re
 
 import astropy.units as u
 import numpy as np
@@ -80,8 +79,8 @@ def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     printed = capsys.readouterr()
     assert printed.out.startswith("The model lacks one effect: unequal gains of the two beams")
     assert str(report) in printed.out
-    assert re.search(r"^astropolcal: +\d+ s  looking for causes$", printed.err, re.M)
-    assert re.search(r" s  looking for cause 1, at most \d$", printed.err, re.M)
+    # how far it is, is for terminals
+    assert "looking for causes" not in printed.err
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["verdict"] == "named"
     (cause,) = content["causes"]

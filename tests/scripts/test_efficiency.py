@@ -123,19 +123,20 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
 def test_bad_input_is_one_error():
     for argv, error, words in [
         (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),
-        (["--target", "x", "--night", NIGHT], ParameterError, "write RA,DEC in degree"),
+        (["--target", "x", "--night", NIGHT], ParameterError, "give RA,DEC in degrees"),
         (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
         (
             ["--target", "1,2,3", "--night", NIGHT],
             ParameterError,
-            "--target 1,2,3: write RA,DEC in",
+            "--target 1,2,3: give RA,DEC in",
         ),
         (
             ["--target", "nan,2", "--night", NIGHT],
             ParameterError,
-            "--target nan,2: write RA,DEC in",
+            "--target nan,2: give RA,DEC in",
         ),
-        (["--target", "1,nan", "--night", NIGHT], ParameterError, "--target 1,nan: write RA,DEC"),
+        (["--target", "1,nan", "--night", NIGHT], ParameterError, "--target 1,nan: give RA,DEC"),
+        (["--target", "\u0661,2", "--night", NIGHT], ParameterError, "give RA,DEC in degrees"),
         (["--target", "1,95", "--night", NIGHT], ParameterError, "--target 1,95: .* -90 to 90"),
         (
             ["--target", "1,2", "--night", "2025-11-03"],

@@ -4,7 +4,10 @@
 import argparse
 import os
 import re
+import shutil
+import subprocess
 import sys
+import time
 import warnings
 from types import SimpleNamespace
 
@@ -63,6 +66,20 @@ def test_interruption_while_the_commands_are_loaded(monkeypatch, capsys):
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
 
 
+def test_interruption_is_not_lost_where_python_drops_exceptions(running, capsys):
+    class Odd:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    def work():
+        Odd()
+        for _ in range(500):
+            time.sleep(0.01)
+
+    assert running(work) == 130
+    assert capsys.readouterr().err == "astropolcal: interrupted\n"
+
+
 def test_no_memory_is_one_line(running, capsys):
     for said, words in [
         ("Unable to allocate 21 GiB", "Unable to allocate 21 GiB"),
@@ -84,6 +101,49 @@ def test_warnings_go_to_standard_error_in_one_line(running, capsys):
 
     assert running(warn) == 0
     assert capsys.readouterr() == ("", "astropolcal: warning: two lines\n")
+
+
+_COMPLETED = """
+source ./script
+try() {
+    COMP_WORDS=("$@"); COMP_CWORD=$(( $# - 1 )); COMPREPLY=()
+    _shtab_astropolcal; echo "${COMPREPLY[*]}"
+}
+try astropolcal calib
+try astropolcal calibrate --st
+try astropolcal calibrate --errors ""
+try astropolcal calibrate --start run
+try astropolcal calibrate --plots f
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_completion_of_commands_options_choices_files_and_folders(tmp_path, capsys):
+    pytest.importorskip("shtab")
+    with pytest.raises(SystemExit) as stop:
+        main(["--print-completion", "bash"])
+    assert not stop.value.code
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    (tmp_path / "run.asdf").touch()
+    (tmp_path / "figure.png").touch()
+    (tmp_path / "figures").mkdir()
+    command = ["bash", "--norc", "-c", _COMPLETED]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = [sorted(line.split()) for line in done.stdout.splitlines()]
+    assert found == [
+        ["calibrate"],
+        ["--standard", "--start", "--strategy"],
+        ["scatter", "white"],
+        ["run.asdf"],
+        ["figures"],
+    ], done.stderr
+
+
+def test_completion_says_what_it_needs(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    with pytest.raises(SystemExit):
+        main(["--print-completion", "zsh"])
+    assert 'pip install "astropolcal[completion]"' in capsys.readouterr().err
 
 
 def test_how_warnings_are_shown_is_put_back(running):

@@ -63,7 +63,9 @@ from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.measurement.datasets import as_pairs
+from astropolcal.measurement.parameters import ROUNDING, with_own
+from astropolcal.progress import stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
 
@@ -90,6 +92,7 @@ def calibrate(
     observable=None,
     weights=None,
     ties=None,
+    own=(),
     positions=None,
     wavelength=None,
     search=None,
@@ -130,6 +133,11 @@ def calibrate(
         per wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
+    own : sequence of str, or dict of str to sequence
+        Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
+        the group of each dataset, such as its night, in which they have the same. All others are
+        shared. In all groups but the first the name of the group is added to that of the optic. The
+        full summary says which of them really differ.
     positions : sequence of dict, optional
         Position of every stage for each dataset, see
         `~astropolcal.measurement.Measurement`.
@@ -196,7 +204,12 @@ def calibrate(
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
+    copies = {}
+    if own:
+        chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
+        chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
@@ -224,6 +237,7 @@ def calibrate(
             "errors": errors,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+            **({"own": copies} if copies else {}),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
         stages=stages,
@@ -304,6 +318,7 @@ def _run(measurement, weighting, fitter):
 
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
+    stage(f"fitting {measurement.free.size} parameters")
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:
@@ -409,6 +424,7 @@ def _thinned(measurement, weighting):
 
 def _first_search(measurement, weighting, origin):
     """Return the best branches; where no noise is known yet, first without the priors."""
+    stage("looking for where to start")
     problem = BinProblem(measurement, weighting)
     found = search_branches(problem, origin)[0]
     if weighting.is_known or not problem.has_priors:
@@ -501,6 +517,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
+    stage("cross-validation")
     return calibration.cross_validate() if cross_validate else calibration
 
 

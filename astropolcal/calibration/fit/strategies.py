@@ -28,6 +28,7 @@ from astropolcal.calibration.noise.weighting import Problem
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.progress import steps
 
 __all__ = []
 
@@ -187,7 +188,7 @@ def search_branches(problem, vector, origin=None):
     best, costs = problem.polish(vector)
     moved = np.zeros(problem.n_bins, dtype=bool)
     retardances = problem.main_retardances()
-    for row, low, high in retardances:
+    for row, low, high in steps(retardances, "retardances"):
         # one that was scanned before may have moved
         for base in (start, best.copy()) if len(retardances) > 1 else (start,):
             for values in problem.valleys(base, row, low, high):

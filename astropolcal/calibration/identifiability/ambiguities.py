@@ -24,9 +24,9 @@ from astropolcal.calibration.identifiability.sky import (
     sky_words,
 )
 from astropolcal.calibration.system import split_chain
-from astropolcal.chain import join, leaves, stages, system_mueller
+from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.optics import COORDINATES, EllipticalRetarder, LinearRetarder, MuellerElement
+from astropolcal.optics import EllipticalRetarder, LinearRetarder, MuellerElement
 
 __all__ = []
 
@@ -175,11 +175,11 @@ def _knows_hand(measurement, vector):
             continue
         source = join(front)
         step = max(1, dataset.frames.shape[0] // _FEW)
-        positions = {
-            stage: 0.0 * u.one
-            if stage in COORDINATES
-            else dataset.positions[stage][:, ::step].ravel() * u.rad
+        places = standing(source)
+        positions = places | {
+            stage: dataset.positions[stage][:, ::step].ravel() * u.rad
             for stage in stages(source)
+            if stage not in places
         }
         light = system_mueller(source, lam, positions)[..., :, 0]
         if np.abs(light[..., 3]).max() > _SAME * np.abs(light[..., 0]).max():

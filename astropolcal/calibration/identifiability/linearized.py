@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The linear problem around a solution, decomposed once for all who ask, and its directions."""
 
+from collections import defaultdict
 from functools import cached_property
 from typing import NamedTuple
 
@@ -160,7 +161,8 @@ class Whitened:
 # what is worth a word in a direction, as a share of its largest component
 _WORTH_A_WORD = 0.02
 # where a parameter is that uncertain, an error is no help: degree, micrometre, percent
-LARGE = {" deg": 5.0, " um": 50.0, "": 0.05}
+# (how large a coefficient of a law is tells nothing)
+LARGE = defaultdict(lambda: np.inf, {" deg": 5.0, " um": 50.0, "": 0.05})
 # and where the data hold one direction so much better than another
 _CONDITION = 1e4
 # what of a near-null direction is worth a word, as a share of what moves most
@@ -197,6 +199,9 @@ def step_of(unit):
     if u.Unit(unit).is_equivalent(u.rad):
         # canonical is radian: one degree is the step that a user has a feeling for
         return np.deg2rad(1.0), 1.0, " deg"
+    if not u.Unit(unit).is_equivalent(u.um):
+        # a coefficient of a law, such as one in deg / day
+        return canonical_factor(unit), 1.0, f" {unit}"
     return 1.0, 1.0, " um"
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from astropolcal import instruments
 from astropolcal.calibration.system import Rows, free_of, from_first_stage
-from astropolcal.chain import join, leaves, stages
+from astropolcal.chain import join, leaves, stages, standing
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
@@ -129,7 +129,7 @@ def _view(chains, free, lam, metas, name, settings):
     law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
     stated = [meta.get("tracking") for meta in metas if meta.get("tracking") in law.modes]
     mode = stated[0] if stated else next(iter(law.modes), None)
-    placed = _positions(stages(chain), settings, law.plate_law(mode))
+    placed = _positions(chain, settings, law.plate_law(mode))
     site = None if instrument is None else instrument.location
     view = SkyView(chain, telescope, free, lam, placed, site)
     # optics that never determine q and u say nothing of the sky
@@ -158,8 +158,9 @@ def _sequence(wanted, settings):
     return {stage: placed[stage] for stage in wanted}, count
 
 
-def _positions(wanted, settings, law):
+def _positions(chain, settings, law):
     """Return the position of every stage in the frames of all settings."""
+    wanted = stages(chain)
     angles = {
         # a file of before does not say where the derotator stood
         stage: np.asarray(settings.get(stage) or np.linspace(0, np.pi, _MOST, endpoint=False))
@@ -181,7 +182,7 @@ def _positions(wanted, settings, law):
     placed = {stage: np.repeat(angle, n_frames) for stage, angle in each.items()}
     placed["hwp"] = np.repeat(plate, n_frames) + np.tile(cycle, count)
     # where another number of a frame is zero, an optic that depends on it does nothing
-    placed |= {stage: np.zeros(1) for stage in wanted if stage in COORDINATES}
+    placed |= {stage: np.full(1, x.value) for stage, x in standing(chain).items()}
     if n_states > 1:
         placed[_MODULATOR] = np.tile(np.repeat(_STATES, len(_CYCLE)), count)
     return {stage: placed[stage] for stage in wanted}, count

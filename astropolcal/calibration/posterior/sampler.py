@@ -24,6 +24,7 @@ from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.progress import shown, steps
 
 __all__ = ["LogPosterior", "sample"]
 
@@ -422,7 +423,7 @@ def sample(
         Whether to go on from a checkpoint that exists; otherwise it is
         replaced.
     progress : bool
-        Whether to show a progress bar; it appears on a terminal only.
+        Whether to show how far it is; on a terminal only.
     moves : object or list, optional
         Moves of emcee. By default its stretch move for up to 10 parameters;
         for more a mixture of preconditioned Crank-Nicolson steps around the
@@ -507,7 +508,8 @@ def _warn(posterior):
         return
     short = posterior.n_times < ENOUGH
     problem = f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
-    warnings.warn(f"the chain {problem}: {posterior.words()}", AstropolcalWarning, stacklevel=3)
+    complaints = "; ".join(posterior.convergence.complaints(posterior.names))
+    warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=3)
 
 
 def _kept_burn_in(burn_in, n_steps, thin):
@@ -540,24 +542,18 @@ def _refused(name, value, reason):
 
 def _run(emcee, sampler, laplace, chain, thin, seed, progress):
     """Advance the walkers until the chain is full."""
-    from tqdm import tqdm
-
     total = len(chain.coords) * thin
     state = _first_state(emcee, laplace, chain, sampler.nwalkers, seed)
     previous, accepted = state.coords.copy(), chain.accepted.copy()
     done = chain.count * thin
-    steps = sampler.sample(state, iterations=total - done, store=False)
-    # disable=None shows the bar on a terminal only
-    with tqdm(
-        total=total, initial=done, desc="sampling", disable=None if progress else True
-    ) as bar:
-        for step, state in enumerate(steps, done + 1):
+    states = sampler.sample(state, iterations=total - done, store=False)
+    with shown(progress):
+        for step, state in enumerate(steps(states, "steps", total, done), done + 1):
             # counted at every step, not only at those that are kept
             accepted += (state.coords != previous).any(axis=1)
             previous[...] = state.coords
             if step % thin == 0:
                 chain.append(state.coords, state.log_prob, state.random_state, accepted)
-            bar.update()
 
 
 def _first_state(emcee, laplace, chain, n_walkers, seed):

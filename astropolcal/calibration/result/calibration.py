@@ -58,6 +58,17 @@ class DatasetRecord:
     accuracy: QTable | None = None
 
 
+class ParameterTable(QTable):
+    """A table that prints value, error, unit and status of every row; the rest is by name."""
+
+    def __str__(self):
+        shown = [
+            name for name in ("name", "value", "std", "unit", "status") if name in self.columns
+        ]
+        lines = QTable(self, copy=False)[shown] if shown else self
+        return "\n".join(lines.pformat(max_lines=-1, max_width=-1))
+
+
 @dataclass
 class Calibration:
     """
@@ -373,9 +384,10 @@ class Calibration:
             flat = (np.ravel(known[key]) for key in keys)
             rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
         types = (str, float, float, bool, bool, float, str, float, str, str)
-        table = QTable(
+        table = ParameterTable(
             rows=rows or None, names=("name", *keys, "unit"), dtype=None if rows else types
         )
+        table["value"].info.format, table["std"].info.format = ".6g", ".3g"
         return table["name", "value", "std", "unit", "status", *_OF_ELEMENTS[1:]]
 
     # ---- for pipelines ---------------------------------------------------------

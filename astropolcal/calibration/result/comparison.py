@@ -7,7 +7,7 @@ from astropy.table import QTable
 
 from astropolcal import instruments
 from astropolcal.calibration.uncertainty.derived import propagate
-from astropolcal.chain import join, leaves, stages, system_mueller
+from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.efficiency import has_derotator, polarimetric_efficiency, sky_path
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments import Instrument
@@ -208,7 +208,7 @@ def _behind_telescope(path):
 
 def _matrix(optic, wavelength):
     # turning an optic by itself changes neither its retardance nor its diattenuation
-    zero = {s: 0.0 if s in COORDINATES else 0 * u.deg for s in stages(optic)}
+    zero = {s: 0 * u.deg for s in stages(optic)} | standing(optic)
     return np.asarray(system_mueller(optic, wavelength, zero)).reshape(-1, 4, 4)
 
 

@@ -21,12 +21,15 @@ from astropolcal.calibration.result.verdict import (
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
+from astropolcal.chain import leaves
 from astropolcal.files import columns, plain
 from astropolcal.words import counted
 
 __all__ = []
 
 _WIDTH = 80
+# logarithm of the Bayes factor from which on something is said to be so
+_STRONG = 3.0
 # value and error of so many parameters fill the 80 columns
 _N_COLUMNS = 3
 # errors from which on digits behind the point are too long
@@ -50,6 +53,8 @@ def summary(calibration, targets=TARGETS, full=False):
         [*found.words, *_more_reasons(found)],
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
+        _law_lines(calibration),
+        _own_lines(calibration),
         _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -114,6 +119,48 @@ def _heading(calibration):
 def _global_lines(known):
     lines = parameter_lines(known, several=False)
     return ["Parameters for all wavelengths", *lines] if lines else []
+
+
+def _law_lines(calibration):
+    """Name the laws that parameters follow, and the frames with which they were calibrated."""
+    optics = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
+    lines = [
+        f"  - {name}.{key}: {law}"
+        for name, leaf in optics.items()
+        for key, law in leaf._follows.items()
+    ]
+    return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
+
+
+def _own_lines(calibration):
+    """Say which parameters of their own in several nights differ, by the evidence for it."""
+    lines = []
+    for name, copies in (calibration.settings.get("own") or {}).items():
+        evidence = _evidence(calibration, copies)
+        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
+        words = words if np.isfinite(evidence) else "is not determined"
+        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
+    return list(_wrap(["Parameters with values of their own", *lines])) if lines else []
+
+
+def _evidence(calibration, names):
+    """Return the logarithm of the Bayes factor of parameters that differ against equal ones."""
+    free = list(calibration.covariance.names)
+    value = dict(zip(calibration.parameters["name"], calibration.parameters["value"], strict=True))
+    first, *others = ([e for e in free if e.partition("[")[0] == name] for name in names)
+    contrasts = np.zeros((len(first) * len(others), len(free)))
+    pairs = ((one, other) for several in others for one, other in zip(first, several, strict=True))
+    for row, (one, other) in zip(contrasts, pairs, strict=True):
+        row[free.index(one)], row[free.index(other)] = -1.0, 1.0
+    used = contrasts.any(axis=0)
+    matrix = calibration.covariance.matrix[np.ix_(used, used)]
+    difference = contrasts @ [value[name] for name in free]
+    if not np.isfinite(matrix).all():
+        return np.nan
+    spread = contrasts[:, used] @ matrix @ contrasts[:, used].T
+    chi2 = difference @ np.linalg.pinv(spread, hermitian=True) @ difference
+    # Schwarz's approximation (1978, Ann. Statist. 6, 461)
+    return (chi2 - len(difference) * np.log(calibration.fit["n_data"])) / 2
 
 
 def _accuracy_lines(record, reasons):

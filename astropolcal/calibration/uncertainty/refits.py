@@ -38,6 +38,7 @@ from astropolcal.calibration.uncertainty.covariance import (
     white_covariance,
 )
 from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.progress import counting, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
 
@@ -360,7 +361,7 @@ class Resampled:
         )
 
 
-def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
+def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     """
     Refit resampled data, drawn in blocks of frames with replacement.
 
@@ -376,8 +377,8 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
         blocks. ``"pair"`` assumes that pairs are independent.
     seed : int or `~numpy.random.Generator`, optional
         Seed.
-    progress : callable, optional
-        Called with the number of fits done and wanted after each.
+    progress : bool
+        Whether to show how far it is; on a terminal only.
 
     Returns
     -------
@@ -412,20 +413,20 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
     # what all data determine, a resample must determine too
     wanted = _singular_values(refit, 1.0)
     samples, rejected = [], 0
-    while len(samples) < n:
-        counts = _draw(rng, groups)
-        vector = _resample(refit, counts, wanted)
-        if vector is None:
-            rejected += 1
-            if rejected > _PATIENCE * n + 10:
-                raise FitError(
-                    f"{rejected} resamples could not be fitted: the data have too few blocks for "
-                    "the model"
-                )
-            continue
-        samples.append(vector)
-        if progress is not None:
-            progress(len(samples), n)
+    with shown(progress), counting(n, "resamples") as add:
+        while len(samples) < n:
+            counts = _draw(rng, groups)
+            vector = _resample(refit, counts, wanted)
+            if vector is None:
+                rejected += 1
+                if rejected > _PATIENCE * n + 10:
+                    raise FitError(
+                        f"{rejected} resamples could not be fitted: the data have too few blocks "
+                        "for the model"
+                    )
+                continue
+            samples.append(vector)
+            add()
     return _result(calibration, refit, np.array(samples), block, groups, rejected)
 
 

@@ -22,6 +22,7 @@ from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_fr
 from astropolcal.calibration.noise.scatter import leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.exceptions import FitError
+from astropolcal.progress import steps
 from astropolcal.words import p_words
 
 __all__ = ["LackOfFit", "lack_of_fit"]
@@ -91,7 +92,7 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     jacobian = measurement.jacobian(vector)
     if len(found) > _MANY:
         return _held_out_linearly(measurement, vector, jacobian, weights, labels, groups)
-    for label in found:
+    for label in steps(found, "groups left out"):
         out = labels == label
         moved, blind = _undetermined(measurement, vector, jacobian, out, weights)
         if groups is not None and blind.any():

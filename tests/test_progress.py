@@ -1,0 +1,85 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""How far long work is: a line of the terminal, and nothing anywhere else."""
+
+import io
+import itertools
+from types import SimpleNamespace
+
+import pytest
+
+from astropolcal import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A terminal, and a clock of one second a look."""
+    seconds = itertools.count()
+    monkeypatch.setattr("time.monotonic", lambda: float(next(seconds)))
+    # pytest exchanges that of sys between the set-up and the test
+    stream = Terminal()
+    monkeypatch.setattr("astropolcal.progress.sys", SimpleNamespace(stderr=stream))
+    monkeypatch.setenv("COLUMNS", "60")
+    return stream
+
+
+def lines(terminal):
+    return [line.rstrip() for line in terminal.getvalue().split("\r") if line.strip()]
+
+
+def test_line_says_how_many_are_done_and_how_long_the_rest_takes(terminal):
+    with progress.shown():
+        progress.stage("cross-validation")
+        assert list(progress.steps(range(3), "groups")) == [0, 1, 2]
+    said = lines(terminal)
+    assert said[0].startswith("astropolcal: cross-validation (")
+    assert "astropolcal: cross-validation: 2 of 3 groups, 0:00:0" in said[2]
+    assert terminal.getvalue().endswith("  \r"), "the line is gone at the end"
+
+
+def test_line_fits_the_terminal(terminal):
+    with progress.shown():
+        progress.stage("a word " * 20)
+    assert max(map(len, lines(terminal))) < 60
+
+
+def test_what_was_done_before_took_no_time(terminal):
+    with progress.shown(), progress.counting(1000, "steps", 900) as add:
+        add(50)
+    # 50 in a second or two
+    assert "950 of 1000 steps, 0:00:0" in lines(terminal)[-1]
+
+
+def test_work_inside_has_no_line_of_its_own(terminal):
+    with progress.shown():
+        for _ in progress.steps(range(3), "challenges"):
+            progress.stage("fitting")
+            list(progress.steps(range(9), "groups"))
+            with progress.shown():
+                pass
+    assert {line.split()[-3] for line in lines(terminal)} == {"challenges,"}
+
+
+def test_line_makes_room_for_a_warning(terminal):
+    with progress.shown():
+        progress.stage("fitting")
+        progress.clear()
+        print("astropolcal: warning: odd", file=terminal)
+    assert "\rastropolcal: warning: odd\n" in terminal.getvalue()
+
+
+def test_short_work_and_unwanted_lines_and_files_get_nothing(terminal, monkeypatch):
+    with progress.shown(False):
+        list(progress.steps(range(9), "groups"))
+    list(progress.steps(range(9), "groups"))
+    monkeypatch.setattr("time.monotonic", lambda: 0.0)
+    with progress.shown():
+        list(progress.steps(range(9), "groups"))
+    monkeypatch.setattr(Terminal, "isatty", lambda self: False)
+    with progress.shown():
+        progress.stage("fitting")
+    assert terminal.getvalue() == ""
