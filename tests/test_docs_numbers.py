@@ -275,5 +275,7 @@ def test_text_of_the_challenges_is_that_of_their_tables():
     assert f"Of the {count[sure].sum():.0f} causes that were given with 80 %" in text
     assert "more, {:.0f} % are right, and their mean probability is {:.0f} %".format(*share) in text
     wrong = {row[0]: round(row["Number"] * row["Wrong (%)"] / 100) for row in rates}
-    assert (wrong["mechanism"], wrong["pair"]) == (3, 2)
-    assert "Three of the five wrong answers are to mechanisms" in text
+    assert (wrong["mechanism"], sum(wrong[k] for k in ("cell", "listed", "pair", "none"))) == (6, 0)
+    none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
+    assert f"nothing in all {none} challenges without a fault" in text
+    assert "All six wrong answers are to mechanisms" in text
