@@ -58,7 +58,7 @@ def courses(calibrations, parameters=None, *, events=()):
         One row per optic: ``what``; ``course``, the most probable of constant, steps, drift, walk
         and scatter; the probability of each; ``change``, the probability of a step between each
         calibration and the next (n - 1 numbers); ``n_open``, the directions that one of the
-        calibrations leaves open, of which nothing is said.
+        calibrations does not determine, of which nothing is reported.
         ``meta["calibrations"]`` and ``meta["dates"]`` name the runs.
 
     Raises
@@ -67,7 +67,7 @@ def courses(calibrations, parameters=None, *, events=()):
         If two calibrations share a dataset.
     ParameterError
         If there are fewer than three, one has no date or that of another, two events lie in the
-        same gap, an event is no date, or a parameter is not free in all of them.
+        same gap, an event is not a date, or a parameter is not free in all of them.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def moment_of(when, name):
     try:
         return Time(getattr(when, "isot", when), scale="tai")
     except (ValueError, TypeError):
-        raise ParameterError(f"{name} {when!r} is no date") from None
+        raise ParameterError(f"{name} {when!r} is not a date") from None
 
 
 def _priors(dates, events):

@@ -8,7 +8,7 @@ HELP = "what changed over all calibrations of an instrument, and what needs care
 DESCRIPTION = """\
 Read all calibrations of a folder; say for each instrument and mode which optics
 are constant, drift or changed and when, what needs care, and when the next
-calibration is due. --html writes a page with figures that can be sent or served."""
+calibration is due. --html writes a page with figures."""
 EXAMPLES = """\
 examples:
   astropolcal health library/
@@ -21,7 +21,7 @@ library DIR Input  folder of calibrations
 --goal PERCENT float  accuracy that is wanted, in percent of polarization
 --max-age DAYS float  age from which on a calibration is too old (default: the instrument's)
 --event DATE + ...  something was done to the instrument on this date
---date DATE  moment for which it is said (default: now)
+--date DATE  moment for which the report is made (default: now)
 @ json quiet
 """
 

@@ -119,7 +119,7 @@ def test_what_gives_no_course_is_refused(steady):
         (ParameterError, [*steady[:3], run(20, date="2020-01-01")], {}, "neither comes first"),
         (FitError, [*steady[:3], steady[0]], {}, "neither comes first|both made from"),
         (ParameterError, steady, {"events": ["2020-02-01", "2020-03-01"]}, "another one lies"),
-        (ParameterError, steady, {"events": ["soon"]}, "'soon' is no date"),
+        (ParameterError, steady, {"events": ["soon"]}, "'soon' is not a date"),
         (ParameterError, steady, {"parameters": ["mirror"]}, "no free parameter 'mirror'"),
     ]
     for error, runs, options, message in cases:
