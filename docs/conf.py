@@ -135,10 +135,28 @@ html_static_path = [
         distribution("sphinx-mathjax-offline").locate_file(
             f"sphinx-mathjax-offline/static/mathjax/{mathjax_path}"
         )
-    )
+    ),
+    "_static",
 ]
-# the theme would load a counter of visitors from the network on every page
-html_theme_options = {"goatcounter_analytics_url": ""}
+html_css_files = ["pages.css"]
+html_logo = html_favicon = "_static/logo.svg"
+# the header has the logo
+html_sidebars = {"**": ["components/sst-sidebar-nav.html"]}
+html_theme_options = {
+    "logo": {"text": "astropolcal", "alt_text": "Logo of astropolcal"},
+    "navbar_start": "components/navbar-logo.html",
+    "navbar_links": [
+        ["First calibration", "first_calibration"],
+        ["Tutorials", "generated/tutorials/index"],
+        ["Optics", "generated/models/optics"],
+        ["Questions", "faq"],
+        ["Reference", "api"],
+    ],
+    "footer_links": [],
+    # the theme would search other packages, and load a counter of visitors from the network
+    "rtd_search": False,
+    "goatcounter_analytics_url": "",
+}
 # one picture of each plot; the default makes three
 plot_formats = [("png", 110)]
 plot_html_show_formats = False

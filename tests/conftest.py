@@ -110,6 +110,14 @@ def shared_data():
 
 
 @pytest.fixture
+def unpainted(monkeypatch):
+    """Figures are made, but not painted, which takes most of the time."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.write_bytes(b"painted"))
+
+
+@pytest.fixture
 def other_svd(monkeypatch):
     """Function after which singular vectors are others that are as good."""
     # not above: the number of threads has to be set before

@@ -82,7 +82,7 @@ def test_nothing_is_loaded_from_the_network(settings):
     found = settings()
     assert found["html_theme_options"]["goatcounter_analytics_url"] == ""
     assert "://" not in found["mathjax_path"]
-    (script,) = found["html_static_path"]
+    script = found["html_static_path"][0]
     assert Path(script).name == found["mathjax_path"]
     assert Path(script).is_file()
 
@@ -95,6 +95,7 @@ def test_equations_are_drawn_by_the_script_beside_the_page(settings, tmp_path):
     (tmp_path / "index.rst").write_text("Title\n=====\n\n.. math:: \\epsilon = \\frac12\n")
     (tmp_path / "conf.py").write_text("extensions = ['sphinx.ext.mathjax']\n")
     names = ("mathjax_path", "html_static_path")
+    (tmp_path / "_static").mkdir()
     app = SphinxTestApp("html", srcdir=tmp_path, confoverrides={n: found[n] for n in names})
     try:
         app.build()

@@ -27,7 +27,7 @@ POINTINGS = ((32, 48), (94, 60), (126, 60), (24, 67))
 def _rows(title):
     """Cells of the list-table of a section, by the first of them."""
     text = PAGE.read_text(encoding="utf-8")
-    section = re.search(rf"^{title}\n-+\n(.*?)^\S[^\n]*\n-+\n", text, re.S | re.M).group(1)
+    section = re.search(rf"^{title}\n-+\n(.*?)(?:^\S[^\n]*\n-+\n|\Z)", text, re.S | re.M).group(1)
     table = section.split(".. list-table::")[1]
     rows = re.split(r"^   \* - ", table, flags=re.M)[1:]
     cells = (
@@ -37,6 +37,20 @@ def _rows(title):
 
 
 ROWS = _rows("Number by number")
+
+
+#: Medians of the accuracy that the table of the fits states, of Datasets 3 and 1.
+OF_JOINT_FITS = dict(
+    zip(
+        (3, 1),
+        re.search(
+            r"^astropolcal, joint fit \(the default\) +9 +(\S+) +(\S+)$",
+            PAGE.with_name("charis_fits.rst").read_text(encoding="utf-8"),
+            re.M,
+        ).groups(),
+        strict=True,
+    )
+)
 
 
 def _cell(start):
@@ -137,6 +151,9 @@ def test_numbers_of_the_polarized_lamp(lamps, data, shared_data):
     for start, name in (("quartz", "w_sio2"), ("MgF", "w_mgf2")):
         value = getattr(cal.chain["hwp"], name).quantity
         _states(start, value.to_value(u.mm), cal.covariance.std(f"hwp.{name}").to_value(u.mm))
+    for number in (1, 3):
+        rounded = f"{np.median(_s_mean(lamps[number])):.3f}"
+        assert rounded == OF_JOINT_FITS[number], number
     short = NM < 1400
     published = Table.read(shared_data / "reference" / "charis_published_fits.ecsv")
     theirs = published["s_rel_elliptical_dataset3"] - published["s_rel_elliptical_dataset1"]
@@ -242,3 +259,23 @@ def test_numbers_of_the_polarized_standard(data):
     nm = found["wavelength"].to_value(u.nm)
     dolp = _percent(found["dolp"])[nm < 1760]
     _states("HD 30675", dolp.min(), dolp.max())
+
+
+def test_text_of_the_challenges_is_that_of_their_tables():
+    """The sentences below the tables repeat sums of their rows."""
+    rates, causes = (
+        Table.read(PAGE.with_name(f"challenge_{name}.csv"), format="csv")
+        for name in ("rates", "reliability")
+    )
+    text = " ".join(PAGE.with_name("challenge.rst").read_text(encoding="utf-8").split())
+    count, mean, right = (np.asarray(causes[name], float) for name in causes.colnames[1:4])
+    sure = np.array([float(row.split()[0]) >= 80 for row in causes[causes.colnames[0]]])
+    share = [np.average(of[sure], weights=count[sure]) for of in (right, mean)]
+    assert f"first {rates['Number'][0]} challenges" in text
+    assert f"Of the {count[sure].sum():.0f} causes that were given with 80 %" in text
+    assert "more, {:.0f} % are right, and their mean probability is {:.0f} %".format(*share) in text
+    wrong = {row[0]: round(row["Number"] * row["Wrong (%)"] / 100) for row in rates}
+    assert (wrong["mechanism"], sum(wrong[k] for k in ("cell", "listed", "pair", "none"))) == (6, 0)
+    none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
+    assert f"nothing in all {none} challenges without a fault" in text
+    assert "All six wrong answers are to mechanisms" in text

@@ -43,7 +43,7 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     events : sequence of str
         Dates at which something was done to the instrument, see `courses`.
     now : str or `~astropy.time.Time`, optional
-        The moment for which the report is made.
+        The moment for which the page holds.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     >>> _ = Library("runs").add(calibrate(chain, table, instrument="charis"))
     >>> (group,) = health("runs", now="2027-01-01")["groups"]
     >>> print(group["alarms"][0])
-    The newest calibration is of 2025-03-01, 671 days old; charis requires one every 365 days.
+    The newest calibration is of 2025-03-01, 671 days old; charis needs one every 365 days.
     """
     library = library if isinstance(library, Library) else Library(library)
     if not len(library):
@@ -182,7 +182,7 @@ def _alarms(content, newest, moment, goal, limit):
         age = (moment - moment_of(day, "date")).to_value(u.day)
         if age > limit and newest.validity.valid_until is None:
             found.append(
-                f"The newest calibration is of {day[:10]}, {age:.0f} days old; {name} requires one "
+                f"The newest calibration is of {day[:10]}, {age:.0f} days old; {name} needs one "
                 f"every {limit:.0f} days."
             )
     last = content["calibrations"][-1]

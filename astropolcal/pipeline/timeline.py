@@ -58,7 +58,7 @@ def courses(calibrations, parameters=None, *, events=()):
         One row per optic: ``what``; ``course``, the most probable of constant, steps, drift, walk
         and scatter; the probability of each; ``change``, the probability of a step between each
         calibration and the next (n - 1 numbers); ``n_open``, the directions that one of the
-        calibrations does not determine, of which nothing is reported.
+        calibrations does not determine; they take no part.
         ``meta["calibrations"]`` and ``meta["dates"]`` name the runs.
 
     Raises

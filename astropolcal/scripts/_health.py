@@ -21,7 +21,7 @@ library DIR Input  folder of calibrations
 --goal PERCENT float  accuracy that is wanted, in percent of polarization
 --max-age DAYS float  age from which on a calibration is too old (default: the instrument's)
 --event DATE + ...  something was done to the instrument on this date
---date DATE  moment for which the report is made (default: now)
+--date DATE  moment for which the page holds (default: now)
 @ json quiet
 """
 

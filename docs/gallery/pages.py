@@ -126,7 +126,9 @@ def optic_page(name, label, place):
     cls = OPTICS[name]
     optic = example_of(cls)
     summary, extended, notes = _parts(cls)
-    matrix, letters = form_of(optic)
+    # a matrix that the description states is not shown twice
+    stated = "pmatrix" in f"{extended}{notes}"
+    matrix, letters = ("", "") if stated else form_of(optic)
     return render(
         "optic",
         matrix=matrix,
@@ -160,7 +162,9 @@ def optics_index():
         "One page for each optic in `astropolcal.optics.OPTICS`: its equation, its parameters, its "
         "Mueller matrix, what it does to a measurement, and how a calibration file holds it."
     )
-    return render("index", title="Optics", words=words, groups=groups, folder="optics")
+    return render(
+        "index", title="Optics", words=words, groups=groups, folder="optics", drawn="_elements"
+    )
 
 
 # ---- effects -------------------------------------------------------------------------------
@@ -396,4 +400,4 @@ def effects_index():
         "its equation, its fingerprint in the residuals, and how a calibration file holds it. "
         ":doc:`../../effects` describes them by the place where they act."
     )
-    return render("index", title="Effects", words=words, groups=groups, folder="effects")
+    return render("index", title="Effects", words=words, groups=groups, folder="effects", drawn="")

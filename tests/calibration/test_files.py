@@ -885,13 +885,13 @@ def test_mutated_file_is_refused_or_the_same(calibration, path, content):
     reasons = []
     # what YAML can read gets further than any byte
     for allowed in (np.arange(256), np.frombuffer(b"0123456789.-eabcn: []{}\n", np.uint8)):
-        for _ in range(150):
+        for _ in range(50):
             changed = np.frombuffer(content, np.uint8).copy()
             places = rng.integers(len(content), size=rng.integers(1, 4))
             changed[places] = rng.choice(allowed, size=len(places))
             reasons.append(refusal(path, changed.tobytes(), expected))
     reasons = [reason for reason in reasons if reason]
-    assert len(reasons) > 200
+    assert len(reasons) > 67
     assert any("does not match its checksum" in reason for reason in reasons)
     assert any("invalid at" in reason for reason in reasons)
     assert not any("\n" in reason for reason in reasons)
@@ -902,11 +902,11 @@ def test_cut_and_doubled_pieces_are_refused_or_the_same(calibration, path, conte
     rng = np.random.default_rng(12)
     expected = calibration.to_dict()
     reasons = []
-    for _ in range(60):
+    for _ in range(30):
         first, last = np.sort(rng.integers(len(content), size=2))
         last = min(last, first + 200)
         piece = content[first:last] * int(rng.choice([0, 2]))
         reasons.append(refusal(path, content[:first] + piece + content[last:], expected))
     reasons = [reason for reason in reasons if reason]
-    assert len(reasons) > 40
+    assert len(reasons) > 20
     assert not any("\n" in reason for reason in reasons)

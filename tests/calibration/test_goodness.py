@@ -60,14 +60,14 @@ def uniform(p):
 
 @pytest.mark.slow
 def test_probabilities_are_uniform_for_a_true_model(measurement):
-    """Monte Carlo, 300 runs; a fit with equal weights is not the best one and yet calibrated."""
+    """Monte Carlo, 120 runs; a fit with equal weights is not the best one and yet calibrated."""
     for weighted in [True, False]:
         m, rng = measurement.copy(), np.random.default_rng(7)
         sigma = m.sigma * np.array([1.0, 2.0, 1.0])[m.bins]
         m.sigma = sigma
         weights = 1 / sigma if weighted else np.ones(m.n_data)
         total, single = [], []
-        for _ in range(300):
+        for _ in range(120):
             draw(m, rng, sigma)
             test = lack_of_fit(m, fit(m, weights), weights=weights)
             total.append(test.p_value)
@@ -169,11 +169,11 @@ def test_overestimated_noise_is_told(measurement):
 
 @pytest.mark.slow
 def test_f_test_with_the_null_channel_is_calibrated(make, chain):
-    """Monte Carlo, 100 runs of faintly polarized light, whose noise is the same in all data."""
+    """Monte Carlo, 50 runs of faintly polarized light, whose noise is the same in all data."""
     source = optics.Diattenuator(diattenuation=0.2, fixed={"diattenuation": True}, name="source")
     faint = join([source, *list(chain)[1:]])
     total, single = [], []
-    for seed in range(100):
+    for seed in range(50):
         m = Measurement(faint, simulate(faint, LAM, make.frames(), seed=seed, **FAINT))
         vector = fit(m)
         test = lack_of_fit(m, vector, noise_from_null_channel(m, vector))
@@ -186,11 +186,11 @@ def test_f_test_with_the_null_channel_is_calibrated(make, chain):
 
 @pytest.mark.slow
 def test_f_test_with_replicates_is_calibrated(make, chain):
-    """Monte Carlo, 200 runs: the classical test of lack of fit against pure error."""
+    """Monte Carlo, 80 runs: the classical test of lack of fit against pure error."""
     twice = np.repeat([45, 70, 95, 120], 2) * u.deg
     m = Measurement(chain, make.observe(chain, make.frames(twice), LAM, seed=1))
     rng, total, single = np.random.default_rng(3), [], []
-    for _ in range(200):
+    for _ in range(80):
         draw(m, rng, np.full(m.n_data, 1e-4))
         vector = fit(m)
         test = lack_of_fit(m, vector, noise_from_replicates(m, vector))
@@ -245,7 +245,7 @@ def test_probabilities_are_uniform_with_priors_that_are_true(chain, measurement)
     m, rng = Measurement(with_priors(chain, **priors), data), np.random.default_rng(2)
     centre, slot = m.vector(), m.free.by_name["wollaston.efficiency"].slice
     total, alone, of_priors = [], [], []
-    for _ in range(200):
+    for _ in range(80):
         truth = centre.copy()
         truth[slot] = rng.normal(0.95, 1e-4, 3)
         truth[m.free.by_name["calibration_polarizer.theta"].start] = rng.normal(

@@ -171,7 +171,7 @@ def test_covariance_agrees_with_samples(calibration, loaded):
     free = FreeParameters(chains, 3, calibration.ties)
     start, factor = free.start(), calibration.covariance.factor * free.factors()
     draws = []
-    for _ in range(800):
+    for _ in range(500):
         free.put_back(start + rng.normal(size=len(factor)) @ factor)
         changed = dataclasses.replace(calibration, chains=chains)
         draws.append(expected(changed))

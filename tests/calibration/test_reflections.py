@@ -123,7 +123,7 @@ def test_summary_and_json_have_the_mirrors(free):
 
 
 @pytest.mark.slow
-def test_figures_of_mirrors_and_targets(free, metal, tmp_path):
+def test_figures_of_mirrors_and_targets(free, metal, tmp_path, unpainted):
     top, bottom = plot_mirrors(free[0]).axes
     lines = " ".join(str(line.get_label()) for line in top.get_lines())
     assert all(metal in lines for metal in ("silver", "gold", "aluminium"))

@@ -128,12 +128,12 @@ def test_defaults_survive():
 def test_anything_survives():
     for name in NAMES:
 
-        @settings(max_examples=4)
+        @settings(max_examples=2)
         @given(optic=an_optic(name))
         def survives_a_file(optic):
             assert_same(optic, round_trip(optic))
 
-        @settings(max_examples=15)
+        @settings(max_examples=6)
         @given(optic=an_optic(name), name=st.just(name))
         def survives_its_node(optic, name):
             assert_same(optic, optic_from_node(name, node_from_optic(optic)))

@@ -20,7 +20,7 @@ if not sys.platform.startswith("linux"):
     pytest.skip("memory and time are read from /proc", allow_module_level=True)
 
 #: Spoiled files in the test-suite, of a series that the offline runs do not use.
-SEED, COUNT = 7, 100
+SEED, COUNT = 7, 50
 #: Which seeds and numbers have failed, or made the process hang or die.
 FAILED = {
     "calibration": {0: (8, 54, 101, 104)},

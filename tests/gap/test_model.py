@@ -112,6 +112,7 @@ def test_a_mounting_that_is_known_is_a_datum():
     assert abs(angle) > 3
 
 
+@pytest.mark.slow
 def test_a_known_mounting_is_no_row_of_the_data():
     """What is worked out of the rows knows which of them are data: page, proposals, places."""
     fault = {"type": "cell", "place": "in:hwp", "kind": "rotation", "dependence": "time"}

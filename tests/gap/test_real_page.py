@@ -44,6 +44,19 @@ def test_tables_are_those_of_the_record_and_all_shown(script, tmp_path):
     assert sorted(re.findall(r":file: (\S+)", page)) == sorted(written)
 
 
+def test_text_is_that_of_the_record():
+    page = " ".join((DOCS / "real_gap.rst").read_text(encoding="utf-8").split())
+    one, three = (RECORD[f"dataset {number}"] for number in (1, 3))
+    assert {one["verdict"], three["verdict"]} == {"unexplained"}
+    assert "In both runs the verdict is ``unexplained``" in page
+    assert {len(one["causes"]), len(three["causes"])} == {8}
+    assert "Eight causes are needed together" in page
+    assert max(cause["probability"] for cause in one["causes"] + three["causes"]) < 0.1
+    assert "a probability of a few percent only" in page
+    first = RECORD["dataset 3 without the beam switcher"]["causes"][0]
+    assert f"The beam switcher is found ({100 * first['probability']:.0f} %)" in page
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3])
 def test_numbers_are_those_of_the_code(script, shared_data, number):

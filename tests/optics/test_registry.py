@@ -648,20 +648,18 @@ def test_only_theta_is_not_the_optics_own(label):
 # --- physics ----------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=40)
+@settings(max_examples=8)
 def test_mueller_matrix_is_physical(label, data):
     values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
     optic = build(label, values, position, theta=data.draw(ANGLE) * u.deg)
     assert np.all(mueller.is_physical(optic.mueller(WAVELENGTH)))
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=40)
+@settings(max_examples=8)
 def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
     values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
     expected = expected_matrix(label, values, position)
@@ -669,10 +667,9 @@ def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
     values = draw_per_wavelength(data, CASES[label].values)
     position = data.draw(CASES[label].placed)
@@ -684,10 +681,9 @@ def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_orientation_turns_the_matrix(label, data, angle):
     values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
     turned = build(label, values, position, theta=angle * u.deg).mueller(WAVELENGTH)
@@ -699,10 +695,9 @@ def test_orientation_turns_the_matrix(label, data, angle):
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.slow
 @each_that_turns
 @given(data=st.data(), theta=st.floats(-90, 90), position=st.floats(-90, 90))
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_position_adds_to_theta(label, data, theta, position):
     values = data.draw(CASES[label].values)
     theta, position = theta * u.deg, position * u.deg
@@ -716,10 +711,9 @@ def test_position_adds_to_theta(label, data, theta, position):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
 
 
-@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_position_is_the_coordinate(label, data, theta):
     values = draw_smooth(data, label)
     positions = u.Quantity([data.draw(CASES[label].placed) for _ in range(4)])
@@ -735,20 +729,18 @@ def test_position_is_the_coordinate(label, data, theta):
 
 
 # an analyser has an amplitude in any case
-@pytest.mark.slow
 @each([label for label in FRAME_OPTICS if label != "StateAnalyser"])
 @given(data=st.data(), theta=ANGLE)
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_without_amplitude_a_frame_optic_is_the_identity(label, data, theta):
     optic = build(label, {}, data.draw(CASES[label].placed), theta=theta * u.deg)
     assert not any(getattr(optic, key).value for key in optic.own_names)
     np.testing.assert_allclose(optic.mueller(), np.eye(4), rtol=0, atol=1e-15)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_light_is_matrix_times_stokes(label, data, angle):
     values = draw_smooth(data, label)
     optic = build(label, values, data.draw(CASES[label].placed), theta=angle * u.deg)
@@ -760,10 +752,9 @@ def test_light_is_matrix_times_stokes(label, data, angle):
     np.testing.assert_allclose(np.array(through[1:]), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_light_of_many_frames(label, data, seed):
     light = np.random.default_rng(seed).normal(size=(4, 5, WAVELENGTH.size))
     optic = build(label, draw_smooth(data, label), data.draw(CASES[label].placed))
@@ -787,10 +778,9 @@ def differences(optic, key, position=None):
     return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
-@settings(max_examples=12)
+@settings(max_examples=3)
 def test_derivatives_against_differences(label, data, angle):
     values, position = draw_smooth(data, label), data.draw(CASES[label].placed)
     optic = build(label, values, position, theta=angle * u.deg)
@@ -806,10 +796,9 @@ def test_derivatives_against_differences(label, data, angle):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * scale)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=8)
+@settings(max_examples=3)
 def test_derivative_to_theta_may_vary_with_wavelength(label, data):
     values, position = data.draw(CASES[label].differentiable), data.draw(CASES[label].placed)
     optic = build(label, values, position, theta=[-20, 3, 50] * u.deg)
@@ -817,10 +806,9 @@ def test_derivative_to_theta_may_vary_with_wavelength(label, data):
     np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
 
 
-@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data())
-@settings(max_examples=8)
+@settings(max_examples=3)
 def test_derivatives_at_several_positions(label, data):
     optic = build(label, draw_smooth(data, label), data.draw(CASES[label].placed))
     positions = u.Quantity([data.draw(CASES[label].placed) for _ in range(4)])[:, None]
@@ -835,10 +823,9 @@ def test_derivatives_at_several_positions(label, data):
 # --- units ------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_any_unit_gives_the_same_optic(label, data, angle):
     values = data.draw(CASES[label].values) | {"theta": angle}
     position = data.draw(CASES[label].placed)
@@ -945,10 +932,9 @@ def test_unit_changed_behind_the_optics_back_is_refused(label):
 # --- copies -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_assignment_keeps_the_declared_unit(label, data):
     optic = build(label, data.draw(CASES[label].values))
     for key, value in data.draw(CASES[label].values).items():
@@ -984,10 +970,9 @@ def state(optic):
     ]
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_copy_is_equal_and_independent(label, data):
     optic = marked(label, draw_smooth(data, label))
     copy = optic.copy()
@@ -1001,10 +986,9 @@ def test_copy_is_equal_and_independent(label, data):
     assert (optic.mount, optic.theta.fixed, optic.theta.value) == (mount, False, 0)
 
 
-@pytest.mark.slow
 @every
 @given(data=st.data())
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_with_parameters_changes_only_the_values(label, data):
     optic = marked(label, data.draw(CASES[label].values))
     values = draw_per_wavelength(data, CASES[label].values) | {"theta": np.array([1.0, 2.0, 3.0])}
@@ -1031,7 +1015,7 @@ def test_assignment_of_another_shape_points_to_with_parameters(label):
 
 @every
 @given(data=st.data())
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_loosened_optic_is_the_same_at_its_wavelengths(label, data):
     optic = build(label, data.draw(CASES[label].values), name="it", mount="stage")
     loose = optic.loosened(WAVELENGTH)

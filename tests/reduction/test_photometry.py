@@ -248,7 +248,7 @@ def test_aperture_correction_has_the_error_of_its_factor():
     for kind in [True, "growth"]:
         # light, noise and aperture such that the error of the factor is most of all
         errors, offsets, both = [], [], []
-        for seed in range(40):
+        for seed in range(20):
             cube = expose(star_image(pair(LAYOUT), flux=4e5), LAYOUT, seed=seed)
             result = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=kind)
             total = result.flux.sum(axis=0)

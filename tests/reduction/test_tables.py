@@ -50,6 +50,9 @@ def test_shared_noise_turns_errors_into_those_of_difference_and_sum(small):
     assert table["single_difference_err"][0] == pytest.approx(np.sqrt(25 - 4))
     assert table["single_sum_err"][0] == pytest.approx(np.sqrt(25 + 4))
     assert "flux_right_err" not in table.colnames
+    # what the beams share wholly is no noise of their difference
+    shared = reduced_table([frame(1, covariance=12.5)], small, {})
+    assert shared["single_difference_err"][0] == 0
 
 
 def test_covariance_of_failed_cells_does_not_count(small):

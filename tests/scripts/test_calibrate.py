@@ -110,6 +110,7 @@ def test_several_standards_and_optics_of_their_own(tables, tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 def test_summary_file_and_info_know_the_standard(tables, tmp_path, capsys):
     cal = tmp_path / "cal.asdf"
     arguments = [tables["first"], "--standard", tables["second"], "-o", cal, "--plots", tmp_path]
@@ -334,6 +335,7 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 def test_what_is_printed_fits_a_terminal_and_tells_what_is_hidden(tables, tmp_path, capsys):
     cal, figures, out = tmp_path / "cal.asdf", tmp_path / "figures", tmp_path / "cal.json"
     files = [tables["first"]]
