@@ -8,7 +8,7 @@ HELP = "what changed over all calibrations of an instrument, and what needs care
 DESCRIPTION = """\
 Read all calibrations of a folder; say for each instrument and mode which optics
 are constant, drift or changed and when, what needs care, and when the next
-calibration is due. --html writes a page with figures that can be sent or served."""
+calibration is due. --html writes a page with figures."""
 EXAMPLES = """\
 examples:
   astropolcal health library/

@@ -38,6 +38,7 @@ OUTPUTS = {
     "calibration": "info cal.asdf",
     "joint calibration": "info a_long_name_of_a_calibration_that_joins_several_tables.asdf",
     "library": "info .",
+    "health": "health .",
     "table": "info run.ecsv",
     "table of many angles": "info fine.ecsv",
     "fit": "calibrate run.ecsv -o again.asdf --json fit.json",
