@@ -94,7 +94,7 @@ def _to_bytes(calibration):
 def _from_bytes(content):
     # the tags are in the text before the blocks of numbers
     has_units = re.search(
-        rb"[/!]units?/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
+        rb"[/!](units?|transform)/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
     )
     with (
         _strict_asdf(_ConfigWithUnits if has_units else _Config),
@@ -132,7 +132,9 @@ def _plugged_in(group, proxy, get_ours, packages):
     for name in packages:
         package = distribution(name)
         points = package.entry_points.select(group=group)
-        asked += [(name, package.version, point.load()) for point in points]
+        # as ASDF itself names it, who compares the names of files with what is installed
+        told = package.metadata["Name"], package.version
+        asked += [(*told, point.load()) for point in points]
     return [
         proxy(one, package_name=name, package_version=version)
         for name, version, get in asked

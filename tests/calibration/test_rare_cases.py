@@ -340,6 +340,6 @@ def test_a_source_of_no_known_kind_gives_no_accuracy_for_a_target(cal):
 
 
 def test_an_instrument_without_files_only_tells_its_name(monkeypatch):
-    lab = SimpleNamespace(name="lab", files=None)
+    lab = SimpleNamespace(name="lab", files=None, headers=None, configured=lambda header: lab)
     monkeypatch.setattr(instruments, "get", lambda name: lab)
     assert describe({"INSTRUME": "CHARIS"}, "lab") == {"instrument": "lab"}

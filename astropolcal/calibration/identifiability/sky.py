@@ -73,8 +73,10 @@ def settings_of(measurement):
     angles, stood = {}, [dataset.positions for dataset in measurement.datasets]
     if not any("hwp" in positions for positions in stood):
         shared = set.intersection(*map(set, stood)) - {*_TELESCOPE, *COORDINATES}
+        if not shared:
+            return {}
         each = [[np.round(p[s], 6).ravel() for s in sorted(shared)] for p in stood]
-        frames = np.hstack([np.vstack(one) for one in each]) if shared else np.zeros((0, 0))
+        frames = np.hstack([np.vstack(one) for one in each])
         frames = _spread_out(np.unique(frames, axis=1).T, _KEPT).T
         return {stage: angle.tolist() for stage, angle in zip(sorted(shared), frames, strict=True)}
     for dataset in measurement.datasets:
