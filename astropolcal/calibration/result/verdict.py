@@ -27,8 +27,8 @@ _ANGLES = 2
 _UNLIKELY = 0.01
 # the mounts are known better than this before any fit, and it turns 6 % of Q into U
 _ABSURD_ANGLE = 10 * u.deg
-# real data of three instruments leave 0.1 to 1.5 %, exchanged beams and wrong signs leave tens
-_MISFIT = 5 * u.percent
+# real data of three instruments leave 0.1 to 1.5 %, wrong minima more, exchanged beams leave tens
+_MISFIT = 2 * u.percent
 # a turn or a change of the DoLP by less, in degree or percent of itself, does not show
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
