@@ -14,7 +14,7 @@ import numpy as np
 from astropolcal import Observations, calibrate, instruments
 from astropolcal.gap import diagnose
 from astropolcal.plotting import plot_gap_spectrum
-from astropolcal.plotting._style import BLUE, COLORS, GREY, MARKERS, VERMILION, canvas, style
+from astropolcal.plotting._style import BLUE, COLORS, GREY, MARKERS, VERMILION, canvas
 from astropolcal.plotting.residuals import DataGrid
 
 FIGURE = Path(__file__).resolve().parent / "images" / "landing.png"
@@ -77,8 +77,7 @@ def draw():
     observations = Observations.read(files("astropolcal") / "data" / "charis_example.ecsv")
     cal = calibrate(charis.chains_for([observations]), observations, cross_validate=False)
     diagnosis = diagnose(charis.chains_for([observations], derotator="linear"), observations)
-    with style():
-        figure = canvas(None, 7.4, 7.4)
+    with canvas(None, 7.4, 7.4) as figure:
         above, below = figure.subfigures(2, height_ratios=(1, 6.2))
         chain = above.subplots()
         top, bottom, gap = below.subplots(3, height_ratios=(2.2, 0.9, 1.9))

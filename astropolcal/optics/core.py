@@ -48,7 +48,7 @@ PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
 
 
 class _Coordinates(tuple):
-    """Names of positions that are numbers; `PLACES` and ``"COLUMN=STATE"`` are among them."""
+    """Names of positions that are numbers; ``PLACES`` and ``"COLUMN=STATE"`` are among them."""
 
     __slots__ = ()
 

@@ -98,13 +98,9 @@ def table():
 
 def draw(rows, figure=None):
     """Return a figure with a panel for each of what was varied."""
-    from matplotlib.figure import Figure
+    from astropolcal.plotting._style import COLORS, MARKERS, canvas
 
-    from astropolcal.plotting._style import COLORS, MARKERS, style
-
-    with style():
-        if figure is None:
-            figure = Figure(figsize=(10, 3.6), layout="constrained")
+    with canvas(figure, 10, 3.6) as figure:
         axes = figure.subplots(1, 3, sharey=True)
         looks = {"prediction": 0, "Jacobian": 1, "log-posterior": 2}
         for panel, axis in zip(axes, ("frames", "wavelengths", "walkers"), strict=True):
