@@ -2,6 +2,7 @@
 """Fixtures and settings common to all tests."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -32,6 +33,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 def pytest_configure(config):
     """Name the versions that matter in the header of the report."""
+    # a shell starts what runs in the background deaf to interruptions; some tests make some
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         from pytest_astropy_header.display import PYTEST_HEADER_MODULES, TESTED_VERSIONS
     except ImportError:

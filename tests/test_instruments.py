@@ -432,6 +432,7 @@ ALLOWED = {
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
     ("scripts/_correct.py", "charis"): DEFAULT,
     ("scripts/_efficiency.py", "charis"): DEFAULT,
+    ("scripts/_reduce.py", "charis"): DEFAULT,
 }
 # arguments of argparse whose texts may cite an instrument
 HELP = {"help", "epilog", "description", "metavar"}

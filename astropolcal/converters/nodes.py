@@ -87,6 +87,9 @@ def plain(value, where="value"):
         return {str(key): plain(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
+        # an array that ASDF reads when it is asked for
+        value = np.asarray(value)
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # a copy: views of one array would share a block
         return value.copy() if value.ndim or isinstance(value, u.Quantity) else value.item()

@@ -16,7 +16,6 @@ from itertools import pairwise
 import numpy as np
 from astropy.table import Table
 from astropy.time import Time
-from scipy.special import logsumexp
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.pipeline.history import compared, named_by_date, optics_of
@@ -144,7 +143,7 @@ def _course(named, what, dates, priors):
     if series is None:
         return None
     evidence, change = series.weigh(priors)
-    chance = np.exp(evidence - logsumexp(evidence))
+    chance = np.exp(evidence - np.logaddexp.reduce(evidence))
     row = {"what": what, "course": COURSES[int(np.argmax(chance))]}
     row |= dict(zip(COURSES, chance, strict=True))
     return row | {"change": change, "n_open": found.n_open}
@@ -203,9 +202,9 @@ class Series:
         parts, n = np.array(parts), len(parts)
         share = np.log([1.0, 1.0, *[(1 - _PARTITION) / 3] * 3])
         share[:2] = np.log(_PARTITION)
-        evidence = logsumexp(parts, axis=0) - np.log(n) + share
+        evidence = np.logaddexp.reduce(parts, axis=0) - np.log(n) + share
         # a step is a step only as far as neither a drift nor a walk explains it
-        weight = np.exp(parts[:, 1] - np.log(n) + share[1] - logsumexp(evidence))
+        weight = np.exp(parts[:, 1] - np.log(n) + share[1] - np.logaddexp.reduce(evidence))
         return evidence, np.asarray(changes).T @ weight
 
     def _partitions(self, gram, target, size, priors):
@@ -231,10 +230,10 @@ class Series:
         ahead[0] = behind[n] = 0.0
         for j in range(1, n + 1):
             before = [ahead[i] + (change[i - 1] if i else 0.0) for i in range(j)]
-            ahead[j] = logsumexp(np.array(before) + stretch[:j, j])
+            ahead[j] = np.logaddexp.reduce(np.array(before) + stretch[:j, j])
         for i in range(n - 1, -1, -1):
             after = [behind[j] + (change[j - 1] if j < n else 0.0) for j in range(i + 1, n + 1)]
-            behind[i] = logsumexp(np.array(after) + stretch[i, i + 1 :])
+            behind[i] = np.logaddexp.reduce(np.array(after) + stretch[i, i + 1 :])
         one = stretch[0, n]
         more = ahead[n] + np.log1p(-min(np.exp(one - ahead[n]), 1 - 1e-15))
         chance = np.exp(ahead[1:n] + behind[1:n] + change - more)

@@ -161,8 +161,8 @@ def test_the_polarizer_is_not_on_sky():
     assert [t["dolp_change_percent"] for t in sky["targets"]] == [[0.0, 0.0]] * 3
 
 
-def test_without_a_half_wave_plate_there_is_no_sky():
-    chain = join([optics.LinearRetarder(retardance=90 * u.deg, mount="derotator", name="derotator"),
+def test_without_an_optic_that_turns_there_is_no_sky():
+    chain = join([optics.LinearRetarder(retardance=90 * u.deg, name="plate"),
                   optics.WollastonPrism(name="wollaston")])  # fmt: skip
     measurement = _measurement(chain)
     assert _consequences(measurement, np.ones((2, 2))) == [None, None]

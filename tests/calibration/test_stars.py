@@ -159,8 +159,8 @@ def test_joint_fit_is_fast(joint, prepared):
         cal = calibrate(chains, data, cross_validate=False)
         seconds.append(time.process_time() - start)
     assert cal.converged
-    # 1 s on a quiet machine
-    assert min(seconds) < 4
+    # 2 s on a quiet machine
+    assert min(seconds) < 8
 
 
 @pytest.mark.slow

@@ -84,10 +84,11 @@ def an_optic(draw, name):
     n = draw(st.integers(1, 5))
     value = numbers | st.lists(numbers, min_size=n, max_size=n)
     extra = {key: draw(SETTINGS[key]) for key in cls()._settings() if key not in ("name", "mount")}
+    declared = cls()._declared
     optic = cls(
         name=draw(st.none() | st.text(max_size=8)),
         mount=draw(st.sampled_from([None, "hwp", "-altitude", "nul l"])),
-        **{key: np.array(draw(value)) * (cls._declared(key).unit or 1) for key in cls.param_names},
+        **{key: np.array(draw(value)) * (declared(key).unit or 1) for key in cls.param_names},
         **extra,
     )
     for key in draw(st.lists(st.sampled_from(cls.param_names), unique=True)):

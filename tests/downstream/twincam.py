@@ -57,9 +57,6 @@ class TwinCam(Instrument):
             optics.Rotator(mount="-altitude", name="altitude"),
         ]
 
-    def setup(self, observations):
-        return self.source_of(observations), ()
-
     @property
     def location(self):
         return location_of((-70.4, -24.6, 2635.0))

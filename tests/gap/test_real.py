@@ -53,7 +53,8 @@ def named(diagnosis, least=0.0):
 def test_beam_switcher_that_the_model_lacks_is_a_parity(shared_data):
     data = observed(shared_data, "dataset3_polarized_2025-10-05")
     chains = [remove_optic(chain, "nbs") for chain in CHARIS.chains_for(data)]
-    found = diagnose(*thinned(chains, data, 5), cells=False)
+    # of very few wavelengths a plate of another thickness explains half of it
+    found = diagnose(*thinned(chains, data, 11), cells=False)
     assert named(found)[0] == PARITY
     assert found.causes[0].effect.kind == "discrete"
     assert found.gap_after_percent < found.gap_before_percent / 5

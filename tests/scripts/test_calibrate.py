@@ -330,7 +330,7 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
 
     right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
     lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD[2:])
-    assert lines[0].startswith("NOT USABLE AS IT IS: most angles at their bounds: are beams or")
+    assert lines[0].startswith("NOT USABLE AS IT IS: the model misses the data by 1.")
     assert "astropolcal diagnose" in lines[4]
 
 

@@ -79,6 +79,10 @@ _ROBUST_ROUNDS = 50
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
+# nor is one tried that leaves so many times as much before everything is fitted
+_HOPELESS = 100.0
+# of data without noise, residuals below this are rounding
+_ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
 
@@ -368,7 +372,9 @@ def _joint(measurement, weighting, fitter, search, prepare):
         return best
     found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
     least = np.sum(problem.residuals(found) ** 2)
-    for _, start in other_laws(problem, found, origin)[:_STARTS]:
+    for promised, start in other_laws(problem, found, origin)[:_STARTS]:
+        if promised > _HOPELESS * least:
+            break
         measurement.stand_at(start)
         outcome = _descend(measurement, weighting, fitter, search, prepare, origin, start)
         left = np.sum(problem.residuals(measurement.vector()) ** 2)
@@ -388,7 +394,7 @@ def _stands_out(measurement):
         # nothing to hold against
         return False
     residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
-    return bool(np.mean((residuals / sigma) ** 2) > _STANDS_OUT**2)
+    return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
 
 
 def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
