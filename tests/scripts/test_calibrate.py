@@ -329,8 +329,8 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
         table["flux_left"], table["flux_right"] = right, left
 
     right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
-    lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD[2:])
-    assert lines[0].startswith("NOT USABLE AS IT IS: the model misses the data by 1.")
+    lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD)
+    assert lines[0].startswith("NOT USABLE AS IT IS: the model misses the data by 2.")
     assert "astropolcal diagnose" in lines[4]
 
 
