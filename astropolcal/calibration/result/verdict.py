@@ -29,8 +29,6 @@ _UNLIKELY = 0.01
 _ABSURD_ANGLE = 10 * u.deg
 # real data of three instruments leave 0.1 to 1.5 %, wrong minima more, exchanged beams leave tens
 _MISFIT = 2 * u.percent
-# so does this misfit, where it is so many times the noise
-_LESS, _FAR_ABOVE = 1 * u.percent, 15
 # a turn or a change of the DoLP by less, in degree or percent of itself, does not show
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
@@ -204,9 +202,7 @@ def _misfit(calibration):
     """Say that the model does not describe the data at all."""
     left = [_median(r.accuracy["s_res"].to_value(u.percent)) for r in calibration.datasets]
     worst = np.nanmax([0.0, *left])
-    excess = _excess(calibration)
-    # of data without a noise to compare with nothing is known
-    if not excess or worst <= (_LESS if excess > _FAR_ABOVE else _MISFIT).value:
+    if not worst > _MISFIT.value or not _excess(calibration):
         return ""
     return f"the model misses the data by {worst:.2g} %, {_excess(calibration):.2g} times the noise"
 
