@@ -19,7 +19,7 @@ from astropy.table import QTable
 from astropolcal import instruments
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
-from astropolcal.files import atomic_path, plain, printable
+from astropolcal.files import plain
 from astropolcal.gap import _numbers, _words, runs
 from astropolcal.gap.planning import plan
 from astropolcal.gap.residuals import locate
@@ -325,22 +325,13 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None):
     >>> data = simulate(chain, wavelength, frames, seed=1)
     >>> write_html(diagnose(chain, data), "gap.html")
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from astropolcal.pipeline.monitoring import write_page
 
-    from astropolcal.version import version
-
-    environment = Environment(
-        loader=PackageLoader("astropolcal.gap", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     names = ("number", "percent", "p", "short_share", "in_title", "shortened", "worth_reading")
-    environment.filters |= {name: getattr(_words, name) for name in names}
-    environment.filters |= {"title_of": _words.title, "zip": zip}
+    filters = {name: getattr(_words, name) for name in names}
+    filters |= {"title_of": _words.title, "zip": zip}
     images = _images(figures)
-    page = environment.get_template("report.html").render(
+    known = dict(
         content=to_dict(diagnosis),
         datasets=_about(diagnosis),
         frames=_about_frames(diagnosis),
@@ -352,10 +343,8 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None):
         exposure=_words.exposure,
         where_words=_words.where_words,
         accuracies=_numbers.ACCURACIES,
-        version=version,
     )
-    with atomic_path(path, error=GapError) as temporary:
-        temporary.write_text(printable(page), encoding="utf-8")
+    write_page(path, GapError, "astropolcal.gap", "report.html", known, filters)
 
 
 def _about(diagnosis):

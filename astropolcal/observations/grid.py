@@ -54,7 +54,7 @@ _MAX_ANGLE = 1e6
 class Grid:
     """The arrays of a table of observations: F frames, W wavelengths."""
 
-    # one row a frame, ordered by ``frame``, and the first data row (from 1) of each
+    # one row per frame, ordered by ``frame``, and the first data row (from 1) of each
     frames: QTable
     rows: np.ndarray
     # (W,)

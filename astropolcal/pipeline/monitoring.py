@@ -134,8 +134,9 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     newest = dated[-1] if dated else entries[-1]
     known = instrument_of(newest.calibration) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
-    content["alarms"] = _alarms(content, newest, moment, goal, limit)
-    advice = newest.calibration.verdict().words[-1].partition(" ")[2].strip()
+    verdict = newest.calibration.verdict()
+    content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
+    advice = verdict.words[-1].partition(" ")[2].strip()
     content["next"] = [*_next(content, newest, moment, limit), f"{newest.name}: {advice}"]
     return content
 
@@ -174,7 +175,7 @@ def _events(found, dated):
     return sorted(events, key=lambda one: one["to"])
 
 
-def _alarms(content, newest, moment, goal, limit):
+def _alarms(content, newest, verdict, moment, goal, limit):
     """Return sentences on what needs care."""
     found, name = [], content["instrument"] or "the instrument"
     if newest.validity.valid_from is not None:
@@ -188,7 +189,6 @@ def _alarms(content, newest, moment, goal, limit):
     last = content["calibrations"][-1]
     if not last["converged"]:
         found.append(f"{last['name']}: the fit did not converge.")
-    verdict = newest.calibration.verdict()
     if not verdict.usable:
         found.append(f"{newest.name} is not usable as it is: {verdict.reasons[0]}.")
     reached = last["s_cv_percent"] if np.isfinite(last["s_cv_percent"]) else last["s_res_percent"]
@@ -207,7 +207,10 @@ def _alarms(content, newest, moment, goal, limit):
     ]
     if moving:
         verb = "is" if len(moving) == 1 else "are"
-        found.append(f"{listed(moving)} {verb} not constant: errors grow with the age of a file.")
+        found.append(
+            f"{listed(moving)} {verb} not constant: with the age of a file its true errors grow "
+            "beyond those that it states."
+        )
     return found
 
 
@@ -245,20 +248,26 @@ def write_health(content, path, *, figures=None):
     >>> from astropolcal.pipeline import write_health
     >>> write_health({"now": "2027-01-01T00:00:00", "groups": [], "unreadable": {}}, "h.html")
     """
+    figures = figures or [{} for _ in content["groups"]]
+    groups = list(zip(content["groups"], figures, strict=True))
+    known = {"content": content, "groups": groups}
+    write_page(path, ParameterError, "astropolcal.pipeline", "health.html", known)
+
+
+def write_page(path, error, package, template, known, filters=None):
+    """Write a page from a template of a package, atomically; what is shown is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from astropolcal.version import version
 
     environment = Environment(
-        loader=PackageLoader("astropolcal.pipeline", "templates"),
+        loader=PackageLoader(package, "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    figures = figures or [{} for _ in content["groups"]]
-    page = environment.get_template("health.html").render(
-        content=content, groups=list(zip(content["groups"], figures, strict=True)), version=version
-    )
-    with atomic_path(path, error=ParameterError) as temporary:
+    environment.filters |= filters or {}
+    page = environment.get_template(template).render(**known, version=version)
+    with atomic_path(path, error=error) as temporary:
         temporary.write_text(printable(page), encoding="utf-8")

@@ -86,7 +86,7 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
             way = ways["raw"] if raw is None and layout.raw_columns else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
     if centre is None and not layout.centred:
-        # (beam, x and y): the star stands still over the slices within a fraction of a pixel
+        # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
         centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
         seen = np.isfinite(np.asarray(centre)).all(axis=(1, 2))
         if not seen.all():

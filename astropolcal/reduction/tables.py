@@ -114,7 +114,7 @@ def write_table(table, path, overwrite=False):
 
 
 # ---- tables of pyPolCal --------------------------------------------------------------------------
-# One CSV file a wavelength bin, one row a frame: ``filepath``, ``D_IMRANG`` (derotator), ``RET-
+# One CSV file per wavelength bin, one row per frame: ``filepath``, ``D_IMRANG`` (derotator), ``RET-
 # ANG1`` (commanded half-wave plate), ``LCOUNTS`` and ``RCOUNTS``, their sum and difference
 # ``single_sum`` and ``single_diff`` with errors ``sum_std`` and ``diff_std``, ``wavelength_bin``
 # (nm), and for stars ``p`` and ``a`` (parallactic angle and altitude), all angles in degree.

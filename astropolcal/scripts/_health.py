@@ -51,6 +51,8 @@ def run(arguments):
 
 def _group(group):
     """Return what is printed of an instrument and a mode."""
+    from astropolcal.pipeline.monitoring import LIKELY
+
     name = ", ".join(part for part in (group["instrument"], group["mode"]) if part)
     dates = [one["date"][:10] for one in group["calibrations"] if one["date"]]
     span = f", {dates[0]} to {dates[-1]}" if dates else ""
@@ -59,9 +61,11 @@ def _group(group):
     ]
     lines += [f"  ALARM: {words}" for words in group["alarms"]] or ["  No alarm"]
     lines += [f"  Changed: {one['words']}" for one in group["events"]]
-    steady = [one["what"] for one in group["courses"] if one["course"] == "constant"]
+    # what is but more probably constant than not is told with its probability
+    sure = [one for one in group["courses"] if one["constant"] >= LIKELY]
+    steady = [one["what"] for one in sure]
     lines += [f"  Constant: {', '.join(steady)}"] if steady else []
-    moved = [one["words"] for one in group["courses"] if one["course"] != "constant"]
+    moved = [one["words"] for one in group["courses"] if one not in sure]
     lines += [f"  Course: {words}" for words in moved]
     lines += [f"  Left out: {words}" for words in group["left_out"]]
     return lines + [f"  Next: {words}" for words in group["next"]]

@@ -199,10 +199,7 @@ def calibrate(
     >>> cal.converged
     True
     """
-    choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
-    for (name, allowed), value in zip(choices.items(), (strategy, loss, errors), strict=True):
-        if value not in allowed:
-            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+    _check_choices(strategy, loss, errors)
     search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
@@ -227,7 +224,7 @@ def calibrate(
         )
     hold_silent(measurement, origin)
     chosen, weighting, whitened = _settled(measurement, weighting, origin, gauge)
-    seconds = time.perf_counter() - started
+    outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
     return _result(
         measurement,
         whitened,
@@ -243,10 +240,17 @@ def calibrate(
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
             **({"own": copies} if copies else {}),
         },
-        fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
+        fit=outcome,
         stages=stages,
         cross_validate=cross_validate,
     )
+
+
+def _check_choices(*values):
+    choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
+    for (name, allowed), value in zip(choices.items(), values, strict=True):
+        if value not in allowed:
+            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
 
 
 def _fixed(chain, fix):
