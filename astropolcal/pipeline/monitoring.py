@@ -57,7 +57,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     Raises
     ------
     ParameterError
-        If the folder holds no calibration, or the goal or the age is none.
+        If the folder holds no calibration, the goal or the age is none, or an event is not a date
+        or of the same date as another.
 
     Examples
     --------
@@ -80,6 +81,9 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     if not len(library):
         raise ParameterError(f"{library.source}: holds no calibration that can be read")
     moment = moment_of(Time.now() if now is None else now, "now")
+    days = [moment_of(event, "event").isot[:10] for event in events]
+    if len(set(days)) < len(days):
+        raise ParameterError(f"events {', '.join(days)}: two of one date are not distinguishable")
     goal = None if goal is None else _positive("goal", goal, u.percent)
     limit = None if max_age is None else _positive("max_age", max_age, u.day)
     rows = {row["name"]: row for row in library.table()}

@@ -152,6 +152,9 @@ def test_health_says_what_needs_care(folder):
     for options in ({"goal": -1}, {"max_age": 3 * u.m}, {"goal": "high"}):
         with pytest.raises(ParameterError, match="a positive number"):
             health(folder, **options)
+    for events, words in ((["soon"], "is not a date"), (["2022-03-01"] * 2, "two of one date")):
+        with pytest.raises(ParameterError, match=words):
+            health(folder, events=events)
 
 
 def test_the_command_writes_a_page_and_numbers(folder, tmp_path, capsys):
