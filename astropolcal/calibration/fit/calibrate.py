@@ -391,14 +391,15 @@ def _joint(measurement, weighting, fitter, search, prepare):
 
 
 def _stands_out(measurement):
-    """Whether the residuals are far above the noise that the frames show."""
-    try:
-        sigma = _noise_of_frames(measurement).sigma_of_data
-    except AstropolcalError:
-        # nothing to hold against
-        return False
+    """Whether the residuals are far above the noise that the frames show, or the table states."""
     residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
-    return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
+    for method in (_noise_of_frames, noise_from_errors):
+        try:
+            sigma = method(measurement).sigma_of_data
+        except AstropolcalError:
+            continue  # few wavelengths, or no errors in the table
+        return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
+    return False
 
 
 def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
@@ -498,14 +499,16 @@ def _robust(measurement, fitter, loss, outcome):
 # ---- the result ------------------------------------------------------------------
 
 
-def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
+def _result(measurement, whitened, *, settings, fit, stages, cross_validate, covariance=None):
+    """Return the calibration; ``covariance`` is that of more data than its own."""
     vector = measurement.vector()
     residuals, level = measurement.residuals(vector), measurement.weighting.level
     finding = finding_of(measurement.free, whitened)
     view = view_of_measurement(measurement, vector, settings["instrument"])
     complete(finding, measurement, vector, whitened, level, view=view)
     names = measurement.free.names
-    covariance, lacking = _errors(measurement, whitened, settings["errors"])
+    own, lacking = _errors(measurement, whitened, settings["errors"])
+    covariance = own if covariance is None else covariance
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
