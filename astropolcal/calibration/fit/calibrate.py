@@ -526,7 +526,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     observations = (dataset.observations for dataset in measurement.datasets)
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
-    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
+    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
@@ -543,14 +543,14 @@ def _errors(measurement, whitened, how):
     return covariance, model_error(measurement, scatter)
 
 
-def _lack_of_fit(calibration):
+def _lack_of_fit(calibration, whitened):
     """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
     live = calibration.measurement
     for method in (noise_from_errors, _noise_of_frames):
         try:
             noise = method(live)
-            test = lack_of_fit(live, calibration, noise)
+            test = lack_of_fit(live, calibration, noise, whitened=whitened)
         except AstropolcalError:
             continue  # no errors in the table, or too few frames: nothing to hold against
         # unknown where no degree of freedom is left
