@@ -65,8 +65,8 @@ files FILE * Input  observation tables (ECSV)
 --own NAME[=GROUP,...] ...  a parameter with a value of its own in each table, or in each group of
     tables, such as hwp.theta=july,july,october; all others are shared
 --follow NAME:LAW:INPUTS[:SINCE] ...  let a parameter follow Polynomial1D(DEGREE) of an input, or
-    Polynomial2D(DEGREE) of two: time (needs the date at which it is zero), x, y, wavelength or a
-    stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
+    Polynomial2D(DEGREE) of two: time (zero on the first day of the tables, or SINCE), x, y,
+    wavelength or a stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
 @ prior
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
@@ -110,7 +110,7 @@ def run(arguments):
     chains = instrument.chains_for(tables[:n], **exact, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in tables[n:]]
-    chains = follow_laws(chains, arguments.follow)
+    chains = follow_laws(chains, arguments.follow, datasets)
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     if arguments.start:
         edits["free"] = []

@@ -24,7 +24,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.progress import clear
-from astropolcal.units import plain_number
+from astropolcal.units import mjd_of, plain_number
 
 # what a terminal has that nobody made wider
 _COLUMNS = 80
@@ -547,8 +547,13 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     return chains
 
 
-def follow_laws(chains, texts):
-    """Return the chains in which parameters follow laws, each NAME:MODEL(DEGREE):INPUTS[:SINCE]."""
+def follow_laws(chains, texts, tables):
+    """
+    Return the chains in which parameters follow laws, each NAME:MODEL(DEGREE):INPUTS[:SINCE].
+
+    Time is zero on the first day of the tables where no date is given.
+    """
+    dated = [mjd_of(table.frames["time"]) for table in tables if "time" in table.frames.colnames]
     for text in texts:
         # a time of day has colons too
         match = re.fullmatch(r"([^:]+):(\w+)\((\d{1,2})\):([\w,]+)(?::(.+))?", text, re.ASCII)
@@ -565,6 +570,8 @@ def follow_laws(chains, texts):
             # raises, with near matches
             find_optic(chains[0], optic)
         law, of = model(int(degree)), of.split(",")
+        if "time" in of and since is None and dated:
+            since = np.floor(min(one.min() for one in dated))
         chains = [
             follow(chain, name, law, of, since=since) if here else chain
             for chain, here in zip(chains, have, strict=True)
