@@ -587,7 +587,7 @@ def test_parameters_of_each_night_and_a_drift(nights, tmp_path):
         (["--own", "hwp.theta"], ("hwp_night10", "theta"), 0.5, 0.02),
         (["--own", "hwp.theta=march,april"], ("hwp_april", "theta"), 0.5, 0.02),
         (["--follow", "hwp.theta:Polynomial1D(1):time"], ("hwp", "theta_c1"), 0.05, 0.002),
-        (["--follow", "hwp.theta:Polynomial1D(1):time:60000"], ("hwp", "theta_c1"), 0.05, 0.002),
+        (["--follow", "hwp.theta:Polynomial1D(1):time:61090"], ("hwp", "theta_c1"), 0.05, 0.002),
     ):
         assert main(["calibrate", *map(str, nights), *held, *options, "-o", str(out)]) == 0
         found = {leaf.name: leaf for chain in Calibration.read(out).chains for leaf in chain}
