@@ -381,6 +381,9 @@ def _low_rank(measurement, vector, sigma, weights, fitted):
     # in units of the noise the hat matrix is a b^T
     known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
     by_noise = (weights * known)[:, None]
+    if not np.all(by_noise > 0):
+        # data without noise, which the fit meets exactly
+        return nothing, nothing
     a, b = basis / by_noise, basis * by_noise
     return np.hstack([a, b]), np.hstack([a @ (b.T @ b) - b, -a])
 
