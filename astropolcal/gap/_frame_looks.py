@@ -67,7 +67,8 @@ class Look:
         #: Sum of squares and degrees of freedom of the frames that take part.
         self.chi2 = float(np.sum(self.residual[rows] ** 2))
         lost = sum(
-            c.count * int(c.valid[:, o].sum()) for c, o in zip(self.problem.channels, out, strict=True)
+            c.count * int(c.valid[:, o].sum())
+            for c, o in zip(self.problem.channels, out, strict=True)
         )
         self.freedom = max(self.problem.n_data - lost - self.tangent.shape[1], 1)
 
@@ -116,7 +117,9 @@ class Look:
             shapes = shapes if channel.groups is None else (1 / bright, bright)
             law = self.law(i).T[:, :, None]
             table = np.zeros((len(shapes) * len(law), *channel.shape))
-            table[:, channel.told] = np.concatenate([law * shape * channel.valid for shape in shapes])
+            table[:, channel.told] = np.concatenate(
+                [law * shape * channel.valid for shape in shapes]
+            )
             block = np.zeros((self.problem.n_rows, len(table)))
             block[rows] = channel.whiten_frames(table).reshape(len(table), -1).T
             blocks.append(block)

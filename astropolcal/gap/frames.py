@@ -300,7 +300,9 @@ def _words(fault, told, beam=""):
         which = f"the {beam} beam" if beam else "one beam"
         return f"{head}{which} is off by {100 * abs(fault.value - 1):.2g} %"
     if fault.what == "brightness":
-        return f"{head}its brightness is off that of its group by {100 * abs(fault.value - 1):.2g} %"
+        return (
+            f"{head}its brightness is off that of its group by {100 * abs(fault.value - 1):.2g} %"
+        )
     if fault.what == "lamp":
         return f"{head}the lamp is off its drift by {100 * abs(fault.value - 1):.2g} %"
     if fault.what == "unknown":

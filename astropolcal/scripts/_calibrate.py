@@ -199,7 +199,11 @@ def _check_start(arguments):
     if not arguments.start:
         return
     # they would contradict what the old calibration holds
-    given = [f"--{key}" for key in ("fix", "prior", "without", "own", "follow") if getattr(arguments, key)]
+    given = [
+        f"--{key}"
+        for key in ("fix", "prior", "without", "own", "follow")
+        if getattr(arguments, key)
+    ]
     given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
     if given:
         raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")

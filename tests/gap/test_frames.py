@@ -231,7 +231,10 @@ def single(turning, error=(), factor=1.0, at=(), seed=1):
     """Frames of a single beam, in some of which a stage stood elsewhere or the lamp was bright."""
     if turning:
         n = 40
-        columns = {"calibrator": np.linspace(3, 178, n), "plate": (13.7 + 39.1 * np.arange(n)) % 180}
+        columns = {
+            "calibrator": np.linspace(3, 178, n),
+            "plate": (13.7 + 39.1 * np.arange(n)) % 180,
+        }
         frames = QTable({key: angle * u.deg for key, angle in columns.items()})
     else:
         turns = np.linspace(3, 178, 24)

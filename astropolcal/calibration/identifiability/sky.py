@@ -79,7 +79,9 @@ def settings_of(measurement):
     for dataset in measurement.datasets:
         states = {s: x[..., dataset.frames.T] for s, x in dataset._given.items() if "=" in s}
         stood.append(dataset.positions | states)
-    if not any("hwp" in one for one in stood) or any("=" in stage for one in stood for stage in one):
+    if not any("hwp" in one for one in stood) or any(
+        "=" in stage for one in stood for stage in one
+    ):
         shared = set.intersection(*map(set, stood)) - {*_TELESCOPE, *COORDINATES}
         if not shared:
             return {}
