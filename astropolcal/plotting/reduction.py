@@ -109,7 +109,7 @@ def _draw_frame(panel, index, reduction, k):
     """Draw one panel; return whether pixels lack a value."""
     frame = reduction.frames[index]
     layout = reduction.instrument.files
-    with open_cube(frame.path, layout) as (_, _, cube, good):
+    with open_cube(frame.path, layout, reduction.masters) as (_, _, cube, good):
         image = np.array(cube[k], dtype=float)
         if good is not None:
             image[~good[k]] = np.nan

@@ -26,6 +26,7 @@ from astropolcal.observations.reading import stated_date
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames
+from astropolcal.reduction.masters import Masters
 from astropolcal.reduction.sorting import sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
@@ -58,6 +59,8 @@ class Reduction:
         Of the table.
     options : dict
         Of the photometry.
+    masters : object, optional
+        Dark and flat of the frames.
 
     Examples
     --------
@@ -73,6 +76,7 @@ class Reduction:
     doubts: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
     options: dict = field(default_factory=dict)
+    masters: object = None
 
     @property
     def table(self):
@@ -170,6 +174,8 @@ def reduce_run(
     *,
     source="internal",
     raw=None,
+    dark=None,
+    flat=None,
     meta=None,
     workers=None,
     resume=None,
@@ -197,6 +203,11 @@ def reduce_run(
         ``unpolarized`` where the fluxes leave no doubt.
     raw : path-like, optional
         Folder of raw frames, whose headers are looked into by frame number.
+    dark, flat : path-like, optional
+        FITS files of a dark, which is subtracted from each exposure, and of a flat, by which it is
+        divided, of the shape of an image of a frame; for raw frames. Pixels without a value in
+        them, or where the flat is not above zero, are not used. Where each camera writes a file of
+        its own, that of the right beam is named, and that of the left one stands beside it.
     meta : dict, optional
         More for the table's meta, such as ``{"yjh50_dichroic": "in"}``.
     workers : int, optional
@@ -257,8 +268,12 @@ def reduce_run(
     stated_date(meta or {}, "reduced")
     n_files = len(files)
     files, layout, lost = sort_beams(files, instrument.files)
+    masters = Masters(*(None if path is None else str(path) for path in (dark, flat)))
+    # a dark that does not fit is no fault of the frames
+    masters.check(layout)
     task = {
         "layout": layout,
+        "masters": None if masters == Masters() else masters,
         "source": photometry,
         "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
@@ -267,7 +282,8 @@ def reduce_run(
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    reduction = Reduction(instrument, photometry, problems=lost, options=options)
+    known = {"options": options, "masters": task["masters"]}
+    reduction = Reduction(instrument, photometry, problems=lost, **known)
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
@@ -352,7 +368,7 @@ def _hint(task, reduction):
 
 def _measure_all(files, task, workers, resume, progress):
     """Return the frames of all files in their order, from the journal or measured now."""
-    settings = {name: repr(task[name]) for name in ("layout", "source", "options")}
+    settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
     settings |= {"raw": task["raw"] is not None, "checked": False}
     journal = Journal(resume, settings)

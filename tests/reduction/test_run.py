@@ -15,7 +15,12 @@ from astropy.time import Time
 from reduction_lab import Small, expose, pair, reduce_frame_or_die, star_image, write_cube
 
 from astropolcal import instruments
-from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.observations import Observations, pointing
 from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
 from astropolcal.reduction.cubes import simulate_cubes
@@ -281,6 +286,39 @@ def test_headers_say_which_optics_are_in_the_beam(tmp_path, small):
         assert reduce_run(paths, told, source="star").meta["dichroic_x"] == word
     given = reduce_run(paths, told, source="star", meta={"dichroic_x": "in"})
     assert given.meta["dichroic_x"] == "in"
+
+
+def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
+    rng = np.random.default_rng(5)
+    clean, raw = tmp_path / "clean", tmp_path / "raw"
+    dark = rng.uniform(20, 60, (201, 201))
+    flat = rng.uniform(0.5, 1.5, (201, 201))
+    paths = []
+    for folder in (clean, raw):
+        folder.mkdir()
+        paths.append(flat_frames(folder))
+    for path in paths[1]:
+        with fits.open(path, mode="update") as hdus:
+            hdus[1].data = (hdus[1].data * flat + dark).astype("f4")
+    # a bad pixel of each in a rectangle
+    (rows, columns, _), _ = rectangles(LAYOUT.internal_apertures, (201, 201))
+    bad = rows.start + 9, columns.start + 9
+    dark[bad], flat[bad[0] + 3, bad[1]] = np.nan, 0.0
+    for name, image in (("dark", dark), ("flat", 3 * flat)):
+        fits.writeto(tmp_path / f"{name}.fits", image)
+    masters = {name: tmp_path / f"{name}.fits" for name in ("dark", "flat")}
+    wanted = reduce_run(paths[0], small).observations
+    found = reduce_run(paths[1], small, **masters).observations
+    # up to the median of the flat
+    ratio = found.flux_right / wanted.flux_right
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=2e-3)
+    np.testing.assert_allclose(np.median(ratio), np.median(flat), rtol=5e-3)
+    spoilt = reduce_run(paths[1], small).observations
+    assert abs(spoilt.flux_right / wanted.flux_right - 1).max() > 0.05
+    fits.writeto(tmp_path / "other.fits", np.ones((20, 20)))
+    for path, words in (("other.fits", r"\(20, 20\); .* is needed"), ("none.fits", "no such file")):
+        with pytest.raises(AstropolcalError, match=words):
+            reduce_run(paths[1], small, dark=tmp_path / path)
 
 
 def test_nothing_usable_is_an_error_that_says_why(tmp_path, small):
