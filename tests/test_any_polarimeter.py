@@ -390,7 +390,7 @@ def test_beams_in_columns_are_frames_of_one_group():
         Observations.from_table(wide)
 
 
-# --- few frames, and none with noise ----------------------------------------------------------------
+# --- few frames, and none with noise -------------------------------------------------------------
 
 
 def roman_star(n, **options):

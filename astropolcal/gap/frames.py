@@ -61,8 +61,8 @@ class FrameFault:
     #: The frame's number in the table.
     frame: int
     #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"brightness"``
-    #: of a single beam, ``"unknown"`` where none of these, or more than one, describes it, or ``"lamp"`` where only the brightness is off its
-    #: drift, which does not harm the differences.
+    #: of a single beam, ``"unknown"`` where none of these, or more than one, describes it, or
+    #: ``"lamp"`` where only the brightness is off its drift, which does not harm the differences.
     what: str
     #: Number of the frame with which it was exchanged.
     with_: int | None = None

@@ -171,19 +171,8 @@ class CHARIS(Instrument):
         m3 : {"free", "power law", "metal"}
             Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
             permittivity, or silver with a film.
-        star : str
-            Name of the source optic in a star's chain.
-        target : str, optional
-            Name of the star, for what the catalogue of standards knows of it.
 
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If a choice is unknown.
+        Others, and what is returned and raised, are as in `Instrument.chain`.
 
         Examples
         --------

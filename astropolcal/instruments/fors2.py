@@ -21,8 +21,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 from astropolcal.instruments.telescope import PARANAL
 
@@ -37,12 +35,6 @@ class FORS2(Polarimeter):
     ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
     and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
     hides.
-
-    References
-    ----------
-    Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581.
-    Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545.
-    Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379.
 
     Examples
     --------
@@ -61,16 +53,14 @@ class FORS2(Polarimeter):
         "parallactic": "ESO ADA POSANG",
         "altitude": "ESO TEL ALT",
     }
-    headers = header_map(keywords)
     references = (
         "Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581",
         "Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545",
         "Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379",
     )
     entrance = "collimator"
-    site = PARANAL
-    #: The plate stays where it is put: it turns with the instrument.
-    sky_law = SkyLaw(plate=(0, 0), derotator={})
+    # M1 and M2 do not polarize on the axis
+    site, focus = PARANAL, "cassegrain"
 
     def inner(self, source, optics_in, grid):
         """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
@@ -79,7 +69,3 @@ class FORS2(Polarimeter):
         collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
         plate = turning_retarder("hwp", 178, grid, most=15, theta=zero * u.deg)
         return [collimator, plate, wollaston(grid)]
-
-    def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the turning of the sky; M1 and M2 do not polarize on the axis."""
-        return [optics.Rotator(mount="parallactic", name="parallactic")]

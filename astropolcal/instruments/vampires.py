@@ -328,19 +328,8 @@ class VAMPIRES(Instrument):
         plate : {"free", "two-layer"}
             Half-wave plate with a retardance of its own in each band, or with the law of its two
             layers, whose thicknesses are free.
-        star : str
-            Name of the source optic in a star's chain.
-        target : str, optional
-            Name of the star, for what the catalogue of standards knows of it.
 
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If a choice is unknown.
+        Others, and what is returned and raised, are as in `Instrument.chain`.
 
         Examples
         --------

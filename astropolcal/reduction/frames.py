@@ -73,8 +73,8 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
     """
     Read a cube and measure both beams; everything that is wrong with the file is in ``errors``.
 
-    ``raw`` are raw frames by number, ``masters`` their dark and flat; options are those of `measure_internal` or `measure_stars`,
-    and a wrong one raises.
+    ``raw`` are raw frames by number, ``masters`` their dark and flat; options are those of
+    `measure_internal` or `measure_stars`, and a wrong one raises.
     """
     frame = Frame(str(path))
     try:

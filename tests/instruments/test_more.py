@@ -169,7 +169,9 @@ def test_gpi_measures_the_published_polarization_of_an_unpolarized_star():
     chain["hwp"].retardance = np.full(5, 180) * u.deg
     for plate, expected in (([0, 45], -0.037), ([22.5, 67.5], 0.4338)):
         for parallactic in (0, 30):
-            positions = {"hwp": plate * u.deg, "parallactic": [parallactic] * 2 * u.deg}
+            # the plate counts from 29.14 deg
+            stood = np.subtract(plate, 29.14) * u.deg
+            positions = {"hwp": stood, "parallactic": [parallactic] * 2 * u.deg}
             x = differences(chain, positions, gpi.wavelength, [1, 0, 0, 0])
             seen = 50 * (x[:, 0] - x[:, 1]) / chain["wollaston"].efficiency.value
             np.testing.assert_allclose(seen, expected, atol=1e-4)
