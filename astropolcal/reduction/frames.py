@@ -189,8 +189,8 @@ def _check_header(frame, layout, source):
     frame.errors += [foreign] if foreign else []
     frame.errors += [
         f"no keyword {keywords[column]} in its header"
-        for column in ("hwp", "derotator")
-        if column not in values and not frame.errors
+        for column in layout.stages
+        if column in keywords and column not in values and not frame.errors
     ]
     with suppress(ObservationError):
         time = observation_time(values)

@@ -32,6 +32,8 @@ from astropolcal.reduction.tables import photometry_table, reduced_table, write_
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
+# stages whose angles have sequences that are known
+_HALF_WAVE = {"hwp", "derotator"}
 # below this number of files a process, its start costs more than it saves
 _FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
@@ -287,8 +289,9 @@ def reduce_run(
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
-    frames = consistent(frames, reduction, layout, hwp_sequence is None)
-    if photometry == "internal" and not keep_repeats:
+    check = hwp_sequence is None and _HALF_WAVE <= {*layout.stages}
+    frames = consistent(frames, reduction, layout, check)
+    if photometry == "internal" and not keep_repeats and _HALF_WAVE <= {*layout.stages}:
         frames = without_repeats(frames, reduction)
     if not frames:
         raise ObservationError(_nothing(n_files, reduction.problems) + _hint(task, reduction))
@@ -481,7 +484,7 @@ def _meta(frames, instrument, source, given):
         meta["pairing"] = "flc_state"
     if source != "internal":
         meta["source"] = source
-    elif "source" not in given and (seen := _seen_source(frames)):
+    elif "source" not in given and (seen := _seen_source(frames, instrument.files)):
         meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
@@ -496,8 +499,10 @@ def _optics(values, layout):
     return found
 
 
-def _seen_source(frames):
+def _seen_source(frames, layout):
     """Return whether an internal source is polarized, as far as its fluxes leave no doubt."""
+    if not layout.two_beams or "hwp" not in layout.stages:
+        return None
     angles = {round(frame.values["hwp"], 1) for frame in frames}
     if len(angles) < 4:
         return None
@@ -538,7 +543,9 @@ def set_aside(frames, reduction):
     kept = _kept(frames, reduction, why)
     # before the rest: fluxes in other units cannot be compared at all
     kept = _of_one_kind(kept, "unit", lambda frame: frame.unit, reduction)
-    for name in _KINDS[reduction.source]:
+    # the state of a stage differs from frame to frame
+    stages = reduction.instrument.files.stages if reduction.instrument else ()
+    for name in (name for name in _KINDS[reduction.source] if name not in stages):
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
     # what has no number comes last, by time
     time = {frame.path: frame.values.get("mjd", np.inf) for frame in kept}

@@ -21,7 +21,9 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
+from astropolcal.instruments.layout import FileLayout
 from astropolcal.observations import Observations, pointing
+from astropolcal.plotting.reduction import save_quicklook
 from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.reduction.frames import Frame, reduce_frame
@@ -504,3 +506,70 @@ def test_pypolcal_agrees_with_the_table_made_of_it(tmp_path, shared_data):
     ours = read_pypolcal(tmp_path, {"source": "polarized"})
     np.testing.assert_allclose(ours.flux_right, theirs.flux_right[:, :2], rtol=1e-9)
     np.testing.assert_array_equal(ours.pairs(), theirs.pairs())
+
+
+# --- one beam, and more than two ------------------------------------------------------------------
+
+
+def beams_of(layout, places, states=(), **settings):
+    """Return an instrument whose images hold a star or a lamp at some places, one for each beam."""
+    keywords = {"angle": "ROTOR", "exposure_time": "EXPTIME", "mjd": "MJD", "object": "OBJECT"}
+    keywords |= {name: name.upper() for name in states}
+    own = FileLayout(
+        keywords,
+        (1, 201, 201),
+        beams=layout,
+        stages=("angle", *states),
+        texts=states,
+        star_offsets=places,
+        units={"mjd": "d"},
+        gain=2.0,
+        read_noise=10.0,
+        **settings,
+    )
+
+    class Other(Small):
+        name, aliases, wavelength, files = "other", (), [0.6] * u.um, own
+
+    return Other()
+
+
+def test_one_beam_and_four_beams_are_measured_as_two_are(tmp_path):
+    cases = {
+        ("only",): [(100.0, 90.0)],
+        ("i0", "i45", "i90", "i135"): [(50.0, 50.0), (150.0, 55.0), (50.0, 150.0), (150.0, 155.0)],
+    }
+    for number, (names, places) in enumerate(cases.items()):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        star = beams_of(names, tuple(places), ("wheel",))
+        lamp = beams_of(names, (), internal_apertures=(*places, 20.0, 20.0, 0.0))
+        shares, files = 1 + 0.3 * np.arange(len(names)), []
+        for i, angle in enumerate((0.0, 30.0, 60.0)):
+            image = star_image([(x, y, f) for (x, y), f in zip(places, shares, strict=True)])
+            more = {"ROTOR": angle, "WHEEL": "POL60", "MJD": 61000.0 + i}
+            header = fits.Header(more | {"EXPTIME": 1.0, "OBJECT": "HD 1"})
+            files.append(folder / f"frame{i}.fits")
+            data = expose(image, star.files, seed=i, n_wavelengths=1)
+            fits.HDUList([fits.PrimaryHDU(header=header), fits.ImageHDU(data)]).writeto(files[-1])
+        table = reduce_run(files, star, source="star").table
+        columns = ["flux"] if len(names) == 1 else [f"flux_{name}" for name in names]
+        assert table["angle"].tolist() == [0, 30, 60]
+        assert table["wheel"].tolist() == ["POL60"] * 3
+        for column, share in zip(columns, shares, strict=True):
+            pulls = (table[column] - 2e5 * share) / table[f"{column}_err"]
+            assert np.all(np.abs(pulls) < 5), (column, pulls)
+        found = Observations.from_table(table)
+        assert found.single_beam
+        assert found.n_frames == 3 * len(names)
+        rectangles = reduce_run(files, lamp).table
+        ratio = rectangles[columns[-1]] / rectangles[columns[0]]
+        background = 20.0 * 20**2
+        wanted = (2e5 * shares[-1] + background) / (2e5 + background)
+        np.testing.assert_allclose(ratio, wanted, rtol=0.02)
+        with pytest.raises(ParameterError, match="allowed are False and 'growth'"):
+            reduce_run(files, star, source="star", aperture_correction=True)
+        with pytest.raises(ParameterError, match="they are of right and left"):
+            save_quicklook(reduce_run(files, star, source="star"), folder)
+    with pytest.raises(InstrumentError, match="beams = \\('a', 'a'\\)"):
+        beams_of(("a", "a"), ())
