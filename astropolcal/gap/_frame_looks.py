@@ -215,7 +215,7 @@ class Look:
         return fall, channel.valid.sum(axis=0)
 
     def _told(self, i):
-        """Return residual (F, W) of what tells the gap, and what the model takes up, (F, W, W)."""
+        """Return residual (F, W) of what tells the gap, and what the model absorbs, (F, W, W)."""
         residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]
         n, told = channel.shape[1], channel.told

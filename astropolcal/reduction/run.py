@@ -482,9 +482,10 @@ def _meta(frames, instrument, source, given):
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
+    modulated = instrument.files.two_beams and "hwp" in instrument.files.stages
     if source != "internal":
         meta["source"] = source
-    elif "source" not in given and (seen := _seen_source(frames, instrument.files)):
+    elif "source" not in given and modulated and (seen := _seen_source(frames)):
         meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
@@ -499,10 +500,8 @@ def _optics(values, layout):
     return found
 
 
-def _seen_source(frames, layout):
+def _seen_source(frames):
     """Return whether an internal source is polarized, as far as its fluxes leave no doubt."""
-    if not layout.two_beams or "hwp" not in layout.stages:
-        return None
     angles = {round(frame.values["hwp"], 1) for frame in frames}
     if len(angles) < 4:
         return None
