@@ -33,7 +33,7 @@ examples:
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
   astropolcal calibrate t1.ecsv t2.ecsv --own hwp.theta
-  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time:2026-03-01"
+  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time"
   astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
   astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
   astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
