@@ -16,7 +16,6 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.charis import BOUNDS, derotator_start
 from astropolcal.instruments.layout import header_map
 from astropolcal.observations.pointings import location_of
 
@@ -119,14 +118,13 @@ class SubaruPolarimeter(Polarimeter):
     def inner(self, source, optics_in, grid):
         """Return the half-wave plate, the derotator and the camera."""
         plate = shared.two_layer_plate(**shared.misaligned(0))
-        turning = shared.derotator("elliptical", derotator_start(grid), BOUNDS["physical"])
-        return [plate, turning, *self.camera(optics_in, grid)]
+        return [plate, shared.published_derotator(grid), *self.camera(optics_in, grid)]
 
     def camera(self, optics_in, grid):
         """Return the optics downstream of the derotator, here a Wollaston prism."""
         return [optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston")]
 
-    def telescope_optics(self, behind=(), *, wavelength=None):
+    def telescope_optics(self, behind=(), **options):
         """Return the telescope with the tertiary mirror that is published."""
         return shared.telescope(shared.published_mirror())
 
