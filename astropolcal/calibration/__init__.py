@@ -2,6 +2,7 @@
 """Calibration: fit, identifiability, errors, accuracy, result and posterior of an instrument."""
 
 from astropolcal.calibration.fit.calibrate import calibrate
+from astropolcal.calibration.fit.runs import calibrate_runs
 from astropolcal.calibration.identifiability.analysis import examine
 from astropolcal.calibration.posterior.sampler import sample
 from astropolcal.calibration.result.calibration import Calibration
@@ -18,6 +19,7 @@ __all__ = [
     "add_standard",
     "bootstrap",
     "calibrate",
+    "calibrate_runs",
     "compare",
     "examine",
     "fitted_stars",

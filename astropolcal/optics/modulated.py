@@ -43,6 +43,8 @@ __all__ = [
 ]
 
 _IDENTITY = np.eye(4)
+# share of a frame that is light of the source at the least
+_LEAST_OF_SOURCE = 0.01
 
 
 class FrameOptic(Optic):
@@ -490,10 +492,10 @@ class StrayLight(_Referenced):
     r"""
     Unpolarized light that is added upstream of the beam splitter, regardless of the source.
 
-    :math:`I' = I\,(1 + b F_0/F)` with F the sum of both beams in the table
-    (``mount="total_flux"``), so that a constant flux :math:`b F_0` is added to
-    each frame: background, stray light, ghosts (Patat & Romaniello 2006,
-    doi:10.1086/497581). Where F = 0 nothing is added.
+    :math:`I' = I / (1 - b F_0/F)` with F the sum of both beams in the table
+    (``mount="total_flux"``), which contains the added light: a constant flux :math:`b F_0` is
+    part of each frame, such as background, stray light, ghosts (Patat & Romaniello 2006,
+    doi:10.1086/497581). It is 99 % of a frame at most. Where F = 0 nothing is added.
 
     Parameters
     ----------
@@ -508,26 +510,33 @@ class StrayLight(_Referenced):
     --------
     >>> from astropolcal.optics import StrayLight
     >>> ghost = StrayLight(amount=0.01, reference=1e6, mount="total_flux", name="ghost")
-    >>> float(ghost.mueller(position=5e5)[0, 0])
-    1.02
+    >>> float(ghost.mueller(position=5e5)[0, 0].round(4))
+    1.0204
     """
 
     amount = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added flux over the reference")
 
-    def _share(self, coordinate):
+    def _share(self, coordinate, amount):
+        """Return the reference flux over that of the source, and its derivative to the amount."""
         flux = np.asarray(coordinate, dtype=float)
-        return np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
+        share = np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
+        source = 1 - amount * share
+        # the frame has some light of the source
+        left = np.maximum(source, _LEAST_OF_SOURCE)
+        share = share / left
+        return share, np.where(source > _LEAST_OF_SOURCE, share**2, 0.0)
 
     def _matrix(self, coordinate, amount):
         out = blank(coordinate, amount)
         out[...] = _IDENTITY
         # added light has no polarization: only I to I grows
-        out[..., 0, 0] += amount * self._share(coordinate)
+        out[..., 0, 0] += amount * self._share(coordinate, amount)[0]
         return out
 
     def _derivatives(self, coordinate, amount):
         out = blank(coordinate, amount)
-        out[..., 0, 0] = self._share(coordinate)
+        share, slope = self._share(coordinate, amount)
+        out[..., 0, 0] = share + amount * slope
         return (out,)
 
 
@@ -535,12 +544,12 @@ class PolarizedBackground(StrayLight):
     r"""
     Polarized light that is added to that of the source, regardless of the source.
 
-    .. math:: I' = I\,(1 + b F_0/F),\quad Q' = Q + q F_0/F\,I,\quad U' = U + u F_0/F\,I
+    .. math:: I' = I\,(1 + b s),\quad Q' = Q + q s\,I,\quad U' = U + u s\,I
 
-    with F the sum of both beams in the table (``mount="total_flux"``), so that
-    the same Stokes vector :math:`(b, q, u) F_0` is added to each frame: moonlight,
-    twilight or a zodiacal background (Patat & Romaniello 2006,
-    doi:10.1086/497581). Where F = 0 nothing is added.
+    with :math:`s = F_0 / (F - b F_0)` and F the sum of both beams in the table
+    (``mount="total_flux"``), which contains the added light: the same Stokes vector
+    :math:`(b, q, u) F_0` is part of each frame: moonlight, twilight or a zodiacal background
+    (Patat & Romaniello 2006, doi:10.1086/497581). Where F = 0 nothing is added.
 
     Parameters
     ----------
@@ -569,15 +578,17 @@ class PolarizedBackground(StrayLight):
     def _matrix(self, coordinate, amount, q, u):
         out = blank(coordinate, amount, q, u)
         out[...] = _IDENTITY
+        share, _ = self._share(coordinate, amount)
         for row, value in enumerate((amount, q, u)):
             # the light is added whatever the polarization of the source: the first column only
-            out[..., row, 0] += value * self._share(coordinate)
+            out[..., row, 0] += value * share
         return out
 
     def _derivatives(self, coordinate, amount, q, u):
-        slopes = []
-        for row in range(3):
-            out = blank(coordinate, amount, q, u)
-            out[..., row, 0] = self._share(coordinate)
-            slopes.append(out)
+        slopes = [blank(coordinate, amount, q, u) for _ in range(3)]
+        share, slope = self._share(coordinate, amount)
+        for row, value in enumerate((amount, q, u)):
+            slopes[row][..., row, 0] += share
+            # the more is added, the less is the source
+            slopes[0][..., row, 0] += value * slope
         return tuple(slopes)

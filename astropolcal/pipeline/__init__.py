@@ -6,6 +6,7 @@ from astropolcal.pipeline.history import Change, changes, parameter_history, res
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
 from astropolcal.pipeline.monitoring import health, write_health
+from astropolcal.pipeline.store import fetch, import_context
 from astropolcal.pipeline.timeline import courses
 
 __all__ = [
@@ -16,7 +17,9 @@ __all__ = [
     "SystemMueller",
     "changes",
     "courses",
+    "fetch",
     "health",
+    "import_context",
     "load",
     "mueller_table",
     "parameter_history",

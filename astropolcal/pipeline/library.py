@@ -19,6 +19,7 @@ import re
 import stat
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
 from itertools import islice
@@ -42,16 +43,18 @@ from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
 from astropolcal.exceptions import CalibrationFileError, InstrumentError
 from astropolcal.files import atomic_path, check_kind, one_line
+from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
 
 __all__ = ["Entry", "Library"]
 
-_LOCK, _INDEX, _INDEX_VERSION = ".lock", ".astropolcal-index.json", 1
+_LOCK, _INDEX, _INDEX_VERSION = ".lock", ".astropolcal-index.json", 2
 # of the index for each file of the folder; 500 are usual
 _MOST_BYTES = 16_384
 # nanoseconds; a younger file may change once more within the same tick of its file system's clock
 _SETTLED = 2_000_000_000
 _LONGEST_NAME, _LONGEST_SLUG, _MOST_SHOWN = 255, 60, 4
+_CHOSEN = "chosen: the newest that holds"
 # what the index keeps of how good a calibration is
 _QUALITY = {"datasets": str, "s_res": float | None, "s_cv": float | None, "converged": bool}
 
@@ -70,6 +73,8 @@ class Entry:
         For what it holds.
     content_hash : str
         SHA-256 of all that the file keeps.
+    supersedes : sequence of str
+        The ``content_hash`` of those that it replaces.
 
     Examples
     --------
@@ -79,8 +84,9 @@ class Entry:
     'lab'
     """
 
-    def __init__(self, path, calibration, validity, content_hash):
+    def __init__(self, path, calibration, validity, content_hash, supersedes=()):
         self.path, self.validity, self.content_hash = path, validity, content_hash
+        self.supersedes = tuple(supersedes)
         self._calibration, self._quality = calibration, None
 
     def __repr__(self):
@@ -105,6 +111,7 @@ class Entry:
         except OSError as error:
             raise CalibrationFileError(f"{path}: {error.strerror}") from error
         told = {"validity": self.validity.to_dict(), "content_hash": self.content_hash}
+        told["supersedes"] = list(self.supersedes)
         if told != {key: record[key] for key in told}:
             raise CalibrationFileError(
                 f"{path}: holds something else than when the library was read; read the library "
@@ -121,6 +128,8 @@ class Library:
     ----------
     source : path-like or sequence of path-like
         A folder, whose ``*.asdf`` count, or files.
+    context : str, optional
+        Name of a context of the folder, see `freeze`: its files only, as they were.
 
     Attributes
     ----------
@@ -137,7 +146,7 @@ class Library:
     Raises
     ------
     CalibrationFileError
-        If there is no such folder or file.
+        If there is no such folder, file or context, or a file of the context is missing or altered.
 
     Examples
     --------
@@ -148,9 +157,14 @@ class Library:
     0
     """
 
-    def __init__(self, source):
+    def __init__(self, source, context=None):
         one = isinstance(source, (str, Path)) or hasattr(source, "__fspath__")
         self.source = Path(source) if one else None
+        if context is not None:
+            if not one or not self.source.is_dir():
+                raise CalibrationFileError(f"context {context}: only a folder has contexts")
+            source, one = frozen(self.source, context), False
+        self.context = context
         self._files = [self.source] if one else [Path(path) for path in source]
         for path in self._files:
             # os.path answers where pathlib raises: the name may be one that no system takes
@@ -161,7 +175,8 @@ class Library:
 
     @property
     def _folder(self):
-        return self.source if self.source is not None and self.source.is_dir() else None
+        whole = self.source is not None and self.context is None
+        return self.source if whole and self.source.is_dir() else None
 
     def _scan(self, believe=True):
         """Look through the files; those that the index knows are not read."""
@@ -206,7 +221,13 @@ class Library:
 
     @property
     def _label(self):
-        return "of files" if self.source is None else str(self.source)
+        inside = f", context {self.context}" if self.context else ""
+        return "of files" if self.source is None else f"{self.source}{inside}"
+
+    def _in_force(self):
+        """Return the entries that no other one supersedes."""
+        gone = {digest for entry in self.entries for digest in entry.supersedes}
+        return [entry for entry in self.entries if entry.content_hash not in gone]
 
     def find(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
         """
@@ -245,7 +266,7 @@ class Library:
             raise CalibrationFileError(
                 f"{path}: {reason}; as it might be the one that is needed, remove or repair it"
             )
-        found, date = _of_instrument(self.entries, instrument), wanted["date"]
+        found, date = _of_instrument(self._in_force(), instrument), wanted["date"]
         # once, as it takes longer than to compare
         moment = _moment(date, "date")
         words = f"no calibration of {instrument}" if instrument else "no calibration"
@@ -303,7 +324,120 @@ class Library:
                 raise CalibrationFileError(_overlap(other, newest))
         return newest
 
-    def add(self, calibration, name=None, **stated):
+    def explain(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
+        """
+        Return which calibration `find` chooses, and why none of the others.
+
+        Parameters
+        ----------
+        instrument, mode, date, optics_in, beam
+            As for `find`.
+
+        Returns
+        -------
+        `~astropy.table.Table`
+            One row per file, the chosen one first: ``name``, ``holds`` (for what), ``why`` it is
+            chosen or not. Where `find` raises, its words are in ``meta["problem"]``.
+        """
+        wanted = {"mode": mode, "optics_in": optics_in, "beam": beam or None, "date": date}
+        problem, chosen = "", None
+        try:
+            chosen = self._confirmed(lambda: self._choice(instrument, wanted))
+        except CalibrationFileError as error:
+            problem = str(error)
+        rows = [
+            (entry.name, str(entry.validity), self._why(entry, chosen, instrument, wanted))
+            for entry in self.entries
+        ]
+        rows += [(path.name, "", f"unreadable: {why}") for path, why in self.problems.items()]
+        rows.sort(key=lambda row: row[2] != _CHOSEN)
+        table = Table(rows=rows or None, names=("name", "holds", "why"), dtype=(str, str, str))
+        table.meta["problem"] = problem
+        return table
+
+    def _why(self, entry, chosen, instrument, wanted):
+        """Return why a calibration is chosen or not, the first reason in the order of `find`."""
+        if entry is chosen:
+            return _CHOSEN
+        held, moment = entry.validity, _moment(wanted["date"], "date")
+        for other in self.entries:
+            if entry.content_hash in other.supersedes:
+                return f"superseded by {other.name}"
+        if not _of_instrument([entry], instrument):
+            return f"of {held.instrument or 'an unknown instrument'}"
+        for key in ("mode", "optics_in", "beam"):
+            if wanted[key] is not None and not _fits(held, key, wanted[key]):
+                return f"of mode {held.mode}" if key == "mode" else optics_words(held.optics_in)
+        if moment is not None and not held.holds(moment):
+            begins = held.valid_from is not None and moment < held.valid_from
+            return f"begins {held.valid_from}" if begins else f"ended {held.valid_until}"
+        if chosen is None:
+            return "holds, but the choice is open"
+        if entry.content_hash == chosen.content_hash:
+            return f"a copy of {chosen.name}"
+        return f"replaced by {chosen.name}"
+
+    def freeze(self, name):
+        """
+        Keep what the folder holds now as a context, which stays as it is.
+
+        Parameters
+        ----------
+        name : str
+            Of the context: letters, digits, and . _ -
+
+        Returns
+        -------
+        `~pathlib.Path`
+            The file of the context, beside the calibrations.
+
+        Raises
+        ------
+        CalibrationFileError
+            If the library is not a folder, holds nothing or something unreadable, or there is such
+            a context.
+        """
+        if self._folder is None:
+            raise CalibrationFileError(f"{self._label}: only a folder can be frozen")
+        with _locked(self.source):
+            self._scan()
+            if self.problems:
+                path, reason = next(iter(self.problems.items()))
+                raise CalibrationFileError(f"{path}: {reason}; remove or repair it")
+            files = (path for path, _ in _files_of(self.source))
+            return freeze(self.source, name, list(files))
+
+    @property
+    def contexts(self):
+        """Names of the contexts of the folder."""
+        return [] if self.source is None else contexts(self.source)
+
+    def export(self, context, path):
+        """
+        Write a context and its calibrations as one archive, for `import_context`.
+
+        Parameters
+        ----------
+        context : str
+            Its name.
+        path : path-like
+            A new file, with suffix ``.zip``.
+
+        Returns
+        -------
+        `~pathlib.Path`
+            The file.
+
+        Raises
+        ------
+        CalibrationFileError
+            If there is no such context, a file of it is missing or altered, or the archive exists.
+        """
+        if self.source is None:
+            raise CalibrationFileError(f"{self._label}: only a folder has contexts")
+        return export(self.source, context, path)
+
+    def add(self, calibration, name=None, *, supersedes=(), **stated):
         """
         Write a calibration into the folder, under a name of its own.
 
@@ -314,6 +448,9 @@ class Library:
         name : str, optional
             Name of the file, with suffix ``.asdf``; by default it is made of instrument, mode,
             start and hash.
+        supersedes : sequence of str
+            Names of files that it replaces from now on, for all dates. They stay in the folder,
+            and in the contexts that have them.
         **stated
             As for ``with_validity``.
 
@@ -331,17 +468,19 @@ class Library:
         if self._folder is None:
             raise CalibrationFileError(f"{self._label}: only a folder can be added to")
         calibration = with_validity(calibration, **stated)
-        held, digest = validity_of(calibration), content_hash(calibration)
-        path = self.source / (_name(held, digest) if name is None else _checked_name(name))
-        new = Entry(path, calibration, held, digest)
         with _locked(self.source):
             self._scan()
+            calibration, gone = self._superseding(calibration, supersedes)
+            held, digest = validity_of(calibration), content_hash(calibration)
+            path = self.source / (_name(held, digest) if name is None else _checked_name(name))
+            new = Entry(path, calibration, held, digest, gone)
             same = self._confirmed(
                 lambda: next((e for e in self.entries if e.content_hash == digest), None)
             )
             if same is not None:
                 return self.source / same.name
-            for pair in (sorted([entry, new], key=_order) for entry in self.entries):
+            others = [entry for entry in self._in_force() if entry.content_hash not in gone]
+            for pair in (sorted([entry, new], key=_order) for entry in others):
                 # of which some frame could choose neither
                 if _differ(*pair) and _meet(*pair):
                     raise CalibrationFileError(_overlap(*pair))
@@ -350,9 +489,23 @@ class Library:
             self._scan()
         return path
 
+    def _superseding(self, calibration, names):
+        """Return a calibration that says which ones it supersedes, and these."""
+        if not names:
+            return calibration, supersedes_of(calibration)
+        known = {entry.name: entry.content_hash for entry in self.entries}
+        for name in [names] if isinstance(names, str) else names:
+            if name not in known:
+                raise CalibrationFileError(
+                    f"supersedes: no {one_line(repr(name))} in {self._label}", argument="supersedes"
+                )
+        gone = sorted({known[name] for name in ([names] if isinstance(names, str) else names)})
+        settings = calibration.settings | {"supersedes": gone}
+        return replace(calibration, settings=settings), tuple(gone)
+
     def overlaps(self):
         """Return a sentence for each pair of different files that claim the same moment."""
-        found, entries = [], sorted(self.entries, key=_order)
+        found, entries = [], sorted(self._in_force(), key=_order)
         for i, first in enumerate(entries):
             name = first.validity.instrument
             for second in islice(entries, i + 1, None):
@@ -525,8 +678,17 @@ def _read(path, state):
         "state": list(state),
         "validity": validity_of(calibration).to_dict(),
         "content_hash": content_hash(calibration),
+        "supersedes": list(supersedes_of(calibration)),
         "quality": _quality(calibration),
     }
+
+
+def supersedes_of(calibration):
+    """Return the hashes of those that a calibration supersedes."""
+    gone = calibration.settings.get("supersedes") or ()
+    if isinstance(gone, str) or not all(isinstance(digest, str) for digest in gone):
+        raise CalibrationFileError(f"supersedes = {gone!r}; hashes of calibrations are needed")
+    return tuple(gone)
 
 
 def _quality(calibration):
@@ -562,11 +724,13 @@ def _entry(path, record, state):
         quality, held = record["quality"], Validity(**record["validity"])
         sound = [isinstance(quality[key], kind) for key, kind in _QUALITY.items()]
         sound += [isinstance(held.instrument, str | None), isinstance(record["content_hash"], str)]
+        gone = record["supersedes"]
+        sound += [isinstance(gone, list), all(isinstance(digest, str) for digest in gone)]
         if record["state"] != list(state) or not all(sound):
             return None
     except (LookupError, TypeError, CalibrationFileError):
         return None
-    entry = Entry(path, None, held, record["content_hash"])
+    entry = Entry(path, None, held, record["content_hash"], gone)
     entry._quality = quality
     return entry
 

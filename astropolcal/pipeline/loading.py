@@ -199,19 +199,9 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     ((22, 4, 4), (22, 16, 16))
     """
     library = _library(path)
-    header = primary_header(header) if isinstance(header, str | PathLike) else header
-    if header is not None and not hasattr(header, "get"):
-        raise ParameterError(
-            f"header = {header!r} is of type {type(header).__name__}; a FITS header or a mapping "
-            "is needed, such as astropy.io.fits.getheader(file)"
-        )
-    told = {} if header is None else describe(header, instrument)
+    wanted = wanted_of(header, instrument, mode=mode, date=date, optics_in=optics_in)
     chosen = {"instrument": instrument, "mode": mode, "date": date}
-    wanted = {key: told.get(key) if value is None else value for key, value in chosen.items()}
-    beam = None
-    if header is not None and optics_in is None:
-        beam = instruments.get(wanted["instrument"]).optics_of(header)
-    entry = library.find(**wanted, optics_in=optics_in, beam=beam)
+    entry = library.find(**wanted)
     stated = {key: value for key, value in chosen.items() if value is not None}
     loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)
     if header is not None:
@@ -220,6 +210,23 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     elif date is not None:
         loaded._check(loaded._stated_frame(), light="internal")
     return loaded
+
+
+def wanted_of(header, instrument=None, *, mode=None, date=None, optics_in=None):
+    """Return what `Library.find` needs for a frame; what is stated comes before its header."""
+    header = primary_header(header) if isinstance(header, str | PathLike) else header
+    if header is not None and not hasattr(header, "get"):
+        raise ParameterError(
+            f"header = {header!r} is of type {type(header).__name__}; a FITS header or a mapping "
+            "is needed, such as astropy.io.fits.getheader(file)"
+        )
+    told = {} if header is None else describe(header, instrument)
+    stated = {"instrument": instrument, "mode": mode, "date": date}
+    wanted = {key: told.get(key) if value is None else value for key, value in stated.items()}
+    beam = None
+    if header is not None and optics_in is None:
+        beam = instruments.get(wanted["instrument"]).optics_of(header)
+    return wanted | {"optics_in": optics_in, "beam": beam}
 
 
 def _headers(header):

@@ -7,12 +7,13 @@ import astropy.units as u
 import numpy as np
 from astropy.time import Time
 
+from astropolcal.calibration.fit.evidence import COURSES, moment_of
 from astropolcal.calibration.result.validity import instrument_of
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
 from astropolcal.pipeline.library import Library
-from astropolcal.pipeline.timeline import COURSES, courses, moment_of
+from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
 
 __all__ = ["health", "write_health"]

@@ -17,21 +17,23 @@ import numpy as np
 from astropy.table import Table
 from astropy.time import Time
 
+from astropolcal.calibration.fit.evidence import (
+    COURSES,
+    LAWS,
+    SIZES,
+    chances_of,
+    law_of,
+    log_evidence,
+)
 from astropolcal.exceptions import ParameterError
 from astropolcal.pipeline.history import compared, named_by_date, optics_of
 
 __all__ = ["courses"]
 
-#: What the values of an optic may do.
-COURSES = ("constant", "steps", "drift", "walk", "scatter")
 # prior of a partition into stretches, of which most are one; the others share the rest
 _PARTITION = 0.7
-# a change between two runs is thought this probable beforehand, and where an event is known
-_CHANGE, _EVENT = 0.05, 0.5
-# sizes of a deviation in standard errors of one run
-_SIZES = (3.0, 10.0, 30.0, 100.0, 1000.0)
-# numbers per parameter of the law in wavelength; None is one per wavelength
-_LAWS = (1, 3, None)
+# a change between two runs is thought this probable beforehand
+_CHANGE = 0.05
 # a direction less certain than this share of the most certain one tells nothing
 _RANK = 1e-12
 
@@ -92,7 +94,7 @@ def courses(calibrations, parameters=None, *, events=()):
     if len(named) < 3:
         raise ParameterError(f"{len(named)} calibrations: at least three are needed for a course")
     dates = _dates(named)
-    priors = _priors(dates, events)
+    priors = chances_of(dates, events, _CHANGE)
     rows = [_course(named, what, dates, priors) for what in parameters or optics_of(named)]
     table = Table(rows=[row for row in rows if row is not None])
     table.meta |= {"calibrations": [name for name, _ in named], "dates": dates.isot.tolist()}
@@ -110,30 +112,6 @@ def _dates(named):
         if first == second:
             raise ParameterError(f"{one} and {other} are both of {first}: neither comes first")
     return Time(told, scale="tai")
-
-
-def moment_of(when, name):
-    """Return a date as a `Time` that no table of leap seconds limits: a decade ahead, too."""
-    try:
-        return Time(getattr(when, "isot", when), scale="tai")
-    except (ValueError, TypeError):
-        raise ParameterError(f"{name} {when!r} is not a date") from None
-
-
-def _priors(dates, events):
-    """Return the prior probability of a change in each gap between two calibrations."""
-    found = np.full(len(dates) - 1, _CHANGE)
-    for event in events:
-        when = moment_of(event, "event")
-        gap = int(np.searchsorted(dates.mjd, when.mjd)) - 1
-        if 0 <= gap < len(found):
-            if found[gap] == _EVENT:
-                raise ParameterError(
-                    f"event {event}: another one lies between {dates[gap].isot[:10]} and "
-                    f"{dates[gap + 1].isot[:10]} too; the data cannot tell them apart"
-                )
-            found[gap] = _EVENT
-    return found
 
 
 def _course(named, what, dates, priors):
@@ -173,8 +151,8 @@ class Series:
         points = np.array([kept.T @ v for v in found.values])
         middle = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
         laws = []
-        for count in _LAWS:
-            law = kept.T @ found.basis @ _law(found.names, count, found.steps)
+        for count in LAWS:
+            law = kept.T @ found.basis @ (law_of(found.names, count) / found.steps[:, None])
             # orthonormal, and without what the kept directions do not know
             left, size, _ = np.linalg.svd(law, full_matrices=False)
             laws.append(left[:, size > 1e-6 * size.max(initial=1e-300)])
@@ -191,12 +169,12 @@ class Series:
             # unit information of one run: the g-prior then is a multiple of unity
             root = np.linalg.inv(np.linalg.cholesky(gram.mean(axis=0)))
             gram, target = root @ gram @ root.T, target @ root.T
-            for size in _SIZES:
+            for size in SIZES:
                 one, change = self._partitions(gram, target, size, priors)
                 line = np.stack([np.ones(len(gram)), self.time], axis=1)
                 drift = _regressed(gram, target, line, size)
                 runs = zip(gram, target, strict=True)
-                scatter = sum(_log_evidence(*run, size) for run in runs)
+                scatter = sum(log_evidence(*run, size) for run in runs)
                 parts.append([*one, drift, self._walk(gram, target, size), scatter])
                 changes.append(change)
         parts, n = np.array(parts), len(parts)
@@ -219,7 +197,7 @@ class Series:
         stretch = np.full((n + 1, n + 1), -np.inf)
         for i in range(n):
             for j in range(i + 1, n + 1):
-                stretch[i, j] = _log_evidence(grams[j] - grams[i], targets[j] - targets[i], size)
+                stretch[i, j] = log_evidence(grams[j] - grams[i], targets[j] - targets[i], size)
         change, stay = np.log(priors), np.log1p(-priors)
         quiet = np.concatenate([[0.0], np.cumsum(stay)])
         # within a stretch no gap changes
@@ -256,29 +234,8 @@ class Series:
         return total
 
 
-def _log_evidence(gram, target, size):
-    """Return the log evidence of a deviation against none, with a prior of unit times the size."""
-    held = gram + np.eye(len(gram)) / size**2
-    fit = np.linalg.solve(held, target)
-    return 0.5 * target @ fit - 0.5 * np.linalg.slogdet(held)[1] - len(gram) * np.log(size)
-
-
 def _regressed(gram, target, waves, size):
     """Return the log evidence of deviations in proportion to functions of the run, (n, m)."""
     k = target.shape[1]
     both = np.einsum("na,nb,nij->aibj", waves, waves, gram).reshape(2 * k, 2 * k)
-    return _log_evidence(both, np.einsum("na,ni->ai", waves, target).ravel(), size)
-
-
-def _law(names, count, steps):
-    """Return the law of a change: one, or a few numbers per parameter, shape (n_names, k)."""
-    stems = np.array([name.partition("[")[0] for name in names])
-    columns = []
-    for stem in dict.fromkeys(stems):
-        own = np.flatnonzero(stems == stem)
-        degree = len(own) if count is None else min(count, len(own))
-        x = np.linspace(-1, 1, len(own)) if len(own) > 1 else np.zeros(1)
-        block = np.zeros((len(names), degree))
-        block[own] = np.polynomial.legendre.legvander(x, degree - 1) / steps[own, None]
-        columns.append(block)
-    return np.concatenate(columns, axis=1)
+    return log_evidence(both, np.einsum("na,ni->ai", waves, target).ravel(), size)

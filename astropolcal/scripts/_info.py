@@ -18,6 +18,8 @@ and for what it is valid. Without a file, what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only
+--frame FITS Input  of a folder: which calibration holds for this frame, and why none of the others
+--context NAME  of a folder: the files of this context only
 @ full
 --json FILE Output  write it for machines (- for stdout)
 @ quiet
@@ -40,6 +42,8 @@ examples:
   astropolcal info                     version, instruments and optics
   astropolcal info cal.asdf --full     all of a calibration's summary
   astropolcal info library/            the calibrations of a folder
+  astropolcal info library/ --frame frame.fits
+                                       which of them holds for a frame, and why
   astropolcal info run.ecsv            frames, wavelengths and angles of a table
 """
 
@@ -55,7 +59,9 @@ def run(arguments):
     if path is None:
         lines, content = _installation()
     elif Path(path).is_dir():
-        lines, content = _library(path)
+        lines, content = _library(path, arguments.context, arguments.frame)
+    elif arguments.frame or arguments.context:
+        raise AstropolcalError(f"{path}: --frame and --context are for a folder of calibrations")
     elif Path(path).suffix.lower() == ".asdf":
         lines, content = _calibration(path, arguments)
     # a FITS file, or one that by its name claims to be one
@@ -118,11 +124,13 @@ def _calibration(path, arguments):
     return [*compact_lines(calibration, found, height), *lines, *last, HINT], content
 
 
-def _library(folder):
+def _library(folder, context, frame):
     """Return what a folder of calibrations holds, one block of lines a file."""
     from astropolcal.pipeline.library import Library
 
-    library = Library(folder)
+    library = Library(folder, context)
+    if frame is not None:
+        return _wrapped(*_choice(library, frame))
     lines, files = [f"{folder}: {counted(len(library), 'calibration')}"], []
     for entry, row in zip(library.entries, library.table(), strict=True):
         good = f"s_res {_percent(row['s_res'])}, s_cv {_percent(row['s_cv'])}"
@@ -150,6 +158,17 @@ def _library(folder):
         lines.append(f"  {what} in it; astropolcal info FILE tells of one")
     content = {"folder": str(folder), "calibrations": files}
     return _wrapped(lines, content | {"unreadable": problems, "overlaps": overlaps})
+
+
+def _choice(library, frame):
+    """Return which calibration of a library holds for a frame, and why none of the others."""
+    from astropolcal.pipeline.loading import wanted_of
+
+    table = library.explain(**wanted_of(frame))
+    lines = [f"{row['name']}: {row['why']}" for row in table]
+    problem = table.meta["problem"]
+    rows = [dict(zip(table.colnames, map(str, row), strict=True)) for row in table]
+    return lines + [f"NONE: {problem}"] * bool(problem), {"calibrations": rows, "problem": problem}
 
 
 def _percent(value):

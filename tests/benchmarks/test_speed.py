@@ -297,3 +297,39 @@ def test_command_on_dataset_3(shared_data, capsys, tmp_path):
     assert result.returncode == 0, result.stderr
     report(capsys, f"astropolcal calibrate: {seconds:.2f} s")
     assert seconds < 4.0
+
+
+_HUNDRED = """
+import resource, sys, time
+import astropy.units as u, numpy as np
+from astropolcal import instruments
+from astropolcal.calibration import calibrate_runs
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+charis = instruments.get("charis")
+chain = charis.chain()
+for name in ("calibration_polarizer", "derotator"):
+    chain[name].theta.fixed = True
+frames = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
+runs = []
+for i in range(100):
+    truth = chain.copy()
+    truth["hwp"].theta = 0.4 * (i > 33) * u.deg
+    meta = {"date": f"{2001 + i // 12}-{i % 12 + 1:02d}-01"}
+    runs.append(simulate(truth, charis.wavelength, frames, seed=i, flux=1e6, meta=meta))
+begin = time.process_time()
+found = calibrate_runs(chain, runs)
+varying = [str(r["what"]) for r in found.courses if r["course"] != "constant"]
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+print(time.process_time() - begin, peak, *varying)
+"""
+
+
+def test_a_hundred_runs_have_one_likelihood(capsys):
+    """100 runs of 64 frames and 22 wavelengths: processor time and memory of a new process."""
+    done = subprocess.run([sys.executable, "-c", _HUNDRED], capture_output=True, text=True)
+    seconds, peak, *varying = done.stdout.split()
+    text = f"a hundred runs: {float(seconds):.0f} s of processor time, {float(peak):.2f} GB"
+    report(capsys, text)
+    assert varying == ["hwp.theta"]
+    assert float(seconds) < 60
+    assert float(peak) < 1

@@ -3,10 +3,12 @@
 
 import dataclasses
 import datetime
+import hashlib
 import json
 import multiprocessing
 import os
 import sys
+import zipfile
 from itertools import combinations, product
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.result.validity import Validity, validity_of, with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.pipeline import fetch, import_context
 from astropolcal.pipeline import library as module
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -654,3 +657,146 @@ def test_newer_version_is_refused_with_clear_words(calibration, tmp_path):
     path.write_bytes(path.read_bytes().replace(b"calibration-1.1.0>", b"calibration-1.2.0>"))
     with refused(r"version 1\.2\.0; this astropolcal reads version 1\.0\.0, 1\.1\.0: .*newer"):
         Calibration.read(path)
+
+
+# ---- why, supersession, contexts -----------------------------------------------------------
+
+
+@pytest.fixture
+def years(calibration, library):
+    """A library of three years, the second of which was made again."""
+    for year in (2025, 2026, 2027):
+        library.add(calibration, f"{year}.asdf", valid_from=f"{year}-01-01")
+    library.add(calibration, "again.asdf", supersedes=["2026.asdf"], valid_from="2026-01-02")
+    return library
+
+
+def test_a_choice_is_explained(calibration, years):
+    years.add(calibration, "other.asdf", valid_from="2025-06-01", mode="K")
+    mode = validity_of(calibration).mode
+    table = years.explain("charis", date="2026-06-01", mode=mode, beam={"nbs": True})
+    why = dict(zip(table["name"], table["why"], strict=True))
+    assert table["name"][0] == "again.asdf"
+    assert years.find("charis", date="2026-06-01", mode=mode).name == "again.asdf"
+    for name, words in {
+        "again.asdf": "chosen",
+        "2025.asdf": "replaced by again.asdf",
+        "2026.asdf": "superseded by again.asdf",
+        "2027.asdf": "begins 2027-01-01",
+        "other.asdf": "of mode K",
+    }.items():
+        assert why[name].startswith(words), name
+    assert not table.meta["problem"]
+    # where there is no choice, the reasons of all are there
+    none = years.explain("charis", date="2020-01-01")
+    assert "no calibration of charis for date 2020-01-01" in none.meta["problem"]
+    assert not any(words.startswith("chosen") for words in none["why"])
+    (years.source / "bad.asdf").write_text("bad")
+    assert "unreadable" in str(Library(years.source).explain("charis")["why"][-1])
+
+
+def test_what_is_superseded_is_kept_but_not_chosen(calibration, years):
+    assert years.find("charis", date="2026-01-03").name == "again.asdf"
+    # neither for the days for which only the superseded one held
+    assert years.find("charis", date="2026-01-01").name == "2025.asdf"
+    assert "2026.asdf" in years.table()["name"]
+    assert Library(years.source).find("charis", date="2026-01-03").name == "again.asdf"
+    with refused("supersedes: no 'gone.asdf'"):
+        years.add(calibration, supersedes="gone.asdf", valid_from="2031-01-01")
+
+
+def test_context_is_what_it_was(calibration, years, tmp_path):
+    with refused("allowed are up to 100 letters"):
+        years.freeze("../outside")
+    years.freeze("spring")
+    with refused("spring"):
+        years.freeze("spring")
+    years.add(calibration, "late.asdf", supersedes=["again.asdf"], valid_from="2026-01-04")
+    now, then = Library(years.source), Library(years.source, context="spring")
+    assert now.find("charis", date="2026-06-01").name == "late.asdf"
+    assert then.find("charis", date="2026-06-01").name == "again.asdf"
+    assert now.contexts == ["spring"]
+    with refused("no context 'autumn'; there are spring"):
+        Library(years.source, context="autumn")
+    kept = (years.source / "2025.asdf").read_bytes()
+    (years.source / "2025.asdf").write_bytes(kept + b" ")
+    with refused("context spring: 2025.asdf is not what it was"):
+        Library(years.source, context="spring")
+    (years.source / "2025.asdf").unlink()
+    with refused("context spring: 2025.asdf is missing"):
+        Library(years.source, context="spring")
+    for content in ("", "[]", '{"version": 1, "files": {"../x.asdf": "00"}}'):
+        (years.source / "spring.context.json").write_text(content)
+        with refused("is not a context"):
+            Library(years.source, context="spring")
+
+
+def test_archive_of_a_context(years, tmp_path_factory):
+    folder, other = (tmp_path_factory.mktemp("archives") for _ in range(2))
+    years.freeze("spring")
+    path = years.export("spring", folder / "spring.zip")
+    assert import_context(path, other / "new") == "spring"
+    for name in ("2025.asdf", "again.asdf", "spring.context.json"):
+        assert (other / "new" / name).read_bytes() == (years.source / name).read_bytes()
+    # the same again changes nothing, something else in its place is left alone
+    assert import_context(path, other / "new") == "spring"
+    (other / "new" / "2025.asdf").write_text("mine")
+    with refused("another file 2025.asdf"):
+        import_context(path, other / "new")
+    assert (other / "new" / "2025.asdf").read_text() == "mine"
+
+
+def test_forged_archives_write_nothing(years, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("forged")
+    years.freeze("spring")
+    good = years.export("spring", folder / "spring.zip")
+
+    def forged(change):
+        path = folder / "forged.zip"
+        with zipfile.ZipFile(good) as source, zipfile.ZipFile(path, "w") as target:
+            for name in source.namelist():
+                for new, content in change(name, source.read(name)):
+                    target.writestr(new, content)
+        return path
+
+    for change, message in (
+        (lambda n, c: [(n, c + b" " * n.endswith(".asdf"))], "does not have its checksum"),
+        (lambda n, c: [(n, c), ("../evil.asdf", b"")][: 1 + n.endswith("json")], "differ"),
+        (lambda n, c: [(n, c)] * (n != "2025.asdf"), "differ"),
+        (lambda n, c: [(n, c)] * n.endswith(".asdf"), "is not an archive"),
+        (lambda n, c: [(n, b"{}" if n.endswith("json") else c)], "is not a context"),
+        (lambda n, c: [(f"../{n}" if n.endswith("json") else n, c)], "allowed are up to"),
+    ):
+        with refused(message):
+            import_context(forged(change), folder / "there")
+    assert not (folder / "there").exists()
+    (folder / "none.zip").write_bytes(b"PK")
+    for path in (folder / "none.zip", folder / "missing.zip"):
+        with pytest.raises(CalibrationFileError):
+            import_context(path, folder / "there")
+
+
+def test_fetched_has_the_checksum(years, tmp_path_factory, monkeypatch):
+    pytest.importorskip("fsspec")
+    folder = tmp_path_factory.mktemp("remote")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    (folder / "cache" / "astropy").mkdir(parents=True)
+    years.freeze("spring")
+    path = years.export("spring", folder / "spring.zip")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    url = path.as_uri()
+    with refused("has the checksum"):
+        fetch(url, folder / "library", sha256="0" * 64)
+    assert not (folder / "library").exists()
+    assert fetch(url, folder / "library", sha256=digest) == "spring"
+    assert Library(folder / "library", "spring").find("charis", date="2025-03-01")
+    path.unlink()
+    # from the cache
+    assert fetch(url, folder / "again", sha256=digest) == "spring"
+    one = years.source / "2025.asdf"
+    digest = hashlib.sha256(one.read_bytes()).hexdigest()
+    assert fetch(one.as_uri(), folder / "again", sha256=digest).name == "2025.asdf"
+    with refused("cannot be fetched"):
+        fetch((folder / "gone.asdf").as_uri(), folder / "again", sha256="1" * 64)
+    with refused("cannot be fetched"):
+        fetch("nowhere://gone.asdf", folder / "again", sha256="1" * 64)

@@ -4,7 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from astropolcal.chain import with_beam
@@ -72,18 +72,21 @@ def test_gain_of_one_beam_does_not_move_the_other():
 
 @given(amount=SHARE, flux=FLUX, reference=FLUX)
 def test_stray_light_adds_a_constant_flux(amount, flux, reference):
-    """What is added does not depend on what the source gives: F M I = F + b F_0."""
+    """What is added does not depend on what the source gives: S M I = S + b F_0 = F."""
+    added = amount * reference
+    assume(abs(added) < 0.98 * (flux + added))
     stray = optic(StrayLight, amount=amount, reference=reference)
-    out = flux * stray.mueller(position=flux) @ STOKES
-    np.testing.assert_allclose(out, flux * STOKES + [amount * reference, 0, 0, 0], rtol=1e-12)
+    out = flux * stray.mueller(position=flux + added) @ STOKES
+    np.testing.assert_allclose(out, flux * STOKES + [amount * reference, 0, 0, 0], rtol=1e-9)
 
 
 @given(amount=SHARE, q=SHARE, u_=SHARE, flux=FLUX)
 def test_background_adds_the_same_stokes_vector(amount, q, u_, flux):
+    assume(abs(1e4 * amount) < 0.98 * (flux + 1e4 * amount))
     background = optic(PolarizedBackground, amount=amount, q=q, u=u_, reference=1e4)
-    out = flux * background.mueller(position=flux) @ STOKES
+    out = flux * background.mueller(position=flux + 1e4 * amount) @ STOKES
     added = 1e4 * np.array([amount, q, u_, 0])
-    np.testing.assert_allclose(out - flux * STOKES, added, rtol=1e-7, atol=1e-7 * flux)
+    np.testing.assert_allclose(out - flux * STOKES, added, rtol=1e-7, atol=1e-7 * (flux + 1e4))
 
 
 def test_polarized_background_without_polarization_is_stray_light():
@@ -105,16 +108,18 @@ def test_nothing_is_added_where_there_is_no_flux():
     for cls in [StrayLight, PolarizedBackground]:
         found = optic(cls, amount=0.3).mueller(position=[0.0, 2.0])
         np.testing.assert_array_equal(found[0], np.eye(4))
-        assert found[1, 0, 0] == pytest.approx(1.15), cls
+        assert found[1, 0, 0] == pytest.approx(1 / 0.85), cls
+        # nearly all of a frame may be added light, but not all of it
+        assert optic(cls, amount=0.5).mueller(position=0.1)[0, 0] == pytest.approx(501), cls
 
 
 def test_stray_light_dilutes_the_polarization_that_is_measured():
-    """With b F_0 added to F, both beams' contrast is that of q F / (F + b F_0)."""
+    """With b F_0 in F, the contrast of both beams is that of q (F - b F_0) / F."""
     chain = optic(StrayLight, amount=0.25, reference=4.0) | WollastonPrism(name="w")
     stray = chain["optic"]
     stray.position = 4.0
     right, left = (with_beam(chain, b)(1 * u.um, *STOKES)[1] for b in ("right", "left"))
-    assert (right - left) / (right + left) == pytest.approx(0.3 / 1.25)
+    assert (right - left) / (right + left) == pytest.approx(0.3 * 0.75)
 
 
 # --- all of them ------------------------------------------------------------------------------
@@ -139,7 +144,7 @@ def test_derivatives_of_frames_and_wavelengths():
                 for step in (1e-4, -1e-4)
             ]
             assert slopes[key].shape == (2, 3, 4, 4), cls
-            np.testing.assert_allclose(slopes[key].value, (ends[0] - ends[1]) / 2e-4, atol=1e-10)
+            np.testing.assert_allclose(slopes[key].value, (ends[0] - ends[1]) / 2e-4, atol=1e-5)
 
 
 def test_reference_is_one_positive_number():

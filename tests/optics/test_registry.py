@@ -134,6 +134,11 @@ def stray(share):
     return np.eye(4) + np.asarray(share)[..., None, None] * np.diag([1.0, 0, 0, 0])
 
 
+def of_source(share, amount):
+    """Return a share of the flux of a frame as one of the light of the source."""
+    return share / np.maximum(1 - amount * share, 0.01)
+
+
 def background(share, q, u):
     out = stray(share) + np.zeros((*np.shape(share * q * u), 4, 4))
     out[..., 1, 0], out[..., 2, 0] = q, u
@@ -339,7 +344,7 @@ CASES = {
     ),
     "StrayLight": case(
         optics.StrayLight,
-        lambda x, amount: stray(amount * 3e4 / x),
+        lambda x, amount: stray(amount * of_source(3e4 / x, amount)),
         settings={"reference": 3e4},
         mount="total_flux",
         position=st.floats(1e3, 6e4),
@@ -347,7 +352,9 @@ CASES = {
     ),
     "PolarizedBackground": case(
         optics.PolarizedBackground,
-        lambda x, amount, q, u: background(*(part * 3e4 / x for part in (amount, q, u))),
+        lambda x, amount, q, u: background(
+            *(part * of_source(3e4 / x, amount) for part in (amount, q, u))
+        ),
         settings={"reference": 3e4},
         mount="total_flux",
         position=st.floats(1e3, 6e4),

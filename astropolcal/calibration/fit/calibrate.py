@@ -397,14 +397,15 @@ def _joint(measurement, weighting, fitter, search, prepare):
 
 
 def _stands_out(measurement):
-    """Whether the residuals are far above the noise that the frames show."""
-    try:
-        sigma = _noise_of_frames(measurement).sigma_of_data
-    except AstropolcalError:
-        # nothing to hold against
-        return False
+    """Whether the residuals are far above the noise that the frames show, or the table states."""
     residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
-    return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
+    for method in (_noise_of_frames, noise_from_errors):
+        try:
+            sigma = method(measurement).sigma_of_data
+        except AstropolcalError:
+            continue  # few wavelengths, or no errors in the table
+        return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
+    return False
 
 
 def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
@@ -504,14 +505,16 @@ def _robust(measurement, fitter, loss, outcome):
 # ---- the result ------------------------------------------------------------------
 
 
-def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
+def _result(measurement, whitened, *, settings, fit, stages, cross_validate, covariance=None):
+    """Return the calibration; ``covariance`` is that of more data than its own."""
     vector = measurement.vector()
     residuals, level = measurement.residuals(vector), measurement.weighting.level
     finding = finding_of(measurement.free, whitened)
     view = view_of_measurement(measurement, vector, settings["instrument"])
     complete(finding, measurement, vector, whitened, level, view=view)
     names = measurement.free.names
-    covariance, lacking = _errors(measurement, whitened, settings["errors"])
+    own, lacking = _errors(measurement, whitened, settings["errors"])
+    covariance = own if covariance is None else covariance
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
@@ -529,7 +532,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     observations = (dataset.observations for dataset in measurement.datasets)
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
-    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
+    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
@@ -546,14 +549,14 @@ def _errors(measurement, whitened, how):
     return covariance, model_error(measurement, scatter)
 
 
-def _lack_of_fit(calibration):
+def _lack_of_fit(calibration, whitened):
     """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
     live = calibration.measurement
     for method in (noise_from_errors, _noise_of_frames):
         try:
             noise = method(live)
-            test = lack_of_fit(live, calibration, noise)
+            test = lack_of_fit(live, calibration, noise, whitened=whitened)
         except AstropolcalError:
             continue  # no errors in the table, or too few frames: nothing to hold against
         # unknown where no degree of freedom is left

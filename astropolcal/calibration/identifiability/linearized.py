@@ -50,7 +50,15 @@ def decompose(rows):
     """Decompose rows of derivatives, with all right vectors however few rows."""
     n_rows, n_columns = rows.shape
     # null directions need all right vectors; with more rows than columns they are there anyway
-    _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
+    wide = n_rows < n_columns
+    try:
+        _, singular, right = np.linalg.svd(rows, full_matrices=wide)
+    except np.linalg.LinAlgError:
+        # a calibration is read where there is no scipy
+        from scipy.linalg import svd
+
+        # the quick algorithm of LAPACK fails for a few matrices, the slow one does not
+        _, singular, right = svd(rows, full_matrices=wide, lapack_driver="gesvd")
     singular = np.pad(singular, (0, n_columns - singular.size))
     # without data the largest singular value is zero too: nothing is determined then
     threshold = max(RANK * singular.max(initial=0.0), _NOTHING)
@@ -114,10 +122,15 @@ class Whitened:
         return decompose(np.concatenate([self._square, self.prior_rows])[:, self.live])
 
     @cached_property
+    def slopes(self):
+        """Derivatives of the data to the determined directions, each one error long."""
+        return self.along(self.rows)
+
+    @cached_property
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
         # diagonal of the hat matrix J (J^T J + P)^-1 J^T
-        return np.sum(self.along(self.rows) ** 2, axis=1)
+        return np.sum(self.slopes**2, axis=1)
 
     @cached_property
     def n_taken(self):

@@ -1,0 +1,484 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The coefficients from which the parameters of all runs follow, and how they are found.
+
+Values that all runs share, values of one run only, which are eliminated run by run, and courses in
+time; see `astropolcal.calibration.fit.runs`.
+"""
+
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from astropolcal.calibration.fit.evidence import (
+    COURSES,
+    EVENT,
+    Deviation,
+    Weighed,
+    chances_of_runs,
+    laws_of,
+    waves_of,
+    weigh,
+)
+from astropolcal.calibration.identifiability.analysis import physical_scale
+from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
+from astropolcal.exceptions import ParameterError
+from astropolcal.progress import stage
+
+__all__ = []
+
+# an optic that varies with less than this probability is held constant
+_SURE = 0.9
+_ENOUGH = float(np.log(_SURE / (1 - _SURE)))
+# others that explain it nearly as well are named: log evidence
+_RIVAL = 5.0
+_MOST_TERMS, _MOST_SEARCHES = 12, 5
+# courses that follow a law
+_SIMPLE = ("steps", "drift")
+# the solution has arrived where no determined direction moves by this share of its error
+_ARRIVED, _MOST_ROUNDS, _HALVINGS, _SHORTER = 0.01, 20, 6, 1.1
+_PINV = 1e-9
+# rows of so many runs are reduced at a time
+_MANY = 2000
+
+
+@dataclass(eq=False)
+class Term:
+    """A course of an optic: elements by name, law in wavelength, and time; with a prior or not."""
+
+    what: str
+    course: str
+    names: list
+    law: np.ndarray
+    times: np.ndarray
+    prior: float = np.inf
+    gap: int | None = None
+
+    @property
+    def size(self):
+        return self.law.shape[1] * self.times.shape[1]
+
+    def block(self, run):
+        """Return the derivative of the elements of a run to the coefficients."""
+        return np.kron(self.times[run], self.law)
+
+
+class Model:
+    """The coefficients of all runs, and the rows around them."""
+
+    def __init__(self, work, own, dates, events):
+        self.work, self.dates, self.terms = work, dates, []
+        frees = [shape.free for shape in work.shapes]
+        self.names = [free.names for free in frees]
+        self.scales = [physical_scale(free) for free in frees]
+        count = {}
+        for names in self.names:
+            for name in names:
+                count[name] = count.get(name, 0) + 1
+        known = {key for name in count for key in (stem(name), optic(name))}
+        _check_known(own, known, "own")
+        self.own = [
+            np.array([count[n] == 1 or _is_of(n, own) for n in names]) for names in self.names
+        ]
+        self.shared = [n for n in count if count[n] > 1 and not _is_of(n, own)]
+        place = {name: k for k, name in enumerate(self.shared)}
+        self.columns = [
+            np.array([place[n] for n in np.array(names)[~mine]], dtype=int)
+            for names, mine in zip(self.names, self.own, strict=True)
+        ]
+        first = {name: i for i in reversed(range(len(frees))) for name in self.names[i]}
+        self.limits = self._of_shared(first, lambda i: np.array(frees[i].bounds()) / self.scales[i])
+        self.value = self._of_shared(first, lambda i: work.alone[i][None] / self.scales[i])[0]
+        self.held = np.zeros(self.value.size, dtype=bool)
+        self.priors = [
+            _priors_of(free, scale) for free, scale in zip(frees, self.scales, strict=True)
+        ]
+        self.chances = None if dates is None else chances_of_runs(dates, events)
+        self.vectors, self.rows = work.alone, None
+
+    def _of_shared(self, first, values):
+        where = [(first[name], self.names[first[name]].index(name)) for name in self.shared]
+        return np.array([values(i)[:, k] for i, k in where]).reshape(len(where), -1).T
+
+    @property
+    def varying(self):
+        """Names of the shared elements of each optic that all runs have."""
+        found, everywhere = {}, set.intersection(*map(set, self.names))
+        for name in (n for n in self.shared if n in everywhere):
+            for what in (optic(name), stem(name)):
+                found.setdefault(what, []).append(name)
+        # what has a single parameter is named by its optic
+        single = [k for k in found if k != optic(k) and found[k] == found[optic(k)]]
+        return {what: names for what, names in found.items() if what not in single}
+
+    # ---- linear algebra
+
+    def _split(self, i):
+        """Return a run's rows with what is its own projected out, and how that follows."""
+        one, mine = self.rows[i], self.own[i]
+        rows, targets = one.rows, one.targets
+        if mine.any():
+            extra, aims = self.priors[i](self.vectors[i] / self.scales[i], mine)
+            rows = np.concatenate([rows, extra])
+            targets = np.concatenate([targets, aims])
+            basis = orthonormal(rows[:, mine])
+            targets = targets - basis @ (basis.T @ targets)
+            rows = rows - basis @ (basis.T @ rows)
+            rows[:, mine] = 0.0
+        return rows, targets
+
+    def _spread(self, i, rows):
+        """Return rows of a run's elements as rows of all coefficients."""
+        shared = ~self.own[i]
+        out = [np.zeros((len(rows), self.value.size - sum(t.size for t in self.terms)))]
+        out[0][:, self.columns[i]] = rows[:, shared]
+        for term in self.terms:
+            where = [self.names[i].index(name) for name in term.names]
+            out.append(rows[:, where] @ term.block(i))
+        return np.concatenate(out, axis=1)
+
+    def _prior_rows(self):
+        """Return rows and targets of what is known beforehand of the coefficients."""
+        rows, aims, seen = [], [], set()
+        for i, names in enumerate(self.names):
+            fresh = np.array([n not in seen for n in names]) & ~self.own[i]
+            seen |= set(names)
+            if fresh.any():
+                one, targets = self.priors[i](self.vectors[i] / self.scales[i], fresh)
+                rows.append(self._spread(i, one))
+                aims.append(targets)
+        start = self.value.size - sum(t.size for t in self.terms)
+        for term in self.terms:
+            if np.isfinite(term.prior):
+                block = np.zeros((term.size, self.value.size))
+                block[:, start : start + term.size] = np.eye(term.size) / term.prior
+                rows.append(block)
+                aims.append(np.zeros(term.size))
+            start += term.size
+        return np.concatenate(rows), np.concatenate(aims)
+
+    def _system(self):
+        """Return the triangular factor of all rows and its targets."""
+        rows, aims = self._prior_rows()
+        total = np.column_stack([rows, aims - rows @ self.value])
+        for i in range(len(self.rows)):
+            own, targets = self._split(i)
+            own = self._spread(i, own)
+            total = np.concatenate([total, np.column_stack([own, targets - own @ self.value])])
+            if len(total) > max(4 * total.shape[1], _MANY):
+                total = np.linalg.qr(total, mode="r")
+        return total[:, :-1], total[:, -1]
+
+    def _solved(self):
+        """Return the coefficients that fit best, within their bounds, and the directions."""
+        rows, aims = self._system()
+        n = self.limits.shape[1]
+        low, high = self.limits
+        held = np.zeros(self.value.size, dtype=bool)
+        while True:
+            live = np.flatnonzero(~held)
+            found = decompose(rows[:, live])
+            new = self.value.copy()
+            new[held] = np.clip(new[:n], low, high)[held[:n]] if held.any() else new[held]
+            left = aims - rows @ (new - self.value)
+            new[live] += found.half.T @ (found.half @ (rows[:, live].T @ left))
+            outside = np.zeros_like(held)
+            outside[:n] = ~held[:n] & ((new[:n] < low) | (new[:n] > high))
+            if not outside.any():
+                self.held = held
+                return new, found
+            self.value = self.value.copy()
+            self.value[:n] = np.where(outside[:n], np.clip(new[:n], low, high), self.value[:n])
+            rows, aims = self._system()
+            held |= outside
+
+    def _vectors(self, value):
+        """Return the canonical parameters of all runs."""
+        out = []
+        n = self.value.size - sum(t.size for t in self.terms)
+        for i, mine in enumerate(self.own):
+            theta = self.vectors[i] / self.scales[i]
+            theta[~mine] = value[:n][self.columns[i]]
+            start = n
+            for term in self.terms:
+                where = [self.names[i].index(name) for name in term.names]
+                theta[where] += term.block(i) @ value[start : start + term.size]
+                start += term.size
+            if mine.any():
+                extra, aims = self.priors[i](self.vectors[i] / self.scales[i], mine)
+                rows = np.concatenate([self.rows[i].rows, extra])
+                targets = np.concatenate([self.rows[i].targets, aims]) - rows @ theta
+                theta[mine] += np.linalg.pinv(rows[:, mine], rcond=_PINV) @ targets
+            bounds = self.work.shapes[i].free.bounds()
+            out.append(np.clip(theta * self.scales[i], *bounds))
+        return out
+
+    def begin(self):
+        """Solve around the parameters that each run has by itself."""
+        #: Rows around the parameters of each run alone, with its residuals there.
+        self.alone = self.rows = self.work.around(self.vectors)
+        self.value = self._solved()[0]
+
+    def solve(self):
+        """Solve around the present parameters, go there, and return those before."""
+        before, new = self.value, self._solved()[0]
+        old, cost = self.vectors, sum(one.chi2 for one in self.rows)
+        # derivatives hold nearby only: a step that makes it much worse is shortened; a little worse
+        # is what other weights than equal ones may make it
+        for k in range(_HALVINGS):
+            trial = before + (new - before) / 2**k
+            vectors = self._vectors(trial)
+            rows = self.work.around(vectors)
+            if sum(one.chi2 for one in rows) <= _SHORTER * cost or k == _HALVINGS - 1:
+                break
+        self.value, self.vectors, self.rows = trial, vectors, rows
+        return old
+
+    def settle(self):
+        """Solve until no run moves by more than a share of its error."""
+        for k in range(_MOST_ROUNDS):
+            old = self.solve()
+            moved = max(
+                np.abs(one.rows @ ((new - then) / scale)).max(initial=0.0)
+                for one, new, then, scale in zip(
+                    self.rows, self.vectors, old, self.scales, strict=True
+                )
+            )
+            if moved < _ARRIVED:
+                return k + 1, True
+        return _MOST_ROUNDS, False
+
+    # ---- courses
+
+    def add(self, term):
+        """Add a course, of no size yet."""
+        self.terms.append(term)
+        self.value = np.concatenate([self.value, np.zeros(term.size)])
+
+    def add_wanted(self, vary):
+        """Add the courses that the user asks for."""
+        if not isinstance(vary, dict):
+            raise ParameterError(f"vary = {vary!r}; allowed are 'evidence' or a dict of courses")
+        known = {
+            key for names in self.varying.values() for n in names for key in (optic(n), stem(n))
+        }
+        _check_known(vary, known, "vary")
+        for what, course in vary.items():
+            if course not in COURSES:
+                raise ParameterError(f"vary: {what} = {course!r}; allowed are {', '.join(COURSES)}")
+            names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
+            if course in ("walk", "scatter"):
+                best = self._weighed(names, self._parts()).best([course])
+                self.add(Term(what, course, names, best.law, best.waves, best.size))
+            elif course != "constant":
+                self._add_plain(what, course, names)
+
+    def _add_plain(self, what, course, names):
+        """Add a drift, or a step at each event, of which every element has its own."""
+        waves, law = waves_of(self.dates)[course], np.eye(len(names))
+        gaps = np.flatnonzero(self.chances == EVENT) if course == "steps" else [0]
+        if not len(gaps):
+            raise ParameterError(f"vary: {what} has steps, but there is no event between the runs")
+        for gap in gaps:
+            at = int(gap) if course == "steps" else None
+            self.add(Term(what, course, names, law, waves[:, [gap]], gap=at))
+
+    def search(self):
+        """Add the courses that the evidence asks for."""
+        before = None
+        for k in range(_MOST_SEARCHES):
+            stage(f"what changed, look {k + 1}")
+            # far from a run its rows mislead: what was found is looked for again from where it led
+            gained, terms = self._grown(_SIMPLE)
+            if len(terms) > 1:
+                # a walk does what several steps do, and the other way round
+                other = self._grown(COURSES[1:])
+                terms = other[1] if other[0] > gained else terms
+            self._take(terms)
+            found = [(t.what, t.course, t.gap, t.law.shape[1]) for t in terms]
+            if found == before:
+                break
+            before = found
+            self.solve()
+
+    def _take(self, terms):
+        """Take courses in place of all present ones."""
+        self.terms = list(terms)
+        self.value = np.pad(self.value[: len(self.shared)], (0, sum(t.size for t in terms)))
+        self.value = self._solved()[0]
+
+    def _grown(self, first):
+        """Return the evidence of courses that are added one by one, and these.
+
+        As long as one of the ``first`` explains something they are added, and then any.
+        """
+        self._take([])
+        gained, among = 0.0, first
+        while len(self.terms) < _MOST_TERMS:
+            found = self.weighed()
+            odds = {what: one.odds_of(among) for what, one in found.items()}
+            what = max(odds, key=odds.get, default=None)
+            if what is not None and odds[what] > _ENOUGH:
+                self._take([*self.terms, self._term(what, found[what].best(among))])
+                gained += odds[what] + self._exchange()
+            elif among == COURSES[1:]:
+                break
+            else:
+                among = COURSES[1:]
+        return gained, self.terms
+
+    def _term(self, what, best):
+        # a size that is given to what follows no law keeps it from following the noise
+        prior = np.inf if best.course in _SIMPLE else best.size
+        return Term(what, best.course, self.varying[what], best.law, best.waves, prior, best.gap)
+
+    def _exchange(self):
+        """Put in place of each course the best of its optic beside all others; return the gain.
+
+        What is needless beside a later one goes.
+        """
+        gained = 0.0
+        for old in self.terms[:-1]:
+            k, terms = self.terms.index(old), list(self.terms)
+            self._take([*terms[:k], *terms[k + 1 :]])
+            parts, mine = self._parts(), optic(old.what)
+            found = {
+                what: self._weighed(names, parts)
+                for what, names in self.varying.items()
+                if optic(what) == mine
+            }
+            odds = {what: one.odds_of(COURSES[1:]) for what, one in found.items()}
+            what = max(odds, key=odds.get)
+            gained -= odds[old.what]
+            if odds[what] > _ENOUGH:
+                new = self._term(what, found[what].best(COURSES[1:]))
+                gained += odds[what]
+                self._take([*terms[:k], new, *terms[k + 1 :]])
+        return gained
+
+    def weighed(self):
+        """Return the probabilities of all courses of each optic, beside all that were added."""
+        if not self.varying:
+            return {}
+        parts = self._parts()
+        return {what: self._weighed(names, parts) for what, names in self.varying.items()}
+
+    def _parts(self):
+        """Return of each run rows, what all coefficients take of them, and what is left."""
+        value, found = self._solved()
+        wide, parts = np.zeros((self.value.size, found.rank)), []
+        wide[~self.held] = found.half.T
+        for i in range(len(self.rows)):
+            rows, targets = self._split(i)
+            spread = self._spread(i, rows)
+            parts.append((rows, spread @ wide, targets - spread @ value))
+        return parts
+
+    def _weighed(self, names, parts):
+        looks = []
+        for law in laws_of(names):
+            columns = []
+            for own, (rows, taken, left) in zip(self.names, parts, strict=True):
+                part = rows[:, [own.index(name) for name in names]] @ law
+                columns.append((part.T @ part, taken.T @ part, part.T @ left))
+            looks.append(Deviation.of(law, *map(np.array, zip(*columns, strict=True))))
+        looks = [look for look in looks if look is not None]
+        return weigh(looks, waves_of(self.dates), self.chances) if looks else _NEVER
+
+    def final(self, term):
+        """Return the probabilities of an optic's courses beside all others, its rivals, its share.
+
+        Rivals are what would explain the data nearly as well in its place; the share is its
+        probability among them and itself.
+        """
+        new = copy(self)
+        new._take([other for other in self.terms if other is not term])
+        found, now = new.weighed(), self.weighed()
+        odds = {what: one.odds_of(COURSES[1:]) for what, one in found.items()}
+        rivals = [
+            what
+            for what in found
+            if _differ(what, term.what)
+            and odds[what] > odds[term.what] - _RIVAL
+            and now[what].odds_of(COURSES[1:]) < 0
+        ]
+        weights = np.exp([odds[what] - odds[term.what] for what in rivals])
+        return found[term.what], rivals, float(1 / (1 + weights.sum()))
+
+    # ---- errors
+
+    def errors_of(self, i):
+        """Return determined and open directions of a run's parameters, in steps."""
+        _, found = self._solved()
+        follow = self._follow(i)[:, ~self.held]
+        known, null = found.half @ follow.T, found.null @ follow.T
+        mine = self.own[i]
+        if mine.any():
+            extra, _ = self.priors[i](self.vectors[i] / self.scales[i], mine)
+            own = decompose(np.concatenate([self.rows[i].rows, extra])[:, mine])
+            block = np.zeros((own.right.shape[0], mine.size))
+            block[:, mine] = own.right
+            known = np.concatenate([known, block[: own.rank] / own.singular[: own.rank, None]])
+            null = np.concatenate([null, block[own.rank :]])
+        return known, null[np.linalg.norm(null, axis=1) > STILL]
+
+    def _follow(self, i):
+        """Return the derivative of a run's parameters to the coefficients, in steps."""
+        mine = self.own[i]
+        out = self._spread(i, np.eye(mine.size))
+        if mine.any():
+            extra, _ = self.priors[i](self.vectors[i] / self.scales[i], mine)
+            rows = np.concatenate([self.rows[i].rows, extra])
+            out[mine] = -np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (rows @ out)
+        return out
+
+
+# nothing is known of it
+_NEVER = Weighed({course: float(course == "constant") for course in COURSES}, -np.inf, [])
+
+
+def _check_known(wanted, known, what):
+    for name in wanted:
+        if name not in known:
+            raise ParameterError(f"{what}: no free optic or parameter {name!r} in the runs")
+
+
+def stem(name):
+    """Return the parameter, ``"optic.parameter"``, of an element."""
+    return name.partition("[")[0]
+
+
+def optic(name):
+    """Return the optic of a parameter, or of an element."""
+    return name.partition(".")[0]
+
+
+def _differ(one, other):
+    """Whether neither of two optics or parameters holds the other."""
+    return one not in (other, optic(other)) and other != optic(one)
+
+
+def _is_of(name, wanted):
+    return stem(name) in wanted or optic(name) in wanted
+
+
+def _priors_of(free, scale):
+    """Return what gives rows and targets of a run's priors on some elements, in steps."""
+
+    def rows_of(theta, which):
+        rows, aims = [np.zeros((0, scale.size))], [np.zeros(0)]
+        for slot, prior in free.priors:
+            here = np.arange(slot.start, slot.start + slot.size)
+            wanted = which[here]
+            if prior.is_flat or not wanted.any():
+                continue
+            value = theta[here] * scale[here]
+            slope = np.broadcast_to(prior.slope(value), here.shape) * scale[here]
+            block = np.zeros((here.size, scale.size))
+            block[np.arange(here.size), here] = slope
+            rows.append(block[wanted])
+            aims.append((slope * theta[here] - prior.residual(value))[wanted])
+        return np.concatenate(rows), np.concatenate(aims)
+
+    return rows_of
