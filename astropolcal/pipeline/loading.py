@@ -309,6 +309,22 @@ class LoadedCalibration:
         """Wavelengths of the calibration, a `~astropy.units.Quantity`."""
         return self.calibration.wavelength
 
+    @property
+    def chain(self):
+        """
+        The calibrated chain, an astropy model: a copy, which may be changed.
+
+        From the sky where the telescope is calibrated, otherwise from the first optic on a stage
+        of the instrument.
+
+        Raises
+        ------
+        ChainError
+            If the calibration has several sets of optics in the beam and none was stated.
+        """
+        inner = inner_optics(self.calibration, self.optics_in, label=self.path.name)
+        return join([*(telescope_optics(self.calibration) or ()), *inner]).copy()
+
     def system_mueller(
         self,
         header=None,

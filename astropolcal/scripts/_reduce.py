@@ -41,6 +41,10 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 -o --output OBS.ecsv Output required  the table; overwritten if it exists
 --instrument NAME  default: the one that the headers name, else charis
 --raw DIR Frames  folder of raw frames, for keywords that the cubes lack
+--dark FILE Input  raw frames: dark that is subtracted (FITS); of two cameras the file of the right
+    beam, beside that of the left one
+--flat FILE Input  raw frames: flat by which they are divided; pixels where it is not above zero, or
+    that have no value in dark or flat, are not used
 --source KIND =internal  internal (default), polarized, unpolarized (internal source with and
     without its polarizer), star, 'unpolarized standard star', 'polarized standard star'
 --meta KEY=VALUE pair ...  more for the table's meta, such as yjh50_dichroic=in
@@ -80,6 +84,8 @@ def run(arguments):
         instrument,
         source=arguments.source,
         raw=arguments.raw,
+        dark=arguments.dark,
+        flat=arguments.flat,
         meta=dict(arguments.meta),
         workers=arguments.workers,
         resume=arguments.resume,

@@ -118,6 +118,19 @@ def test_frames_have_an_axis_of_their_own(loaded):
     np.testing.assert_allclose(both.value[1], loaded.system_mueller(other).value, atol=1e-15)
 
 
+def test_the_chain_is_a_model_from_the_sky_with_the_values_found(calibration, loaded):
+    chain = loaded.chain
+    assert [leaf.name for leaf in leaves(chain)][:4] == ["parallactic", "m3", "altitude", "hwp"]
+    assert chain["hwp"].w_sio2 == calibration.chains[0]["hwp"].w_sio2
+    angles = {"hwp": 10.0, "derotator": 50.0, "parallactic": 20.0, "altitude": 60.0}
+    positions = {stage: angle * u.deg for stage, angle in angles.items()}
+    seen = system_mueller(with_beam(chain, "right"), WAVELENGTH, positions)
+    wanted = loaded.system_mueller(positions=positions).value
+    np.testing.assert_allclose(np.squeeze(seen), np.squeeze(wanted))
+    chain["hwp"].w_sio2 = 1 * u.mm
+    assert loaded.chain["hwp"].w_sio2.value > 1
+
+
 def test_positions_in_place_of_headers(loaded):
     angles = {"hwp": 62.5, "derotator": 60.0, "parallactic": -30.0, "altitude": 55.0}
     positions = {key: value * u.deg for key, value in angles.items()}

@@ -318,6 +318,12 @@ def _run(measurement, weighting, fitter):
     for _ in range(ROUNDS):
         outcome = _fit(measurement, weighting, fitter)
         before, weighting = weighting, weighting.updated(measurement)
+        if not np.isfinite(weighting.sigma).all():
+            raise FitError(
+                f"{measurement.free.size} free parameters and {measurement.n_data} data leave none "
+                "for the noise, against which priors weigh; fix some, add frames, or take "
+                "weights='errors'"
+            )
         if weighting.agrees(before):
             return outcome, weighting
     message = f"the noise from the residuals did not settle in {ROUNDS} fits"

@@ -396,6 +396,9 @@ class _Hat:
             weights = np.append(weights, np.full(measurement.n_priors, problem.noise))
             known = np.append(known, np.ones(measurement.n_priors))
         by_noise = (weights * known)[:, None]
+        if not np.all(by_noise > 0):
+            # data without noise, which the fit meets exactly
+            return None
         # in units of the noise the hat matrix is a b^T
         return cls(basis, by_noise, (basis * by_noise).T @ (basis * by_noise))
 
