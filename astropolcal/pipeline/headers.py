@@ -70,7 +70,7 @@ def describe(header, instrument=None, stated=()):
         "instrument": found.name,
         "stated": own,
         "mode": None if "mode" in stated else _text(_look_up(header, "filter", layout)),
-        "date": None if time is None else time.utc.isot,
+        "date": None if time is None else time.isot,
     }
 
 
