@@ -51,7 +51,7 @@ def describe(header, instrument=None, stated=()):
     What is not known is None; what the user has ``stated`` is not looked for.
     """
     if instrument is None:
-        found = _recognized(header)
+        found = recognized(header)
     else:
         found = instruments.get(instrument) if isinstance(instrument, str) else instrument
     with suppress(InstrumentError):
@@ -78,7 +78,7 @@ def _text(value):
     return None if value is None else str(value).strip()
 
 
-def _recognized(header):
+def recognized(header):
     """Return the instrument whose identity a header bears."""
     seen = []
     # each instrument looks under its own keyword, so that all of them are asked
