@@ -28,6 +28,9 @@ _ATTEMPTS = 3
 _TIMEOUT, _LOOK = 10, 1.0
 # tasks that a cluster holds for each of its workers: one that runs and one that waits
 _AHEAD = 2
+_BEGUN = "begun"
+# tasks after which a process ends and another begins, so that what libraries keep cannot add up
+_MOST_TASKS = 500
 # a process of a cluster may have several threads, but warnings and streams belong to all of them
 _ALONE = threading.Lock()
 
@@ -82,15 +85,21 @@ class _Worker:
         self.process.start()
         theirs.close()
         self.task = self.attempts = self.began = None
+        self.n_tasks = 0
 
     def give(self, task, attempts):
-        self.task, self.attempts, self.began = task, attempts + 1, time.monotonic()
+        self.task, self.attempts, self.began = task, attempts + 1, None
+        self.n_tasks += 1
         # one that died while it was idle is found when it is waited for
         with suppress(OSError):
             self.pipe.send(task)
 
+    def late(self, timeout):
+        """Return whether its task takes longer than that, its own start not counted."""
+        return None not in (timeout, self.began) and time.monotonic() - self.began > timeout
+
     def answer(self):
-        """Return result and reason, or None if the process is dead."""
+        """Return that it has begun, or result and reason, or None if the process is dead."""
         try:
             return self.pipe.recv() if self.pipe.poll() else None
         except (EOFError, OSError):
@@ -108,7 +117,9 @@ def _serve(pipe, function):
     # no more tasks, or nobody who gives them
     with suppress(EOFError, OSError):
         while True:
-            pipe.send(_tried(function, pipe.recv()))
+            task = pipe.recv()
+            pipe.send(_BEGUN)
+            pipe.send(_tried(function, task))
 
 
 def process_context(preload):
@@ -121,7 +132,7 @@ def process_context(preload):
 
 
 def _on_processes(function, tasks, workers, timeout, preload):
-    context, busy, idle = process_context(preload), [], []
+    context, busy, idle = process_context([__name__, *preload]), [], []
     again, fresh = [], ((task, 0) for task in tasks)
     try:
         while True:
@@ -134,16 +145,21 @@ def _on_processes(function, tasks, workers, timeout, preload):
             places = [place for w in busy for place in (w.pipe, w.process.sentinel)]
             ready = connection.wait(places, None if timeout is None else _LOOK)
             for worker in list(busy):
-                late = timeout is not None and time.monotonic() - worker.began > timeout
+                late = worker.late(timeout)
                 if not (worker.pipe in ready or worker.process.sentinel in ready or late):
                     continue
-                busy.remove(worker)
                 found = worker.answer()
-                if found is not None:
+                if found == _BEGUN:
+                    worker.began = time.monotonic()
+                    continue
+                busy.remove(worker)
+                if found is not None and worker.n_tasks < _MOST_TASKS:
                     idle.append(worker)
+                else:
+                    worker.end()
+                if found is not None:
                     yield Ended(worker.task, *found)
                     continue
-                worker.end()
                 if late:
                     yield Ended(worker.task, reason=f"it took longer than {timeout:g} s")
                 elif worker.attempts < _ATTEMPTS:

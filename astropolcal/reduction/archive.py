@@ -115,23 +115,16 @@ class Index:
             "SELECT seen.* FROM seen LEFT JOIN frames USING (path) WHERE frames.path IS NULL "
             "OR frames.size != seen.size OR frames.changed != seen.changed ORDER BY path"
         ).fetchall()
-        # the reader of one batch is not worth a process
-        reader = _Reader(instrument)
-        n_read = len(rows)
+        n_read, reader = len(rows), _Reader(instrument)
         batches = (rows[i : i + _BATCH] for i in range(0, n_read, _BATCH))
-        if n_read <= _BATCH and cluster is None:
-            found = (reader(batch) for batch in batches)
-        else:
-            given = {"workers": workers, "cluster": cluster, "preload": [__name__]}
-            found = (_of(ended) for ended in ended_tasks(reader, batches, **given))
-        with counting(total, "headers", total - n_read) as add:
-            for part in found:
-                marks = ", ".join("?" * len(_COLUMNS))
+        given = {"workers": workers, "cluster": cluster, "preload": [__name__]}
+        put = f"INSERT OR REPLACE INTO frames ({keys}) VALUES ({', '.join('?' * len(_COLUMNS))})"
+        ended = ended_tasks(reader, batches, **given)
+        with closing(ended), counting(total, "headers", total - n_read) as add:
+            for each in ended:
                 with base:
-                    base.executemany(
-                        f"INSERT OR REPLACE INTO frames ({keys}) VALUES ({marks})", part
-                    )
-                add(len(part))
+                    base.executemany(put, _rows(each))
+                add(len(each.task))
         base.execute("DROP TABLE seen")
         return total, n_read
 
@@ -187,21 +180,24 @@ class _Reader:
     instrument: str | None = None
 
     def __call__(self, files):
-        return [self._row(*file) for file in files]
+        # once for all files: plug-ins are looked for on the disk
+        names = [self.instrument] if self.instrument else instruments.names()
+        known = list(map(instruments.get, names))
+        return [self._row(known, *file) for file in files]
 
-    def _row(self, path, size, changed):
+    def _row(self, known, path, size, changed):
         row = dict.fromkeys(_COLUMNS) | {"path": path, "size": size, "changed": changed}
         try:
-            row |= self._values(path)
+            row |= self._values(known, path)
         except AstropolcalError as problem:
             row["problem"] = one_line(str(problem).removeprefix(f"{path}: "), None)
         return tuple(row.values())
 
-    def _values(self, path):
+    def _values(self, known, path):
         header = primary_header(path)
         if "CALHASH" in header and "POLCONV" in header:
             raise ObservationError("a corrected product of this package, not a frame")
-        found = instruments.get(self.instrument) if self.instrument else recognized(header)
+        found = known[0] if self.instrument else recognized(header, known)
         with suppress(InstrumentError):
             # which keyword holds the mode may depend on the mode
             found = found.configured(header)
@@ -225,7 +221,7 @@ class _Reader:
         }
 
 
-def _of(ended):
+def _rows(ended):
     """Return the rows of a batch of files, with the reason if its process died."""
     if ended.reason is None:
         return ended.result

@@ -40,9 +40,7 @@ def is_archive(arguments, single):
             if getattr(arguments, name) not in (None, False, _DEFAULTS.get(name)):
                 raise ParameterError(f"--{name}: is for --archive DIR")
         if arguments.output is None:
-            raise ParameterError(
-                "-o FILE is needed; or --archive DIR for all sequences of a folder"
-            )
+            raise ParameterError("-o FILE is needed, or --archive DIR for a whole archive")
         return False
     for name in ("output", *single):
         if getattr(arguments, name, None) is not None:
@@ -92,9 +90,10 @@ def run_archive(command, arguments):
             "astropolcal.pipeline.library",
         ]
         limit = None if arguments.timeout is None else 60 * arguments.timeout
-        with counting(total, "sequences", total - rest) as add:
-            for ended in ended_tasks(work, todo, timeout=limit, preload=preload, **where):
-                manifest.add(_entry(ended))
+        ended = ended_tasks(work, todo, timeout=limit, preload=preload, **where)
+        with closing(ended), counting(total, "sequences", total - rest) as add:
+            for each in ended:
+                manifest.add(_entry(each))
                 add()
         found = [manifest.entries[s.name] for s, *_ in sequences()]
         content = counts | _content(found, rest, index, folder, arguments)
