@@ -5,7 +5,7 @@ What an archive costs: many small sequences, corrected in turn and by a cluster 
 ``python tests/benchmarks/archive.py FILE.json [N]`` makes N (2,000) sequences of a star, corrects
 them with one process and through a local cluster of dask one worker of which is killed twice,
 compares all products bit by bit, and writes what was measured. docs/archives.rst has its numbers.
-With ``--headers`` only the index is measured, of as many frames, and its numbers are replaced.
+With ``--part`` the others of its numbers are kept.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from astropy.io import fits
 from astropolcal import calibrate, instruments
 from astropolcal.correction import measurement_rows
 from astropolcal.reduction.archive import Index
+from astropolcal.reduction.cubes import CubeFiles, simulate_cubes
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -82,11 +83,12 @@ def write_sequences(folder, calibration, numbers):
             fits.HDUList(hdus).writeto(inside / name)
 
 
-def correct(tree, calibration, out, *options):
+def correct(tree, calibration, out, *options, cut=True):
     """Run the command in a process of its own; return its summary and the seconds."""
     started = time.perf_counter()
     words = ["correct", tree, "--archive", out, "--calibration", calibration, "--any-date"]
-    words += ["--centre", ",".join(map(str, CENTRE)), "--size", SIZE, "--json", f"{out}.json", "-q"]
+    words += ["--json", f"{out}.json", "-q"]
+    words += ["--centre", ",".join(map(str, CENTRE)), "--size", SIZE] if cut else []
     command = [sys.executable, "-m", "astropolcal.scripts.main", *map(str, (*words, *options))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, 1):
@@ -212,16 +214,43 @@ def measured_headers(n, folder):
     }
 
 
+def measured_cubes(n, folder):
+    """Return what a frame of whole cubes costs: the star is found, the images are turned."""
+    folder, n_frames = Path(folder), 16
+    calibration = write_calibration(folder / "calibration.asdf")
+    frames = half_wave_plate_cycles([0, 45, 22.5, 67.5] * u.deg, np.linspace(60, 62, 4) * u.deg)
+    frames["parallactic"] = np.linspace(20, 26, n_frames) * u.deg
+    frames["altitude"] = np.linspace(70, 72, n_frames) * u.deg
+    simulate_cubes(
+        folder / "tree", CHARIS.on_sky(calibration.chain), CHARIS, frames,
+        source="star", stokes=(1, 0.03, -0.02, 0), flux=2e6,
+        files=CubeFiles(headers={"OBJECT": "HD 1"}, raw=False),
+    )  # fmt: skip
+    options = ("--workers", 1, "--rotation", "pupil", "--size", 151)
+    found, _ = correct(
+        folder / "tree", folder / "calibration.asdf", folder / "out", *options, cut=False
+    )
+    if found["failed"]:
+        raise RuntimeError(found["failed"])
+    return {
+        "cube_seconds_per_frame": round(found["median_seconds"] / n_frames, 3),
+        "cube_megabytes": found["most_megabytes"],
+    }
+
+
+_PARTS = {"sequences": measured, "headers": measured_headers, "cubes": measured_cubes}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument("file", type=Path)
     parser.add_argument("number", type=int, nargs="?", default=2000)
-    parser.add_argument("--headers", action="store_true", help="measure the index only")
+    parser.add_argument("--part", action="append", choices=_PARTS, help="measure this part only")
     arguments = parser.parse_args()
-    found = json.loads(arguments.file.read_text()) if arguments.headers else {}
-    for measure in (measured_headers,) if arguments.headers else (measured, measured_headers):
+    found = json.loads(arguments.file.read_text()) if arguments.part else {}
+    for part in arguments.part or _PARTS:
         with tempfile.TemporaryDirectory() as folder:
-            found |= measure(arguments.number, folder)
+            found |= _PARTS[part](arguments.number, folder)
     text = json.dumps(found, indent=1) + "\n"
     arguments.file.write_text(text, encoding="utf-8")
     print(text)
