@@ -40,7 +40,7 @@ examples:
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
   astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \\
       --rotation pupil --camera-angle 113 --open-directions ignore
-  astropolcal correct --calibration library/ nights/ --archive products/ --workers 8
+  astropolcal correct --calibration library/ nights/ --archive out --workers 8
 """
 
 OPTIONS = """
