@@ -226,6 +226,7 @@ def _lines(content, folder, arguments):
     from astropolcal.scripts._ending import with_ending, written_lines
 
     n_failed, total = content["n_failed"], content["n_sequences"]
+    n_left, n_warned = content["n_left_out"], content["n_warned"]
     body = [f"  failed: {name}: {why}" for name, why in content["failed"].items()]
     body += [f"  left out: {path}: {why}" for path, why in content["left_out"].items()]
     verdict = f"All {counted(total, 'sequence')} done"
@@ -240,8 +241,8 @@ def _lines(content, folder, arguments):
         cost = f"{content['median_seconds']:.2g} s per sequence{memory}"
     lines = {
         "Sequences": now,
-        "Left out": counted(content["n_left_out"], "file"),
-        "Warnings": f"of {counted(content['n_warned'], 'sequence')}, see the manifest",
+        "Left out": counted(n_left, "file") if n_left else None,
+        "Warnings": f"in {counted(n_warned, 'sequence')}, see the manifest" if n_warned else None,
         "Calibration": used or None,
         "Cost": cost,
         "Next": "--retry tries what failed again" if n_failed else None,
