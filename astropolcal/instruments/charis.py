@@ -261,7 +261,7 @@ class CHARIS(SubaruPolarimeter):
             time = frame_time(header, self.files)
         except (TypeError, ValueError):
             return {}
-        present = None if time is None else _switcher_by(time.utc.isot[:10])
+        present = None if time is None else _switcher_by(time.isot[:10])
         return {} if present is None else {"nbs": present}
 
 

@@ -5,6 +5,7 @@ How the FITS files of an instrument look, and what their headers say in the unit
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 
@@ -457,6 +458,8 @@ def frame_time(header, layout):
     return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
 
 
+# a header is asked for its time by several who want to know it
+@lru_cache(maxsize=4096, typed=True)
 def time_of(mjd=None, date=None, clock=None):
     """Return the time (UTC) that a number of days, or a date and a time of day, state, or None."""
     if mjd is not None:

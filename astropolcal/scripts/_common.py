@@ -310,6 +310,14 @@ _SHARED = """
 --online  fetch new tables of the Earth's rotation; by default the network is not used
 -q --quiet  print only warnings and errors
 --plots DIR Folder  save the figures in this folder
+--archive DIR Folder  work on all sequences in the folders that are named and in those inside, and
+    write products, index and manifest to this folder; what is there already is not done again
+--gap MINUTES float =30  with --archive: time without a frame after which another sequence begins
+    (default: 30)
+--cycles N int  with --archive: cut sequences after so many cycles of the half-wave plate
+--target PATTERN  with --archive: only objects such as 'HD*'
+--retry  with --archive: try the sequences that failed again
+--timeout MINUTES float  with --archive: give a sequence up after this time
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
 --prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
