@@ -13,7 +13,7 @@ from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
-from astropolcal.units import canonical_factor
+from astropolcal.units import canonical_factor, mjd_of
 
 __all__ = []
 
@@ -231,19 +231,34 @@ def distinct(positions):
 
     Of positions that are all scalar the frames have no axis.
     """
-    given = {name: u.Quantity(position) for name, position in positions.items()}
-    counts = [len(position) for position in given.values() if position.ndim]
+    # dates as numbers, and states by their numbers
+    positions = {k: mjd_of(v, k) if k == "time" else v for k, v in positions.items()}
+    numbers = {name: _numbers(position) for name, position in positions.items()}
+    counts = [len(number) for number in numbers.values() if number.ndim]
     if len({*counts} - {1}) > 1:
         # refused where the matrices are made
         return positions, np.zeros((), dtype=int)
     count = max(counts, default=1)
-    for name, position in given.items():
-        shape = (count, *position.shape[1:])
-        given[name] = np.broadcast_to(position, shape, subok=True)
-    rows = np.column_stack([position.value for position in given.values()] or [np.zeros((1, 0))])
+    columns = [np.broadcast_to(number, (count, *number.shape[1:])) for number in numbers.values()]
+    rows = np.column_stack(columns or [np.zeros((1, 0))])
     _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    settings = {name: position[first] for name, position in given.items()}
+    settings = {}
+    for name, number in numbers.items():
+        given = positions[name]
+        if not hasattr(given, "shape"):
+            text = np.asarray(given).dtype.kind in "US"
+            given = np.asarray(given) if text else u.Quantity(given)
+        shape = (count, *number.shape[1:])
+        settings[name] = np.broadcast_to(given, shape, subok=True)[first]
     return settings, which.reshape((count,) if counts else ())
+
+
+def _numbers(position):
+    """Return positions, which may be names of states, as plain numbers that tell them apart."""
+    told = np.asarray(position) if not isinstance(position, u.Quantity) else position.value
+    if told.dtype.kind in "US":
+        return np.unique(told, return_inverse=True)[1].reshape(told.shape)
+    return np.asarray(u.Quantity(position).value)
 
 
 # settings of the stages that are worked on at a time: their derivatives are the largest arrays
