@@ -120,7 +120,8 @@ if not ONLINE:
     builtin = (
         r"(bool|bytes|dict|float|int|list|object|str|tuple|type|property|None|True|False"
         r"|[A-Z]\w*(Error|Warning|Exception)|Exception"
-        r"|(abc|argparse|collections|contextlib|dataclasses|enum|functools|io|pathlib|typing)\..*)"
+        r"|(abc|argparse|collections|concurrent|contextlib|dataclasses|enum|functools|io|pathlib"
+        r"|typing)\..*)"
     )
     nitpick_ignore_regex.append((r"py:.*", builtin))
 

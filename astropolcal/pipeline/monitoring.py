@@ -261,12 +261,12 @@ def write_health(content, path, *, figures=None):
 
 def write_page(path, error, package, template, known, filters=None):
     """Write a page from a template of a package, atomically; what is shown is escaped."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
     from astropolcal.version import version
 
     environment = Environment(
-        loader=PackageLoader(package, "templates"),
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("astropolcal.pipeline")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

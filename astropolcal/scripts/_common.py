@@ -25,6 +25,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.progress import clear
 from astropolcal.units import mjd_of, plain_number
+from astropolcal.words import did_you_mean
 
 # what a terminal has that nobody made wider
 _COLUMNS = 80
@@ -613,7 +614,8 @@ def _parameters(chains, name):
     for leaf in carriers:
         if key and key not in leaf.param_names:
             known = ", ".join(leaf.param_names)
-            raise ParameterError(f"{optic} has no parameter {key!r}; it has {known}")
+            hint = did_you_mean(key, leaf.param_names)
+            raise ParameterError(f"{optic} has no parameter {key!r}; it has {known}{hint}")
         found += [getattr(leaf, each) for each in ([key] if key else leaf.param_names)]
     return found
 

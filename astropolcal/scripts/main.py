@@ -68,8 +68,11 @@ class _PrintCompletion(argparse.Action):
             parser.error(f'{option_string} needs shtab: pip install "astropolcal[completion]"')
         from astropolcal.scripts._common import Folder, Input, Output
 
-        commands = next(iter(parser._subparsers._group_actions)).choices
-        for action in (action for each in commands.values() for action in each._actions):
+        (group,) = parser._subparsers._group_actions
+        for choice in group._choices_actions:
+            # zsh shows the first line of the description
+            group.choices[choice.dest].description = choice.help
+        for action in (action for each in group.choices.values() for action in each._actions):
             if isinstance(action.type, type) and issubclass(action.type, (Input, Output)):
                 folder = issubclass(action.type, Folder)
                 action.complete = shtab.DIRECTORY if folder else shtab.FILE

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The page of a diagnosis in a browser, and what a reader with a screen reader needs."""
+"""The pages of a diagnosis and of the health in a browser, and for a screen reader."""
 
 import base64
 import html
@@ -16,6 +16,7 @@ from gap_data import chain, observed, with_effect
 
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import to_dict, write_html
+from astropolcal.pipeline import write_health
 from astropolcal.scripts._diagnose import _figures, _size_figures
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -139,7 +140,7 @@ async function look(width) {
   const frame = document.createElement("iframe");
   frame.style = `border: 0; width: ${width}px; height: 900px`;
   const loaded = new Promise(resolve => { frame.onload = resolve; });
-  frame.src = "gap.html";
+  frame.src = PAGE;
   document.body.append(frame);
   await loaded;
   const page = frame.contentDocument, box = each => each.getBoundingClientRect();
@@ -163,19 +164,51 @@ async function look(width) {
 </script></body>"""
 
 
-@pytest.mark.slow
-def test_page_fits_a_telephone_a_tablet_and_a_desktop(browser, page, tmp_path):
+def at_three_widths(browser, page, folder):
+    """Return what a page measures on a telephone, a tablet and a desktop: it fits all of them."""
     path = page.with_name("frames.html")
-    path.write_text(_FRAMES)
+    path.write_text(_FRAMES.replace("PAGE", json.dumps(page.name)))
     more = ["--allow-file-access-from-files", "--virtual-time-budget=20000"]
-    dom, _ = rendered(browser, path, tmp_path / "profile", *more)
+    dom, _ = rendered(browser, path, folder, *more)
     seen = json.loads(html.unescape(re.search(r"<title>(.*)</title>", dom)[1]))
     for width, found in seen.items():
         assert found["beyond"] == [], width
         assert found["content"] <= found["room"] <= int(width), width
-    narrow, middle, wide = seen.values()
-    # figures fill the telephone, and their panels are below one another
+    narrow, _, wide = seen.values()
+    # figures fill the telephone
     assert {width for width, _ in narrow["images"]} == {narrow["text"]}
+    assert all("sideways" in hint for _, hint in narrow["tables"])
+    assert all(hint == "none" for _, hint in wide["tables"])
+    return narrow, seen["800"], wide
+
+
+@pytest.mark.slow
+def test_page_of_the_health_fits_a_telephone_a_tablet_and_a_desktop(browser, page, tmp_path):
+    path = tmp_path / "health.html"
+    course = {key: 0.2 for key in ("constant", "steps", "drift", "walk", "scatter")}
+    group = {
+        "instrument": "charis",
+        "mode": "broadband",
+        "alarms": ["wollaston.efficiency has changed by 5 standard deviations"],
+        "next": ["The next calibration is due by 2027-01-01."],
+        "events": [{"words": f"{'a long reason ' * 20}on 2026-01-01"}],
+        "left_out": ["of_another_mode.asdf"],
+        "courses": [course | {"what": "calibration_polarizer.theta", "course": "steps"}],
+        "calibrations": [
+            {"date": "2026-01-01", "name": f"{'long_' * 20}name.asdf", "converged": True}
+            | {"s_cv_percent": 0.123, "s_res_percent": None}
+        ],
+    }
+    image = Outline(page.read_text(encoding="utf-8")).images[0]["src"]
+    content = {"now": "2027-01-01T00:00:00", "groups": [group], "unreadable": {"x" * 200: "?"}}
+    write_health(content, path, figures=[{"Accuracy": image}])
+    at_three_widths(browser, path, tmp_path / "profile")
+
+
+@pytest.mark.slow
+def test_page_fits_a_telephone_a_tablet_and_a_desktop(browser, page, tmp_path):
+    narrow, middle, wide = at_three_widths(browser, page, tmp_path / "profile")
+    # the panels are below one another
     shapes = [[high / width for width, high in found["images"]] for found in (narrow, wide)]
     assert sum(one > 2 * other for one, other in zip(*shapes, strict=True)) >= 2
     assert max(width for width, _ in wide["images"]) > 800
@@ -184,8 +217,6 @@ def test_page_fits_a_telephone_a_tablet_and_a_desktop(browser, page, tmp_path):
     assert max(narrow["title"]) < 40
     # what is wider than the telephone says that it can be moved
     assert any(is_wide for is_wide, _ in narrow["tables"])
-    assert all("sideways" in hint for _, hint in narrow["tables"])
-    assert all(hint == "none" for _, hint in wide["tables"])
 
 
 # ---- without one ---------------------------------------------------------------------------
