@@ -6,6 +6,7 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
+from astropy.time import Time
 
 from astropolcal.chain import join, leaves, system_mueller, system_mueller_derivatives
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
@@ -231,19 +232,35 @@ def distinct(positions):
 
     Of positions that are all scalar the frames have no axis.
     """
-    given = {name: u.Quantity(position) for name, position in positions.items()}
-    counts = [len(position) for position in given.values() if position.ndim]
+    numbers = {name: _numbers(position) for name, position in positions.items()}
+    counts = [len(number) for number in numbers.values() if number.ndim]
     if len({*counts} - {1}) > 1:
         # refused where the matrices are made
         return positions, np.zeros((), dtype=int)
     count = max(counts, default=1)
-    for name, position in given.items():
-        shape = (count, *position.shape[1:])
-        given[name] = np.broadcast_to(position, shape, subok=True)
-    rows = np.column_stack([position.value for position in given.values()] or [np.zeros((1, 0))])
+    columns = [np.broadcast_to(number, (count, *number.shape[1:])) for number in numbers.values()]
+    rows = np.column_stack(columns or [np.zeros((1, 0))])
     _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    settings = {name: position[first] for name, position in given.items()}
+    settings = {}
+    for name, number in numbers.items():
+        given = positions[name]
+        if not hasattr(given, "shape"):
+            text = np.asarray(given).dtype.kind in "US"
+            # of texts only one date alone is understood further down
+            given = (Time if name == "time" else np.asarray)(given) if text else u.Quantity(given)
+        shape = (count, *number.shape[1:])
+        settings[name] = np.broadcast_to(given, shape, subok=True)[first]
     return settings, which.reshape((count,) if counts else ())
+
+
+def _numbers(position):
+    """Return positions, which may be dates, as plain numbers that tell them apart."""
+    if isinstance(position, Time):
+        return np.asarray(position.tai.mjd)
+    told = np.asarray(position) if not isinstance(position, u.Quantity) else position.value
+    if told.dtype.kind in "US":
+        return np.unique(told, return_inverse=True)[1].reshape(told.shape)
+    return np.asarray(u.Quantity(position).value)
 
 
 # settings of the stages that are worked on at a time: their derivatives are the largest arrays
