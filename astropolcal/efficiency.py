@@ -71,6 +71,11 @@ def has_derotator(chain):
     return bool(_turning(sky_path(chain)))
 
 
+def has_plate(chain):
+    """Return whether cycles of a half-wave plate modulate a chain, and no device with states."""
+    return "hwp" in stages(chain) and not any("=" in stage for stage in stages(chain))
+
+
 def _turning(path):
     """Return the stages with angles that are neither the plate's nor those of the sky."""
     return {stage for stage in stages(path) if stage not in COORDINATES} - {*_SKY, "hwp"}
@@ -129,7 +134,7 @@ def polarimetric_efficiency(
     Raises
     ------
     ChainError
-        If the chain has a stage that has no position here.
+        If the chain has no half-wave plate, or a stage that has no position here.
     ParameterError
         If an angle is missing or not finite, or too many values are asked for.
     ObservationError
@@ -155,6 +160,11 @@ def polarimetric_efficiency(
     ((2, 22), [0.28, 0.99])
     """
     path = sky_path(chain)
+    if not has_plate(path):
+        raise ChainError(
+            "the chain has no cycle of a half-wave plate with two beams (stage hwp); "
+            "astropolcal.efficiency.demodulation gives the efficiencies of its frames"
+        )
     law = _plate_law(path, instrument, mode) if law is None else law
     positions = _positions(path, derotator, altitude, parallactic, law)
     lam = np.atleast_1d(u.Quantity(wavelength))

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
-from astropolcal.observations.pointings import in_state
+from astropolcal.observations.pointings import in_state, modulator_states
 from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator, splits
 from astropolcal.units import length_to_um
@@ -195,7 +195,9 @@ def stage_positions(chain, frames):
     columns = {s: true if true in frames.colnames else s for s, true in known.items()}
     # a stage without a column is refused by the propagator, which knows whether it is needed
     positions = {
-        stage: finite_position(frames[column], column)
+        stage: modulator_states(frames, "frames")
+        if stage == "flc_state"
+        else finite_position(frames[column], column)
         for stage, column in columns.items()
         if column in frames.colnames
     }

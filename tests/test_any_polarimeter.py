@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal import calibrate, optics
+from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import FitError, ObservationError
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
@@ -312,9 +312,9 @@ def test_a_star_is_corrected(kind):
         np.testing.assert_allclose(found.v, 0.005, atol=5e-5)
 
 
-def test_polarization_on_sky_is_told_of_angles_without_a_half_wave_plate():
+def test_polarization_on_sky_is_known_of_angles_and_states_of_any_kind():
     """And with a hundred times the light it is known ten times as well."""
-    for kind in (KINDS[1], KINDS[2]):
+    for kind in KINDS:
         claims = []
         for flux in (1e6, 1e8):
             seen = observed(kind, seed=2, flux=flux)
@@ -388,3 +388,43 @@ def test_beams_in_columns_are_frames_of_one_group():
     wide.remove_column("flux_b_err")
     with pytest.raises(ObservationError, match="missing column flux_b_err"):
         Observations.from_table(wide)
+
+
+# --- few frames, and none with noise -------------------------------------------------------------
+
+
+def roman_star(n, **options):
+    """Frames of an unpolarized standard star at some rolls, and its chain."""
+    roman = instruments.get("roman")
+    frames = QTable({"roll": np.repeat(np.linspace(-13, 13, n), 2) * u.deg})
+    frames["prism"] = np.tile([0, 45], n) * u.deg
+    source = "unpolarized standard"
+    meta = {"instrument": "roman", "source": source}
+    options = {"flux": 1e9, "seed": 1, "meta": meta} | options
+    star = simulate(roman.chain(source), roman.wavelength, frames, **options)
+    (chain,) = roman.chains_for([star])
+    chain["wollaston"].efficiency.fixed = chain["wollaston"].theta.fixed = True
+    chain["mirrors"].retardance.fixed = True
+    return chain, star
+
+
+def test_as_many_parameters_as_data_are_refused_in_one_line():
+    chain, star = roman_star(2)
+    with pytest.raises(FitError, match="8 free parameters and 8 data leave none for the noise"):
+        calibrate(chain, star, instrument="roman")
+
+
+def test_a_table_without_noise_is_fitted_exactly():
+    chain, star = roman_star(6, noise=False)
+    found = calibrate(chain, star, instrument="roman")
+    np.testing.assert_allclose(found.residuals, 0, atol=1e-9)
+
+
+def test_states_of_a_modulator_may_be_named():
+    vampires = instruments.get("vampires")
+    frames = QTable({"hwp": [0, 45, 22.5, 67.5] * u.deg, "flc_state": ["A", "B", "A", "B"]})
+    frames["derotator"] = np.full(4, 40) * u.deg
+    simulate(vampires.published(), vampires.wavelength, frames)
+    frames["flc_state"][3] = "C"
+    with pytest.raises(ObservationError, match="flc_state = 'C' in frame 3; allowed are A and B"):
+        simulate(vampires.published(), vampires.wavelength, frames)

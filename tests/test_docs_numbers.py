@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The numbers on the page that compares with the CHARIS paper are those that come out."""
+"""The numbers on pages are those that come out, or were measured."""
 
+import json
 import re
 import warnings
 from pathlib import Path
@@ -284,3 +285,43 @@ def test_text_of_the_challenges_is_that_of_their_tables():
     none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
     assert f"nothing in all {none} challenges without a fault" in text
     assert "wrong answers 11 are to mechanisms" in text
+
+
+def test_costs_of_an_archive_are_those_of_its_record():
+    """What the page derives for a million frames follows from what was measured."""
+    record = json.loads(PAGE.with_name("archives.json").read_text(encoding="utf-8"))
+    text = " ".join(PAGE.with_name("archives.rst").read_text(encoding="utf-8").split())
+    million, hour = 1e6, 3600.0
+    sequences = million / record["frames_per_sequence"]
+    small = sequences * record["seconds_per_sequence"]
+    cubes = million * record["cube_seconds_per_frame"]
+    # milliseconds each: seconds of a million are a thousand times the number
+    first, again = (1e3 * record[f"{k}header_milliseconds"] for k in ("", "unchanged_"))
+    for words in (
+        f"{record['sequences']} sequences of {record['frames_per_sequence']} small CHARIS frames "
+        f"({record['megabytes_per_frame']} MB each",
+        f"local cluster of {record['cluster_workers']} workers, one of which was killed "
+        f"{record['workers_killed']} times. All {record['done']} products",
+        f"{record['differing']} of them differ in a bit",
+        f"{record['cores']} cores and was shared; its load was {record['load']}",
+        f"reading a header into the index {record['header_milliseconds']} ms",
+        f"has not changed {record['unchanged_header_milliseconds']} ms",
+        f"correcting a small sequence {record['seconds_per_sequence']} s",
+        f"with one process {record['serial_seconds']:.0f} s",
+        f"a worker killed twice {record['cluster_seconds']:.0f} s",
+        f"to be done for them {record['resume_seconds']} s",
+        f"of a worker, small frames {record['worker_megabytes']:.0f} MB",
+        f"(22 x 201 x 201) {record['cube_seconds_per_frame']:.2f} s",
+        f"of a worker, whole cubes {record['cube_megabytes']:.0f} MB",
+        f"all headers with one process {first / hour:.1f} h",
+        f"no file has changed {again:.0f} s",
+        f"small frames, {sequences:.0f} sequences: one core {small / hour:.0f} h",
+        f"small frames: 100 cores {small / 100 / 60:.0f} min",
+        f"whole cubes: one core {cubes / hour:.0f} h",
+        f"whole cubes: 100 cores {cubes / 100 / hour:.1f} h",
+        f"100 workers, whole cubes {record['cube_megabytes'] / 10:.0f} GB",
+        f"about {100 / record['cube_seconds_per_frame']:.0f} frames per second",
+    ):
+        assert words in text
+    assert record["done"] == record["sequences"]
+    assert record["failed"] == record["differing"] == record["resumed_sequences"] == 0

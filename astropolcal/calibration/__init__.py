@@ -2,7 +2,7 @@
 """Calibration: fit, identifiability, errors, accuracy, result and posterior of an instrument."""
 
 from astropolcal.calibration.fit.calibrate import calibrate
-from astropolcal.calibration.fit.runs import calibrate_runs
+from astropolcal.calibration.fit.runs import RunsCalibration, calibrate_runs
 from astropolcal.calibration.identifiability.analysis import examine
 from astropolcal.calibration.posterior.sampler import sample
 from astropolcal.calibration.result.calibration import Calibration
@@ -16,6 +16,7 @@ from astropolcal.calibration.validation.targets import four_accuracies, target_a
 
 __all__ = [
     "Calibration",
+    "RunsCalibration",
     "add_standard",
     "bootstrap",
     "calibrate",

@@ -1,10 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Rows of the system Mueller matrix of a chain: values, derivatives and errors."""
 
+import copy
+from functools import cached_property
+
 import astropy.units as u
 import numpy as np
+from astropy.time import Time
 
-from astropolcal.chain import join, leaves
+from astropolcal.chain import join, leaves, system_mueller, system_mueller_derivatives
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import nearest_bins
@@ -223,24 +227,144 @@ def between(lam, grid):
     return np.stack([np.interp(lam, grid[order], row) for row in rows.T], axis=1)
 
 
-def errors(calibration, axes, value, slopes, mix):
-    """Return the factor of the covariance, and which elements are open or blind."""
-    free, shape = free_of(calibration), value.shape
-    # where a law gives all wavelengths no parameter has a value at each
-    mix = np.zeros((shape[-3], len(calibration.wavelength))) if mix is None else mix
-    slopes = per_canonical(free, slopes)
-    factor = np.empty((*shape, len(axes.sigmas)))
-    is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    for w in range(shape[-3]):
-        # at one after the other, as all derivatives at once would be large
-        at = (..., slice(w, w + 1), slice(None), slice(None))
-        here, own = value[at].shape, {name: slope[at] for name, slope in slopes.items()}
-        along = axes.along(spread_out(free, own, here, mix[w : w + 1], -3).reshape(-1, free.size))
-        spread = axes.spread(*along)
-        factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
-        is_open[at] = spread.is_open.reshape(here)
-        is_blind[at] = spread.is_blind.reshape(here)
-    return factor, is_open, is_blind
+def distinct(positions):
+    """Return the positions of all distinct settings of the stages, and which one each frame has.
+
+    Of positions that are all scalar the frames have no axis.
+    """
+    numbers = {name: _numbers(position) for name, position in positions.items()}
+    counts = [len(number) for number in numbers.values() if number.ndim]
+    if len({*counts} - {1}) > 1:
+        # refused where the matrices are made
+        return positions, np.zeros((), dtype=int)
+    count = max(counts, default=1)
+    columns = [np.broadcast_to(number, (count, *number.shape[1:])) for number in numbers.values()]
+    rows = np.column_stack(columns or [np.zeros((1, 0))])
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    settings = {}
+    for name, number in numbers.items():
+        given = positions[name]
+        if not hasattr(given, "shape"):
+            text = np.asarray(given).dtype.kind in "US"
+            # of texts only one date alone is understood further down
+            given = (Time if name == "time" else np.asarray)(given) if text else u.Quantity(given)
+        shape = (count, *number.shape[1:])
+        settings[name] = np.broadcast_to(given, shape, subok=True)[first]
+    return settings, which.reshape((count,) if counts else ())
+
+
+def _numbers(position):
+    """Return positions, which may be dates, as plain numbers that tell them apart."""
+    if isinstance(position, Time):
+        return np.asarray(position.tai.mjd)
+    told = np.asarray(position) if not isinstance(position, u.Quantity) else position.value
+    if told.dtype.kind in "US":
+        return np.unique(told, return_inverse=True)[1].reshape(told.shape)
+    return np.asarray(u.Quantity(position).value)
+
+
+# settings of the stages that are worked on at a time: their derivatives are the largest arrays
+_BLOCK = 256
+
+
+class MuellerMatrices:
+    """
+    System Mueller matrices of frames and how they move with the parameters, when that is asked for.
+
+    ``positions`` are those of the distinct settings of the stages, ``which`` tells which of them
+    each frame has; ``axes`` are those of the calibration's covariance. A matrix at one wavelength
+    depends on few parameters, so that its covariance has a factor with no more columns than those.
+    """
+
+    def __init__(self, calibration, axes, chain, lam, positions, which, mix):
+        self._free, self._axes = free_of(calibration), axes
+        self._chain, self._lam, self._positions, self.which = chain, lam, positions, which
+        # where a law gives all wavelengths no parameter has a value at each
+        self._mix = np.zeros((len(lam), len(calibration.wavelength))) if mix is None else mix
+
+    def of(self, which):
+        """Return the same for other frames."""
+        new = copy.copy(self)
+        new.which = which
+        return new
+
+    def values(self):
+        """Return the matrices, (n_frames, n_wavelengths, 4, 4)."""
+        return self._found(lambda at: system_mueller(self._chain, self._lam, at), (4, 4))
+
+    def factor(self):
+        """Return the changes for one sigma along each known direction, on a last axis."""
+        known = self._along[0] * self._axes.sigmas
+        return self._found(lambda at: self._slopes(at) @ known, (4, 4, known.shape[-1]))
+
+    def local_factor(self):
+        """Return a factor of the covariance at each wavelength, (..., 16, n_parameters)."""
+        local = self._local
+        return self._found(lambda at: self._slopes(at) @ local, (16, local.shape[-1]))
+
+    def std(self):
+        """Return the standard errors, infinite for what is open and NaN for what is blind."""
+
+        def of_settings(at):
+            slopes = self._slopes(at)
+            is_open, is_blind = self._flags(slopes)
+            std = np.sqrt(np.sum((slopes @ self._local) ** 2, axis=-1))
+            return np.where(is_open, np.inf, np.where(is_blind, np.nan, std))
+
+        return self._found(of_settings, (4, 4))
+
+    def flags(self):
+        """Return which elements are open and which are blind."""
+        found = self._found(lambda at: np.stack(self._flags(self._slopes(at)), axis=2), (2, 4, 4))
+        return found[..., 0, :, :] > 0, found[..., 1, :, :] > 0
+
+    def _flags(self, slopes):
+        known, *others = self._along
+        return self._axes.flags(*(slopes @ part for part in (_reduced(known), *others)))
+
+    @cached_property
+    def _along(self):
+        """What each parameter does along the known, open and blind directions at a wavelength."""
+        ones = np.ones(len(self._lam))
+        rows = [spread_out(self._free, {name: ones}, ones.shape, self._mix) for name in self._names]
+        rows = np.reshape(rows, (len(self._names), len(ones), self._free.size))
+        return self._axes.along(rows.swapaxes(0, 1))
+
+    @cached_property
+    def _local(self):
+        return _reduced(self._along[0] * self._axes.sigmas)
+
+    @cached_property
+    def _names(self):
+        names = [f"{leaf.name}.{key}" for leaf in leaves(self._chain) for key in leaf.param_names]
+        return [name for name in names if self._free.lookup(name)[0] is not None]
+
+    def _slopes(self, at):
+        """Return derivatives at some settings, (n_settings, n_wavelengths, 16, n_parameters)."""
+        slopes = system_mueller_derivatives(self._chain, self._lam, at)
+        slopes = per_canonical(self._free, slopes)
+        shape = (len(next(iter(at.values()))), len(self._lam), 16)
+        rows = [slopes[name].reshape(shape) for name in self._names]
+        return np.stack(rows, axis=-1) if rows else np.zeros((*shape, 0))
+
+    def _found(self, of_settings, own):
+        """Return for all frames what a function gives for settings, a block after the other."""
+        needed, which = np.unique(self.which, return_inverse=True)
+        found = np.empty((len(needed), len(self._lam), *own))
+        for start in range(0, len(needed), _BLOCK):
+            block = needed[start : start + _BLOCK]
+            at = {name: position[block] for name, position in self._positions.items()}
+            found[start : start + _BLOCK] = of_settings(at).reshape(len(block), *found.shape[1:])
+        if np.array_equal(which.ravel(), np.arange(which.size)) and self.which.ndim:
+            return found
+        return found[which.reshape(self.which.shape)]
+
+
+def _reduced(rows):
+    """Return rows (..., n, k) of the same products in no more than n columns."""
+    if rows.shape[-1] <= rows.shape[-2]:
+        return rows
+    return np.linalg.qr(rows.swapaxes(-1, -2), mode="r").swapaxes(-1, -2)
 
 
 def free_of(calibration):

@@ -20,6 +20,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
+from astropolcal.pipeline.tasks import cluster_client
 from astropolcal.progress import counting, shown
 
 __all__ = ["correct"]
@@ -334,9 +335,6 @@ def _provenance(calibration, frames, systematic, given):
 # Wavelengths do not depend on each other and frames are added in the same order always, so the
 # numbers do not depend on how the work is divided.
 
-# seconds in which a cluster must answer
-_TIMEOUT = 10
-
 
 def correct_block(source, solution, start, stop, by_variance=False):
     """
@@ -537,14 +535,9 @@ def _with_threads(plan, ranges, workers, keep):
 
 
 def _with_cluster(plan, ranges, cluster, keep):
-    _need_dask()
-    try:
-        from distributed import Client, as_completed
+    client = cluster_client(cluster)
+    from distributed import as_completed
 
-        client = Client(cluster, timeout=_TIMEOUT)
-    except (ImportError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise AstropolcalError(f"cluster {cluster}: cannot be used: {reason}") from error
     with client:
         futures = client.compute(plan())
         places = dict(zip((future.key for future in futures), ranges, strict=True))

@@ -143,6 +143,8 @@ class ScienceFrames:
         fluxes, inside = np.empty(shape), _circle(self.source.image_shape)
         for w in range(shape[2]):
             fluxes[:, :, w], missing = self._totals(w, inside)
+            if missing is None:
+                continue
             # what one frame lacks is left out of all, or they would seem to differ
             if missing.any(axis=0).sum() != missing.all(axis=0).sum():
                 common = inside.copy()
@@ -152,20 +154,24 @@ class ScienceFrames:
         return replace(self, scale=frame_brightness(rows, fluxes, self.groups, **settings))
 
     def _totals(self, w, pixels):
-        """Return the light of both beams in some pixels, NaN for none; and which pixels lack."""
-        totals = np.empty((2, self.source.n_frames))
-        missing = np.zeros((2, self.source.n_frames, int(pixels.sum())), dtype=bool)
+        """Return the light of both beams in some pixels, NaN for none; and which lack, or None."""
+        totals, weights = np.empty((2, self.source.n_frames)), pixels.astype(float)
+        missing = None
         for frames in self.source.batches():
             for beam in (0, 1):
                 found = self.source.fluxes(beam, frames, slice(w, w + 1))
-                found = found.reshape(len(found), -1)[:, pixels]
-                sums = found.sum(axis=1)
+                found = found.reshape(len(found), -1)
+                with np.errstate(invalid="ignore"):
+                    sums = found @ weights
                 if not np.isfinite(sums).all():
+                    found = found[:, pixels]
+                    if missing is None:
+                        missing = np.zeros((2, len(totals[0]), found.shape[1]), dtype=bool)
                     lacks = missing[beam, frames] = ~np.isfinite(found)
                     sums = np.where(lacks, 0.0, found).sum(axis=1)
                     sums[lacks.all(axis=1)] = np.nan
                 totals[beam, frames] = sums
-        return totals, missing.reshape(-1, missing.shape[2])
+        return totals, None if missing is None else missing.reshape(-1, missing.shape[2])
 
     @classmethod
     def from_arrays(

@@ -28,6 +28,8 @@ _ALIKE = 9.0
 _ANGLES = np.deg2rad([0.005, 90.0])
 _FACTORS = np.array([1e-4, 2.0])
 _NEWTON = 8
+# variance of a brightness that no frame tells, by that of a datum
+_UNKNOWN = 1e12
 # differences that are wrong for no known reason, wavelength by wavelength
 _ANY = 0.3
 _TINY = 1e-6
@@ -52,16 +54,21 @@ class Look:
         self.vector = self.problem.vector(coefficients)
         rows = self.problem.rows([~o for o in out])
         columns = np.concatenate([self.problem.open_slopes(coefficients), self._of_flux()], axis=1)
+        #: Share of each datum, (2, W, F), that goes to the brightness of the group of a single
+        #: beam; of a frame that takes no part, its variance by that of the datum.
+        self.shares = [np.zeros(channel.shape) for channel in self.problem.channels]
+        columns = self._less_groups(columns)
         #: What the model takes up of a frame that takes part, (n_rows, rank); of one that does
         #: not, how its prediction hangs on the others.
         self.tangent, weight = _basis(columns, rows)
-        residual = self.problem.residual(coefficients)
+        residual = self._less_groups(self.problem.residual(coefficients)[:, None])[:, 0]
         #: What is left of frames that take part; of others, by how far they miss the prediction.
         self.residual = residual - self.tangent @ (weight.T @ residual)
         #: Sum of squares and degrees of freedom of the frames that take part.
         self.chi2 = float(np.sum(self.residual[rows] ** 2))
         lost = sum(
-            2 * int(c.valid[:, o].sum()) for c, o in zip(self.problem.channels, out, strict=True)
+            c.count * int(c.valid[:, o].sum())
+            for c, o in zip(self.problem.channels, out, strict=True)
         )
         self.freedom = max(self.problem.n_data - lost - self.tangent.shape[1], 1)
 
@@ -70,9 +77,30 @@ class Look:
         """Probability that noise gives as large a sum of squares."""
         return float(stats.chi2.sf(self.chi2, self.freedom))
 
+    def _less_groups(self, columns):
+        """Return columns, (n_rows, k), less the brightness of groups as frames that count say."""
+        columns = columns.copy()
+        for i, (channel, rows) in enumerate(
+            zip(self.problem.channels, self.problem.segments, strict=True)
+        ):
+            if channel.groups is None:
+                continue
+            # a datum of unit brightness, in standard deviations
+            unit = channel.whiten_frames(np.ones(channel.shape) * channel.valid)[1]
+            seen = np.square(unit) * ~self.out[i]
+            total = channel.lamp.summed(seen)
+            known = np.where(total > 0, total, 1.0)
+            table = columns[rows].T.reshape(-1, *channel.shape)
+            mean = channel.lamp.summed(table[:, 1] * (unit * ~self.out[i])) / known
+            table[:, 1] -= mean * unit
+            columns[rows] = table.reshape(len(table), -1).T
+            # the only frame of its group that takes part says nothing, nor does any other of it
+            self.shares[i][1] = np.where(total > 0, np.square(unit) / known, _UNKNOWN)
+        return columns
+
     def _of_flux(self):
         """
-        Return what background and nonlinearity do to the differences, (n_rows, k).
+        Return what background and nonlinearity do to the differences, or sums, (n_rows, k).
 
         A lamp that is dim in a few frames must not make a background look like their fault.
         """
@@ -86,9 +114,12 @@ class Look:
             bright = level / np.nanmedian(level) if channel.valid.any() else np.ones(level.shape)
             bright = np.where(channel.valid, bright, 1.0)
             shapes = (1 / bright, difference / bright, bright * difference * (1 - difference**2))
+            shapes = shapes if channel.groups is None else (1 / bright, bright)
             law = self.law(i).T[:, :, None]
             table = np.zeros((len(shapes) * len(law), *channel.shape))
-            table[:, 0] = np.concatenate([law * shape * channel.valid for shape in shapes])
+            table[:, channel.told] = np.concatenate(
+                [law * shape * channel.valid for shape in shapes]
+            )
             block = np.zeros((self.problem.n_rows, len(table)))
             block[rows] = channel.whiten_frames(table).reshape(len(table), -1).T
             blocks.append(block)
@@ -107,7 +138,8 @@ class Look:
         for channel, rows in zip(self.problem.channels, self.problem.segments, strict=True):
             _, n, f = channel.shape
             lamp = np.zeros((2, n * f, channel.n_nuisance))
-            lamp[1] = channel.nuisance
+            if channel.groups is None:
+                lamp[1] = channel.nuisance
             parts.append(
                 (
                     self.residual[rows].reshape(2 * n, f),
@@ -142,7 +174,7 @@ class Look:
             for stage, optics in stages.items()
         }
         law = self.law(i).T[:, None, :, None]
-        for beam, name in enumerate(("right beam", "left beam")):
+        for beam, name in enumerate(("right beam", "left beam")[: channel.count]):
             found[name] = law * np.stack([weight[beam] * sweep.fluxes[beam] for weight in weights])
         return {
             kind: channel.whiten_frames(c * channel.valid).reshape(len(c), -1, channel.shape[2])
@@ -157,6 +189,8 @@ class Look:
         for taken in (tangent, lamp):
             part = np.einsum("afk,haf->fkh", taken, columns, optimize=True)
             inner -= np.einsum("fkh,fkg->fhg", part, part)
+        share = self.shares[i].reshape(residual.shape)
+        inner -= np.einsum("af,haf,gaf->fhg", np.minimum(share, 1.0), columns, columns)
         scale = np.sqrt(np.where(full > 0, full, 1.0))
         values, vectors = np.linalg.eigh(inner / scale[:, :, None] / scale[:, None, :])
         along = np.einsum("haf,af->fh", columns, residual) / scale
@@ -171,16 +205,24 @@ class Look:
         That is by how much it falls if a frame that takes part is left out, and by how much it
         rises if one that does not is taken in.
         """
-        residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]
-        n = channel.shape[1]
-        residual, tangent = residual[:n].T, tangent[:n].transpose(1, 0, 2)
-        values, vectors = np.linalg.eigh(tangent @ tangent.swapaxes(1, 2))
+        residual, taken = self._told(i)
+        values, vectors = np.linalg.eigh(taken)
         along = np.einsum("fab,fa->fb", vectors, residual)
         share = np.where(self.out[i][:, None], 1 + values, 1 - values)
         seen = share > _SEEN
         fall = np.where(seen, along**2 / np.where(seen, share, 1.0), 0.0).sum(axis=1)
         return fall, channel.valid.sum(axis=0)
+
+    def _told(self, i):
+        """Return residual (F, W) of what tells the gap, and what the model absorbs, (F, W, W)."""
+        residual, tangent, _ = self._parts[i]
+        channel = self.problem.channels[i]
+        n, told = channel.shape[1], channel.told
+        rows = slice(told * n, (told + 1) * n)
+        tangent = tangent[rows].transpose(1, 0, 2)
+        own = self.shares[i][told].T[:, :, None] * np.eye(n)
+        return residual[rows].T, tangent @ tangent.swapaxes(1, 2) + own
 
     def kept(self, i):
         """Return which frames of a dataset take part and have data, (F,) of bool."""
@@ -194,15 +236,14 @@ class Look:
         covariance of this, with the errors of the prediction, (W, W); and the inverse of the noise,
         (W,).
         """
-        residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]
-        n = channel.shape[1]
-        weight = channel.whiten_frames(np.ones(channel.shape) * channel.valid)[0, :, f]
-        values, vectors = np.linalg.eigh(tangent[:n, f] @ tangent[:n, f].T)
+        residual, taken = (part[f] for part in self._told(i))
+        weight = channel.whiten_frames(np.ones(channel.shape) * channel.valid)[channel.told, :, f]
+        values, vectors = np.linalg.eigh(taken)
         if self.out[i][f]:
-            return residual[:n, f], (vectors / (1 + values)) @ vectors.T, weight
+            return residual, (vectors / (1 + values)) @ vectors.T, weight
         share = np.where(1 - values > _SEEN, 1 - values, np.inf)
-        missed = (vectors / share) @ vectors.T @ residual[:n, f]
+        missed = (vectors / share) @ vectors.T @ residual
         return missed, (vectors * np.maximum(1 - values, 0.0)) @ vectors.T, weight
 
     def sums_of_frame(self, i, f):
@@ -265,9 +306,10 @@ class Frame:
         self.look, self.i, self.f, self.scatter = look, i, f, scatter
         self.dataset, self.channel = look.problem.datasets[i], look.problem.channels[i]
         self.valid = self.channel.valid[:, f]
-        self.sigma = self.channel.sigma[0, :, f] * np.sqrt(scatter)
+        told, self.single = self.channel.told, self.channel.groups is not None
+        self.sigma = self.channel.sigma[told, :, f] * np.sqrt(scatter)
         self.weight = np.where(self.valid, 1 / self.sigma, 0.0)
-        self.observed = self.channel.observed[0, :, f]
+        self.observed = self.channel.observed[told, :, f]
         missed, self._sight, weight = look.of_frame(i, f)
         plain = self.predicted(self._positions([f]))[:, 0]
         # what others say beyond the optics, of background and the like
@@ -290,12 +332,14 @@ class Frame:
         return {stage: np.atleast_1d(p)[..., frames] for stage, p in given.items()}
 
     def predicted(self, positions):
-        """Return the differences at some positions of the stages, (W, n)."""
+        """Return the differences, or log fluxes of a single beam, at some positions, (W, n)."""
         chain = self.look.chains[self.i]
         wavelength = self.dataset.propagator.wavelength
         right, left = Propagator(chain, wavelength, positions).fluxes(
             self.dataset.current_values(self.look.vector)
         )
+        if self.single:
+            return np.log(np.maximum(right, _TINY))
         return (right - left) / (right + left)
 
     def chi2(self, difference):
@@ -314,7 +358,8 @@ class Frame:
         """Return all trials that need no other frame."""
         stages = [self.angle(stage) for stage in angle_stages(self.look.chains[self.i])]
         degrees = range(self.look.law(self.i).shape[1])
-        beams = [self.beam(degree, side) for degree in degrees for side in _BEAMS]
+        sides = (1,) if self.single else _BEAMS
+        beams = [self.beam(degree, side) for degree in degrees for side in sides]
         return [*stages, *beams, self.anything()]
 
     def angle(self, stage):
@@ -352,7 +397,7 @@ class Frame:
 
     def beam(self, degree, side):
         """
-        Return the trial in which the right (1) or left (-1) beam was off by a factor.
+        Return the trial in which the right (1) or left (-1) beam, or a single one, was off.
 
         The logarithm of the factor is a law in wavelength. The sums take part, too: they tell
         which of the beams it was where the lamp is steady.
@@ -372,11 +417,17 @@ class Frame:
         cost = _occam(size[0], errors[0], _FACTORS)
         cost += sum(_share(error, 2 * biggest) for error in errors[1:])
         mean = float(np.exp(np.mean((law @ size)[self.valid])))
-        return Trial("one beam", chi2, cost, mean, float(errors[0] * mean), beam=_BEAMS[side])
+        error = float(errors[0] * mean)
+        if self.single:
+            return Trial("brightness", chi2, cost, mean, error)
+        return Trial("one beam", chi2, cost, mean, error, beam=_BEAMS[side])
 
     def _of_beam(self, law, size, side):
         """Return what a law leaves of differences and sums, and its derivatives; unit noise."""
         factor = law @ size
+        if self.single:
+            left = (self.observed - self._plain - factor + self._offset) * self.weight
+            return self._root @ left, self._root @ (law * self.weight[:, None])
         shifted = _shifted(self._plain, side * factor)
         left = (self.observed - shifted + self._offset) * self.weight
         slopes = side * law * ((1 - shifted**2) / 2 * self.weight)[:, None]
@@ -400,6 +451,44 @@ class Frame:
     def with_positions_of(self, frames):
         """Return what is left of the frame if its stages stood as in others, (n,)."""
         return self.chi2(self.predicted(self._positions(frames)))
+
+
+class Group(Frame):
+    """All frames of a group of a single beam, which stood alike and share their brightness."""
+
+    def __init__(self, look, i, f, scatter=1.0):
+        self.look, self.i, self.f = look, i, f
+        self.dataset, self.channel = look.problem.datasets[i], look.problem.channels[i]
+        channel = self.channel
+        mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
+        self.frames, self.single = np.flatnonzero(mates), True
+        valid, sigma = (a[:, self.frames] for a in (channel.valid, channel.sigma[channel.told]))
+        self._weight = np.where(valid, 1 / np.square(sigma), 0.0)[:, None] / scatter
+        self.observed = channel.observed[channel.told][:, self.frames]
+        #: Data less the brightness at each wavelength, and less an angle.
+        self.freedom = int(valid.sum() - valid.any(axis=1).sum()) - 1
+
+    def as_told(self):
+        """Return the trial in which nothing is wrong."""
+        stage = next(iter(angle_stages(self.look.chains[self.i])))
+        return Trial("none", float(self._turned(stage, np.zeros(1))[0]), 0.0)
+
+    def trials(self):
+        """Return the trials in which a stage stood elsewhere in all frames, the best first."""
+        angles = self._positions(self.frames)
+        alike = [s for s in angle_stages(self.look.chains[self.i]) if np.ptp(angles[s]) == 0]
+        return sorted((self.angle(stage) for stage in alike), key=lambda trial: trial.total)
+
+    def _turned(self, stage, offsets):
+        """Return the sum of squares that each of some angles leaves."""
+        count = len(self.frames)
+        positions = self._positions(np.tile(self.frames, len(offsets)))
+        positions[stage] = positions[stage] + np.repeat(offsets, count)
+        predicted = self.predicted(positions).reshape(len(self.observed), -1, count)
+        left = self.observed[:, None] - predicted
+        total = self._weight.sum(axis=-1, keepdims=True)
+        mean = (self._weight * left).sum(axis=-1, keepdims=True) / np.where(total > 0, total, 1.0)
+        return (self._weight * (left - mean) ** 2).sum(axis=(0, 2))
 
 
 def _root(matrix):

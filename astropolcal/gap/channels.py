@@ -235,10 +235,14 @@ class _GroupLamp(_Lamp):
         # (F, n_groups)
         self.member = np.eye(groups.max() + 1)[groups]
 
+    def summed(self, values):
+        """Return the sum of (..., F) over the group of each frame."""
+        return values @ self.member @ self.member.T
+
     def mean(self, values, weight):
         """Return the mean of (..., F) over the group of each frame."""
-        total = (weight @ self.member) @ self.member.T
-        return ((values * weight) @ self.member @ self.member.T) / np.where(total > 0, total, 1.0)
+        total = self.summed(weight)
+        return self.summed(values * weight) / np.where(total > 0, total, 1.0)
 
     def brightness(self, shift, weight):
         """Return the brightness of each frame, that of its group, (F,)."""

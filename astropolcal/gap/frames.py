@@ -18,9 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.calibration.noise.estimates import frame_noise
-from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages
-from astropolcal.gap.channels import settings
+from astropolcal.gap._frame_looks import Frame, Group, Look, Trial, angle_stages
+from astropolcal.gap.channels import noise, settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
@@ -33,8 +32,9 @@ _RARE, _UNEXPLAINED = 10.0, 0.1
 # an exchange makes either frame better by so much, and is tried for so many frames
 _BETTER, _PARTNERS = 10.0, 5
 _CERTAIN = 0.99
-# a beam is called by its name where it is it with this share
-_TELLS = 0.95
+# a beam is called by its name where it is it with this share; below the other the kinds of error
+# that may be meant are all named
+_TELLS, _DECIDED = 0.95, 0.8
 # brightness off by so many robust standard deviations is at odds with the drift of the lamp
 _FAR, _LARGEST_DRIFT = 6.0, 4
 # chance of a false accusation in a run, and the share of the frames that may be accused
@@ -43,6 +43,8 @@ _MOST, _LEAST_MOST = 0.05, 2
 # a fit is down to the noise at this chance; else so much of the excess has to be gone, and the
 # accused have to stand so far above the others
 _NOISE, _GONE, _APART = 1e-3, 0.8, 10.0
+# one angle of a group explains its frames if so little is left of them
+_LEFT = 0.01
 # of very many frames several are taken at once, those nearly as bad as the worst
 _AT_ONCE, _NEARLY = 12, 0.5
 # as bad frames are found, so little of the excess is left that the noise is measured anew
@@ -58,9 +60,9 @@ class FrameFault:
     dataset: str
     #: The frame's number in the table.
     frame: int
-    #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"unknown"``
-    #: where neither of these describes it, or ``"lamp"`` where only the brightness is off its
-    #: drift, which does not harm the differences.
+    #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"brightness"``
+    #: of a single beam, ``"unknown"`` where none of these, or more than one, describes it, or
+    #: ``"lamp"`` where only the brightness is off its drift, which does not harm the differences.
     what: str
     #: Number of the frame with which it was exchanged.
     with_: int | None = None
@@ -90,10 +92,9 @@ def suspect_frames(model):
     Those of which only the lamp is off come last. There are none where no frame stands out, or so
     many that the model is at fault and not the frames. Where an optic is missing from the model
     everywhere, a small fault of one frame cannot be distinguished from it: look again once the
-    optic is in. A single beam accuses no frame, as others of its group would have to tell.
+    optic is in. A frame of a single beam is compared with the others of its group: what they cannot
+    tell, such as which of two it is, its words say.
     """
-    if any(channel.groups is not None for channel in model.problem.channels):
-        return []
     search = Search(model)
     accused, last = search.accused()
     found = _Hearing(search).faults(accused, last) if accused else []
@@ -137,7 +138,8 @@ class _Hearing:
             fault = self._verdict(place, trials[place], exchanged[place])
             if fault is not None:
                 found.append(fault)
-        return sorted(self._with_partners(found), key=lambda fault: -fault.evidence)
+        found = self._of_groups(self._with_partners(found), last, scatter)
+        return sorted(found, key=lambda fault: -fault.evidence)
 
     def _verdict(self, place, trials, exchanged):
         """Weigh the trials of a frame against each other (Bayes), or return None: no fault."""
@@ -161,7 +163,57 @@ class _Hearing:
         evidence = none.total - best.total + 2 * np.log(prior)
         sides = [w for t, w in zip(rest, weight[1:], strict=True) if t.beam == best.beam]
         best.beam = best.beam if sum(sides) > _TELLS * by_kind[what] else ""
-        return self._fault(place, best, float(evidence), min(by_kind[what], 1.0))
+        fault = self._fault(place, best, float(evidence), min(by_kind[what], 1.0))
+        rivals = {t.what: t for t in sorted(rest, key=lambda t: -t.total) if t.what in by_kind}
+        rivals = {kind: t for kind, t in rivals.items() if by_kind[kind] > 1 - _TELLS}
+        rivals = rivals if by_kind[what] < _DECIDED else {}
+        return self._of_design(fault, rivals, 1 - weight[0])
+
+    def _of_groups(self, found, last, scatter):
+        """Return the faults; of several in a group of a single beam, a stage of all its frames."""
+        several = {}
+        for fault in found:
+            i, f = fault.place
+            groups = self.problem.channels[i].groups
+            if groups is not None:
+                several.setdefault((i, int(groups[f])), []).append(fault)
+        for (i, _), faults in several.items():
+            group = Group(last, i, faults[0].place[1], scatter[i])
+            trials = group.trials() if len(faults) > 1 else []
+            if not trials:
+                continue
+            chi2, before = trials[0].chi2, group.as_told().chi2
+            # one angle explains all of them, down to the noise or to what the fit is uncertain by
+            if stats.chi2.sf(chi2, max(group.freedom, 1)) < _NOISE and chi2 > _LEFT * before:
+                continue
+            near = trials[0].total - 2 * np.log(1 - _TELLS)
+            rivals = {t.what: t for t in reversed(trials) if t.total < near}
+            worst = max(faults, key=lambda fault: fault.evidence)
+            found = [fault for fault in found if fault not in faults]
+            for f in group.frames:
+                fault = self._fault((i, int(f)), trials[0], worst.evidence, worst.probability)
+                found.append(self._of_design(fault, rivals, worst.probability))
+        return found
+
+    def _of_design(self, fault, rivals, probability):
+        """Return a fault with what the design of its observation cannot tell."""
+        i, f = fault.place
+        channel = self.problem.channels[i]
+        if len(rivals) > 1:
+            kinds = [self._fault(fault.place, t, 0.0, 0.0) for t in rivals.values()]
+            each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
+            fault.what, fault.value, fault.error, fault.with_ = "unknown", None, None, None
+            fault.partner_place, fault.probability = None, float(probability)
+            fault.words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
+        if channel.groups is None:
+            return fault
+        mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
+        if mates.sum() == 2:
+            numbers = self.problem.datasets[i].observations.frames["frame"]
+            one, other = (int(numbers[k]) for k in np.flatnonzero(mates))
+            fault.words += f"; or it is the other of the group: frames {one} and {other} alone"
+            fault.words += " cannot tell which of them is wrong"
+        return fault
 
     def _fault(self, place, trial, evidence, probability):
         i, f = place
@@ -229,7 +281,7 @@ def _as_told(trial, observations, f, dataset):
     """Return value and error of a trial in the units of the user, and what the table says."""
     if not np.isfinite(trial.value):
         return None, None, None
-    if trial.what == "one beam":
+    if trial.what in ("one beam", "brightness"):
         return trial.value, trial.error, None
     stage = trial.what.removesuffix(" angle")
     stood = float(np.atleast_1d(dataset._given[stage])[f])
@@ -247,6 +299,10 @@ def _words(fault, told, beam=""):
     if fault.what == "one beam":
         which = f"the {beam} beam" if beam else "one beam"
         return f"{head}{which} is off by {100 * abs(fault.value - 1):.2g} %"
+    if fault.what == "brightness":
+        return (
+            f"{head}its brightness is off that of its group by {100 * abs(fault.value - 1):.2g} %"
+        )
     if fault.what == "lamp":
         return f"{head}the lamp is off its drift by {100 * abs(fault.value - 1):.2g} %"
     if fault.what == "unknown":
@@ -268,6 +324,9 @@ def _lamp(model):
     found = []
     problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
     for i, channel in enumerate(problem.channels):
+        if channel.groups is not None:
+            # its frames have no other brightness than that of their group
+            continue
         observations = problem.datasets[i].observations
         deviation, score = _off_the_drift(channel, gaps[i][1])
         far = np.flatnonzero(np.abs(np.nan_to_num(score)) > _FAR)
@@ -425,7 +484,7 @@ def _noise_of_others(channel, residual, angles, without):
     """Return the noise of every datum, as it is where some frames take no part."""
     others = copy.copy(channel)
     others.valid = channel.valid & ~without
-    sigma, stated = frame_noise(others, residual, angles), np.sqrt(channel.variance)
+    sigma, stated = noise(others, residual, angles), np.sqrt(channel.variance)
     for own, told in zip(sigma, stated, strict=True):
         known = others.valid & np.isfinite(told) & (told > 0)
         if known.any():

@@ -340,17 +340,23 @@ class Instrument(ABC):
         Parameters
         ----------
         source : str
-            What sends the light.
+            What sends the light, one of ``sources``.
         optics_in : sequence of str
-            Optional optics in the beam.
+            Which of ``optional_optics`` are in the beam.
         wavelength : `~astropy.units.Quantity`, optional
-            Grid of the parameters given per wavelength.
+            Grid of the parameters given per wavelength, by default the usual one.
         **options
-            Particular to the instrument.
+            Particular to the instrument. Most take ``star``, the name of the source optic of a
+            star, and ``target``, the name of the star in the catalogue.
 
         Returns
         -------
         `~astropy.modeling.CompoundModel`
+
+        Raises
+        ------
+        InstrumentError
+            If a choice is unknown.
         """
 
     def setup(self, observations):

@@ -19,16 +19,14 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import telescope as subaru
-from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.layout import FileLayout, frame_time
+from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
 
-# McIntosh et al. 2026, Dataset 3, final fit for each of the 22 bins (in the signs they publish)
-_DEROTATOR_HORIZONTAL = [251.47, 235.97, 223.97, 209.45, 166.71, 153.47, 140.0, 124.37, 110.61,
-                         98.49, 86.98, 77.67, 71.03, 65.73, 60.99, 58.05, 56.51, 55.28, 54.92,
-                         55.18, 56.02, 57.04]  # fmt: skip
+# McIntosh et al. 2026, Dataset 3, final fit for each of the 22 bins (in the signs they publish);
+# horizontal retardances: `DEROTATOR_HORIZONTAL`
 _DEROTATOR_DIAGONAL = [5.08, 5.68, 6.16, 6.8, 5.0, 4.88, 5.01, 4.56, 4.05, 3.78, 3.57, 3.2, 2.9,
                        2.88, 2.36, 2.08, 2.27, 2.51, 2.81, 3.16, 3.76, 4.07]  # fmt: skip
 _DEROTATOR_CIRCULAR = [0, 0, 0, 0, 0, 0, 1.69, 3.1, 3.74, 4.5, 4.73, 4.8, 5.01, 5.27, 5.25, 5.07,
@@ -38,14 +36,6 @@ _EFFICIENCY = [1.0, 0.992, 0.9953, 0.9816, 0.97, 0.9905, 0.9892, 0.9903, 0.9908,
                0.9523]  # fmt: skip
 _PUBLISHED_SIO2, _PUBLISHED_MGF2 = 1.653, 1.291
 _PUBLISHED_MISALIGNMENT = {"calibration_polarizer": 90.03, "derotator": -0.02, "hwp": -0.04}
-
-#: Bounds of the derotator's retardances, by their name.
-BOUNDS = {
-    # every sign and mirror branch of the retardances
-    "physical": {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)},
-    # 0 to 360 deg in the published signs, turned to ours
-    "paper": {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)},
-}
 
 # the only one with polarimetry
 _MODE = "broadband JHK"
@@ -59,7 +49,7 @@ _ABSENT = {
 }
 
 
-class CHARIS(Instrument):
+class CHARIS(SubaruPolarimeter):
     """
     Subaru/SCExAO/CHARIS in its broadband spectropolarimetric mode.
 
@@ -75,14 +65,8 @@ class CHARIS(Instrument):
     name = "charis"
     aliases = ("SCExAO/CHARIS", "Subaru/SCExAO/CHARIS")
     # bins of equal resolving power, as the cubes of the extraction have them
-    wavelength = np.geomspace(1159.5614, 2369.3441, 22) * u.nm
-    keywords = {
-        "hwp": "RET-ANG1",
-        "hwp_true": "RET-POS1",
-        "derotator": "D_IMRANG",
-        "parallactic": "PARANG",
-        "altitude": "ALTITUDE",
-    }
+    wavelength = subaru.BINS
+    keywords = SubaruPolarimeter.keywords | {"parallactic": "PARANG"}
     files = FileLayout(
         keywords=keywords
         | {
@@ -122,9 +106,7 @@ class CHARIS(Instrument):
         "'t Hart et al. 2021, Proc. SPIE 11833",
         "van Holstein et al. 2020, Proc. SPIE 11447",
     )
-    sources = (*subaru.INTERNAL, *subaru.STARS)
     optional_optics = ("nbs", "dichroic")
-    changes = subaru.CHANGES
 
     def chain(
         self,
@@ -171,19 +153,8 @@ class CHARIS(Instrument):
         m3 : {"free", "power law", "metal"}
             Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
             permittivity, or silver with a film.
-        star : str
-            Name of the source optic in a star's chain.
-        target : str, optional
-            Name of the star, for what the catalogue of standards knows of it.
 
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If a choice is unknown.
+        Others, and what is returned and raised, are as in `Instrument.chain`.
 
         Examples
         --------
@@ -192,12 +163,12 @@ class CHARIS(Instrument):
         >>> chain["derotator"].retardance.shape
         (22,)
         """
-        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, tuple(BOUNDS))}
+        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, subaru.BOUNDS)}
         self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
         grid = self.grid(wavelength)
         train = subaru.entrance(source, grid, star, target, m3)
         train.append(subaru.two_layer_plate(**subaru.misaligned(0)))
-        train.append(subaru.derotator(derotator, derotator_start(grid), BOUNDS[bounds]))
+        train.append(subaru.published_derotator(grid, derotator, bounds))
         if "dichroic" in optics_in:
             # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
@@ -205,10 +176,6 @@ class CHARIS(Instrument):
             train.append(optics.ParityFlip(name="nbs"))
         train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
         return join(train)
-
-    def telescope_optics(self, behind):
-        """Return the telescope with the tertiary mirror that is published."""
-        return subaru.telescope(subaru.published_mirror())
 
     def published(self):
         """
@@ -231,7 +198,7 @@ class CHARIS(Instrument):
         hwp, derotator = chain["hwp"], chain["derotator"]
         # (H, 45) with the other sign, see the signs at the top
         hwp.w_sio2, hwp.w_mgf2 = _PUBLISHED_SIO2 * u.mm, _PUBLISHED_MGF2 * u.mm
-        derotator.horizontal = -np.array(_DEROTATOR_HORIZONTAL) * u.deg
+        derotator.horizontal = -np.array(subaru.DEROTATOR_HORIZONTAL) * u.deg
         derotator.diagonal = -np.array(_DEROTATOR_DIAGONAL) * u.deg
         derotator.circular = np.array(_DEROTATOR_CIRCULAR) * u.deg
         chain["wollaston"].efficiency = _EFFICIENCY
@@ -294,14 +261,8 @@ class CHARIS(Instrument):
             time = frame_time(header, self.files)
         except (TypeError, ValueError):
             return {}
-        present = None if time is None else _switcher_by(time.utc.isot[:10])
+        present = None if time is None else _switcher_by(time.isot[:10])
         return {} if present is None else {"nbs": present}
-
-
-def derotator_start(grid):
-    """Return the published horizontal retardances in our sign, where a fit starts."""
-    nm = CHARIS.wavelength.to_value(u.nm)
-    return -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
 
 
 def _stated(meta, name, key, words):

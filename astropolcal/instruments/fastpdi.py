@@ -26,11 +26,6 @@ class FastPDI(SubaruPolarimeter):
     """
     Subaru/SCExAO/Fast-PDI with or without its liquid crystal.
 
-    References
-    ----------
-    fastpdi_dpp, https://github.com/scexao-org/fastpdi_dpp.
-    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833, for plate and derotator.
-
     Examples
     --------
     >>> from astropolcal import instruments

@@ -11,22 +11,27 @@ Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1
 of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
 Gonzalez-Gaitan et al. 2020 (imaging in four filters).
 
+ESO's manual (Sec. 4.6.2, as the public code https://github.com/gongsale/FORS2-INSTPOL reads it)
+has angles of polarization too large by 1.54, 1.80, -1.19 and -2.89 deg in the four filters here,
+because the zero of the plate depends on the wavelength: it starts at half of that with the other
+sign, and is free.
+
 Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99,
-and what is polarized on the axis starts at 0. The zero of the plate depends on the wavelength;
-the table of it by ESO is not included: it is free, 0 deg at the start. The sign of
-``ESO ADA POSANG`` is taken as that of a position angle from north to east.
+and what is polarized on the axis starts at 0. The sign of ``ESO ADA POSANG`` is taken as that of a
+position angle from north to east.
 """
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 from astropolcal.instruments.telescope import PARANAL
 
 __all__ = []
+
+# of the plate in b_HIGH, v_HIGH, R_SPECIAL and I_BESS (deg)
+_ZERO = (-0.77, -0.90, 0.595, 1.445)
 
 
 class FORS2(Polarimeter):
@@ -37,12 +42,6 @@ class FORS2(Polarimeter):
     ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
     and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
     hides.
-
-    References
-    ----------
-    Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581.
-    Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545.
-    Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379.
 
     Examples
     --------
@@ -61,25 +60,21 @@ class FORS2(Polarimeter):
         "parallactic": "ESO ADA POSANG",
         "altitude": "ESO TEL ALT",
     }
-    headers = header_map(keywords)
     references = (
         "Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581",
         "Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545",
         "Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379",
+        "FORS2-INSTPOL, https://github.com/gongsale/FORS2-INSTPOL",
     )
     entrance = "collimator"
-    site = PARANAL
-    #: The plate stays where it is put: it turns with the instrument.
-    sky_law = SkyLaw(plate=(0, 0), derotator={})
+    # M1 and M2 do not polarize on the axis
+    site, focus = PARANAL, "cassegrain"
 
     def inner(self, source, optics_in, grid):
         """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
         zero = np.zeros(grid.size)
         collimator = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="collimator")
         collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
-        plate = turning_retarder("hwp", 178, grid, most=15, theta=zero * u.deg)
+        theta = np.interp(grid.to_value(u.nm), self.wavelength.value, _ZERO)
+        plate = turning_retarder("hwp", 178, grid, most=15, theta=theta * u.deg)
         return [collimator, plate, wollaston(grid)]
-
-    def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the turning of the sky; M1 and M2 do not polarize on the axis."""
-        return [optics.Rotator(mount="parallactic", name="parallactic")]

@@ -8,9 +8,13 @@ prism downstream of the lenslets (Perrin et al. 2015). What polarizes is all ups
 Wiktorowicz et al. (2014) measured how unpolarized light leaves it in the band H. Millar-Blanchaer
 et al. (2016) find it to be the same at all wavelengths within their errors.
 
-Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99. The
-keyword ``WPANGLE`` of the plate, and ``PAR_ANG``, are those that public code reads; the direction
-and the zero in which the plate is counted are not known: its angle is free within 30 deg.
+The public pipeline, https://github.com/geminiplanetimager/gpi_pipeline, gives keywords and signs
+(primitive ``gpi_combine_polarization_sequence``): the sky is turned by ``PAR_ANG`` and the plate
+stands at ``WPANGLE`` + 29.14 deg. It has the retardances of the plate measured in the laboratory,
+within 7 deg of half a wave. Both are starts here, and free. That of K2 is above half a wave, and
+starts as far below it: linear polarization does not tell the two apart.
+
+Not known from these, and nominal here: the efficiency of the prism, 0.99.
 """
 
 import astropy.units as u
@@ -18,8 +22,6 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import replace_optic
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 from astropolcal.instruments.telescope import STARS
 
@@ -27,6 +29,8 @@ __all__ = []
 
 # Wiktorowicz et al. 2014: Q, U and V of unpolarized light that leaves telescope and optics
 _POLARIZANCE = (-0.00037, 0.004338, -0.0664)
+# of the public pipeline: retardances in Y, J, H, K1 and K2, and the angle of the plate (deg)
+_RETARDANCE, _ZERO = (178.9, 175.6, 172.9, 178.5, 175.8), 29.14
 
 
 class GPI(Polarimeter):
@@ -35,12 +39,6 @@ class GPI(Polarimeter):
 
     Free are, per wavelength, the linear diattenuation of all that is upstream of the plate, the
     retardance of the plate and the efficiency of the prism; and the angle of the plate.
-
-    References
-    ----------
-    Wiktorowicz et al. 2014, Proc. SPIE 9147, arXiv:1407.2505.
-    Perrin et al. 2015, ApJ 799, 182, arXiv:1407.2495.
-    Millar-Blanchaer et al. 2016, Proc. SPIE 9908, 990836, arXiv:1609.08691.
 
     Examples
     --------
@@ -57,27 +55,24 @@ class GPI(Polarimeter):
     # nominal centres of Y, J, H, K1 and K2
     wavelength = [1.05, 1.24, 1.65, 2.05, 2.26] * u.um
     keywords = {"hwp": "WPANGLE", "parallactic": "PAR_ANG"}
-    headers = header_map(keywords)
     references = (
         "Wiktorowicz et al. 2014, Proc. SPIE 9147, arXiv:1407.2505",
         "Perrin et al. 2015, ApJ 799, 182, arXiv:1407.2495",
         "Millar-Blanchaer et al. 2016, Proc. SPIE 9908, 990836, arXiv:1609.08691",
+        "GPI data pipeline, https://github.com/geminiplanetimager/gpi_pipeline",
     )
     sources = STARS
     entrance = "telescope_and_ao"
-    site = (-70.7366, -30.2407, 2722.0)
-    #: The plate does not follow the sky.
-    sky_law = SkyLaw(plate=(0, 0), derotator={})
+    # what the telescope polarizes is published together with the instrument
+    site, focus = (-70.7366, -30.2407, 2722.0), "cassegrain"
 
     def inner(self, source, optics_in, grid):
         """Return what is upstream of the plate, the plate and the prism."""
         q, u_ = (np.full(grid.size, value) for value in _POLARIZANCE[:2])
         upstream = optics.VectorDiattenuator(horizontal=q, diagonal=u_, name="telescope_and_ao")
-        return [upstream, turning_retarder("hwp", 178, grid, most=30), wollaston(grid)]
-
-    def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the turning of the sky; what the telescope polarizes is published as one."""
-        return [optics.Rotator(mount="parallactic", name="parallactic")]
+        retardance = np.interp(grid.to_value(u.um), self.wavelength.value, _RETARDANCE)
+        plate = turning_retarder("hwp", retardance, grid, about=_ZERO, most=30)
+        return [upstream, plate, wollaston(grid)]
 
     def published(self):
         """

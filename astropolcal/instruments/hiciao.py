@@ -26,11 +26,6 @@ class HiCIAO(SubaruPolarimeter):
     """
     Subaru/HiCIAO with half-wave plate, derotator and Wollaston prism.
 
-    References
-    ----------
-    Hashimoto, "Polarimetric Calibration for Nasmyth instrument HiCIAO", slides of SEEDS.
-    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833, for plate and derotator.
-
     Examples
     --------
     >>> from astropolcal import instruments

@@ -22,12 +22,6 @@ class IRCS(SubaruPolarimeter):
     """
     Subaru/IRCS with the half-wave plate for J, H and K.
 
-    References
-    ----------
-    "Thermal-infrared adaptive optics imaging- and spectro-polarimetry with the Infrared Camera and
-    Spectrograph (IRCS) for the Subaru Telescope", on another plate of the same unit.
-    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833, for plate and derotator.
-
     Examples
     --------
     >>> from astropolcal import instruments

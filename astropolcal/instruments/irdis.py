@@ -499,19 +499,13 @@ class IRDIS(Instrument):
             Filters by their central wavelengths, by default all four.
         coating : {"before", "after"}
             Coating of the telescope's mirrors: before or after 2017-04-16.
-        star : str
-            Name of the source optic in a star's chain.
-        target : str, optional
-            Name of the star, for what the catalogue of standards knows of it.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
 
         Raises
         ------
         InstrumentError
             If a choice is unknown, or a wavelength is that of no filter with coefficients.
+
+        Others, and what is returned and raised, are as in `Instrument.chain`.
 
         Examples
         --------

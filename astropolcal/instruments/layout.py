@@ -5,6 +5,7 @@ How the FITS files of an instrument look, and what their headers say in the unit
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 
@@ -120,11 +121,19 @@ class FileLayout:
         Of a pixel of the cube, electrons.
     saturation : float
         Value of a pixel, in adu, above which it is not linear.
+    beams : tuple of str
+        Names of the beams in an image, 1 to N; a single one of any name is the column ``flux``.
+    stages : tuple of str
+        Columns of the stages that each frame must have, as far as they have keywords.
+    texts : tuple of str
+        Those of them that have states, whose names the keywords give.
     internal_apertures : tuple
         ((x, y) of the left rectangle, (x, y) of the right one, width, height,
-        rotation).
+        rotation); of other beams the places in the order of ``beams``.
     star_offset : tuple of float
         (x, y) from a star's image in the left beam to that in the right one.
+    star_offsets : tuple of (float, float)
+        Of other beams: places of a star's images, in the order of ``beams``, from a common one.
     pixel_scale : float
         Milliarcsecond.
     edge : float
@@ -191,8 +200,12 @@ class FileLayout:
     gain: float = 1.0
     read_noise: float = 0.0
     saturation: float = float("inf")
+    beams: tuple = ("right", "left")
+    stages: tuple = ("hwp", "derotator")
+    texts: tuple = ()
     internal_apertures: tuple = ()
     star_offset: tuple = (0.0, 0.0)
+    star_offsets: tuple = ()
     pixel_scale: float = 1.0
     edge: float = 1.0
     fwhm: float = 4.0
@@ -224,6 +237,12 @@ class FileLayout:
             raise InstrumentError(
                 f"weights = {self.weights!r}; allowed are {', '.join(map(repr, _WEIGHTS))}"
             )
+        if not self.beams or len({*self.beams}) < len(self.beams):
+            raise InstrumentError(f"beams = {self.beams}; names that differ are needed, at least 1")
+        if len(self.star_offsets) not in (0, len(self.beams)):
+            raise InstrumentError(
+                f"star_offsets = {self.star_offsets}; one place for each of {', '.join(self.beams)}"
+            )
         if len(self.beam_files) not in (0, 2):
             raise InstrumentError(
                 f"beam_files = {self.beam_files}; the marks of the right and left beam are needed"
@@ -240,6 +259,11 @@ class FileLayout:
     def to_header(self, header):
         """Return the header, as the instrument writes it, from which `from_header` gets this."""
         return header
+
+    @property
+    def two_beams(self):
+        """Whether the beams are the right and the left one."""
+        return tuple(self.beams) == ("right", "left")
 
     @property
     def file_shape(self):
@@ -434,6 +458,8 @@ def frame_time(header, layout):
     return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
 
 
+# a header is asked for its time by several who want to know it
+@lru_cache(maxsize=4096, typed=True)
 def time_of(mjd=None, date=None, clock=None):
     """Return the time (UTC) that a number of days, or a date and a time of day, state, or None."""
     if mjd is not None:

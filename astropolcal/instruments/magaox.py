@@ -19,7 +19,6 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, turning_retarder, wollaston
 
 __all__ = []
@@ -33,11 +32,6 @@ class MagAOX(Polarimeter):
     the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror. The
     static retarder ``bench`` is fixed at 0 deg until you free it. Unequal gains of the cameras are
     the nuisance ``"beam_gain"``.
-
-    References
-    ----------
-    MagAO-X handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html.
-    Calibration of 2025, https://github.com/mileslucas/2025_magaox_polcal.
 
     Examples
     --------
@@ -57,7 +51,6 @@ class MagAOX(Polarimeter):
         "derotator": "STAGEK POS",
         "parallactic": "PARANG",
     }
-    headers = header_map(keywords)
     references = (
         "MagAO-X handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html",
         "Calibration of 2025, https://github.com/mileslucas/2025_magaox_polcal",

@@ -23,8 +23,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import (
     Polarimeter,
     aluminium,
@@ -46,12 +44,6 @@ class NaCo(Polarimeter):
     retardance of the plate and the efficiency of the prism; and the angle of the plate, within
     20 deg, as it was once 13 deg off.
 
-    References
-    ----------
-    Witzel et al. 2011, A&A 525, A130, doi:10.1051/0004-6361/201015009.
-    "Characterizing instrumental effects on polarization at a Nasmyth focus using NaCo", 2014, Proc.
-    SPIE 9147, 87.
-
     Examples
     --------
     >>> from astropolcal import instruments
@@ -70,7 +62,7 @@ class NaCo(Polarimeter):
         "altitude": "ESO TEL ALT",
         "position_angle": "ESO ADA POSANG",
     }
-    headers = header_map(keywords, transforms={"hwp": (_STEP, 205 * _STEP)})
+    transforms = {"hwp": (_STEP, 205 * _STEP)}
     references = (
         "Witzel et al. 2011, A&A 525, A130, doi:10.1051/0004-6361/201015009",
         "Characterizing instrumental effects on polarization at a Nasmyth focus using NaCo, 2014, "
@@ -79,8 +71,6 @@ class NaCo(Polarimeter):
     sources = STARS
     entrance = "mirrors"
     site = PARANAL
-    #: The plate stays where it is put in the instrument.
-    sky_law = SkyLaw(plate=(0, 0), derotator={})
 
     def inner(self, source, optics_in, grid):
         """Return the mirrors of the instrument, the plate and the prism."""

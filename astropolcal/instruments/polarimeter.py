@@ -15,8 +15,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.instruments import telescope as shared
-from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.charis import BOUNDS, derotator_start
+from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import header_map
 from astropolcal.observations.pointings import location_of
 
@@ -31,36 +30,31 @@ class Polarimeter(Instrument):
     ----------
     site : tuple of float
         Longitude and latitude (deg) and height (m) of the telescope; empty without a site.
+    focus : str
+        ``"nasmyth"``, with a tertiary mirror of bare aluminium, or ``"cassegrain"``, where the sky
+        turns upstream of the instrument and nothing else.
+    altitude : str
+        The stage of the altitude at a Nasmyth focus, with its sign.
+    transforms : dict
+        Of the keywords, see `~astropolcal.instruments.FileLayout`.
+    times : dict
+        Keywords of the time of a frame, where they are not the usual ones.
     """
 
     sources = ("polarized", *shared.STARS)
     sky_options = ("wavelength",)
-    site = ()
+    site, focus, altitude = (), "nasmyth", "-altitude"
+    transforms, times = {}, {}
+    #: The plate stays where it is put, and turns with the instrument.
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
 
     def chain(self, source=None, optics_in=(), *, wavelength=None, star="star", target=None):
         """
         Return the chain of a source upstream of the instrument or of a star, to be calibrated.
 
-        Parameters
-        ----------
-        source : str, optional
-            One of ``sources``, by default the first: ``"polarized"`` is a polarizer upstream of
-            the instrument, ``"unpolarized"`` a lamp without one, all others are stars.
-        optics_in : sequence of str
-            Which of ``optional_optics`` are in the beam.
-        wavelength : `~astropy.units.Quantity`, optional
-            Grid of what is free at each wavelength, by default the usual one.
-        star, target : str
-            Name of the source optic of a star, and of the star in the catalogue.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If a choice is unknown.
+        As `Instrument.chain`. The first of ``sources`` is the default; ``"polarized"`` is a
+        polarizer upstream of the instrument, ``"unpolarized"`` a lamp without one, all others are
+        stars.
         """
         source = self.sources[0] if source is None else source
         self.check_choices(source, optics_in)
@@ -80,8 +74,15 @@ class Polarimeter(Instrument):
         """Return the optics from the entrance of the instrument on."""
 
     def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the telescope, whose tertiary mirror is bare aluminium."""
-        return shared.telescope(aluminium(self.grid(wavelength)))
+        """Return the telescope of the focus."""
+        if self.focus == "cassegrain":
+            return [optics.Rotator(mount="parallactic", name="parallactic")]
+        return shared.telescope(aluminium(self.grid(wavelength)), self.altitude)
+
+    @property
+    def headers(self):
+        """Layout that reads the headers of frames."""
+        return header_map(self.keywords, self.transforms, **self.times)
 
     @property
     def location(self):
@@ -107,7 +108,8 @@ class SubaruPolarimeter(Polarimeter):
         "derotator": "D_IMRANG",
         "altitude": "ALTITUDE",
     }
-    headers = header_map(keywords, mjd="MJD", time="UT")
+    times = {"mjd": "MJD", "time": "UT"}
+    sky_law = SkyLaw()
 
     def light(self, source, grid, star, target):
         """Return the internal source, or a star and the telescope."""
@@ -116,14 +118,13 @@ class SubaruPolarimeter(Polarimeter):
     def inner(self, source, optics_in, grid):
         """Return the half-wave plate, the derotator and the camera."""
         plate = shared.two_layer_plate(**shared.misaligned(0))
-        turning = shared.derotator("elliptical", derotator_start(grid), BOUNDS["physical"])
-        return [plate, turning, *self.camera(optics_in, grid)]
+        return [plate, shared.published_derotator(grid), *self.camera(optics_in, grid)]
 
     def camera(self, optics_in, grid):
         """Return the optics downstream of the derotator, here a Wollaston prism."""
         return [optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston")]
 
-    def telescope_optics(self, behind=(), *, wavelength=None):
+    def telescope_optics(self, behind=(), **options):
         """Return the telescope with the tertiary mirror that is published."""
         return shared.telescope(shared.published_mirror())
 
@@ -140,13 +141,15 @@ def aluminium(grid):
     )
 
 
-def turning_retarder(stage, retardance, grid, *, bounds=(150, 180), sign="", most=10, **more):
+def turning_retarder(
+    stage, retardance, grid, *, bounds=(150, 180), sign="", about=0.0, most=10, **more
+):
     """Return a retarder on a stage, free in its angle and, per wavelength, its retardance (deg)."""
-    held = shared.misaligned(0, most)
+    held = shared.misaligned(about, most) | {"theta": about * u.deg} | more
     # linear polarization cannot tell 180 + x from 180 - x of a half-wave plate
     held["bounds"] |= {"retardance": bounds}
-    values = np.full(grid.size, float(retardance)) * u.deg
-    return optics.LinearRetarder(retardance=values, mount=sign + stage, name=stage, **held, **more)
+    values = np.full(grid.size, retardance, dtype=float) * u.deg
+    return optics.LinearRetarder(retardance=values, mount=sign + stage, name=stage, **held)
 
 
 def wollaston(grid, **settings):

@@ -24,11 +24,6 @@ class REACH(SubaruPolarimeter):
 
     Unequal throughputs of the two fibres are the nuisance ``"beam_gain"``.
 
-    References
-    ----------
-    pyird, https://github.com/prvjapan/pyird.
-    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833, for plate and derotator.
-
     Examples
     --------
     >>> import astropy.units as u

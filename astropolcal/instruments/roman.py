@@ -19,8 +19,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.layout import header_map
 from astropolcal.instruments.polarimeter import Polarimeter, wollaston
 from astropolcal.instruments.telescope import misaligned, star_source
 
@@ -39,11 +37,6 @@ class RomanCoronagraph(Polarimeter):
     which lowers the signal of one prism, and the efficiency of the prisms; and their common
     orientation.
 
-    References
-    ----------
-    Groff et al., "Roman Space Telescope CGI: prism and polarizer characterization modes", Proc.
-    SPIE.
-
     Examples
     --------
     >>> from astropolcal import instruments
@@ -56,7 +49,7 @@ class RomanCoronagraph(Polarimeter):
     aliases = ("Roman/CGI", "CGI")
     wavelength = [573.8, 825.5] * u.nm
     keywords = {"roll": "ROLL", "prism": "DPAMNAME"}
-    headers = header_map(keywords, transforms={"prism": {"POL0": 0.0, "POL45": 45.0}})
+    transforms = {"prism": {"POL0": 0.0, "POL45": 45.0}}
     references = (
         "Groff et al., Proc. SPIE, Roman Space Telescope CGI: prism and polarizer "
         "characterization modes",
@@ -65,8 +58,6 @@ class RomanCoronagraph(Polarimeter):
     sources = ("unpolarized standard", "polarized standard", "target")
     sky_options = ()
     entrance = "roll"
-    #: Nothing follows the sky.
-    sky_law = SkyLaw(plate=(0, 0), derotator={})
     # a chain is of a source in the sky; there is no other that a telescope could be put before
     has_telescope = False
 

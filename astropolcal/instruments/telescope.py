@@ -313,6 +313,19 @@ def entrance(source, grid, star, target, m3, mirror=tertiary_mirror):
     return [polarizer() if source == "polarized" else fold_mirror(grid.size)]
 
 
+#: Bins of equal resolving power, as the cubes of CHARIS have them.
+BINS = np.geomspace(1159.5614, 2369.3441, 22) * u.nm
+# McIntosh et al. 2026, Dataset 3, final fit for each of the bins (in the signs they publish)
+DEROTATOR_HORIZONTAL = [251.47, 235.97, 223.97, 209.45, 166.71, 153.47, 140.0, 124.37, 110.61,
+                         98.49, 86.98, 77.67, 71.03, 65.73, 60.99, 58.05, 56.51, 55.28, 54.92,
+                         55.18, 56.02, 57.04]  # fmt: skip
+#: Bounds of the derotator's retardances, by their name.
+BOUNDS = {
+    # every sign and mirror branch of the retardances
+    "physical": {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)},
+    # 0 to 360 deg in the published signs, turned to ours
+    "paper": {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)},
+}
 #: The models of the derotator.
 DEROTATORS = ("elliptical", "linear", "kmirror")
 
@@ -329,3 +342,9 @@ def derotator(kind, start, bounds):
     # a start inside the bounds, off the point where the two small ones vanish
     small = np.full(len(start), 1.0) * u.deg
     return optics.EllipticalRetarder(horizontal=start, diagonal=-small, circular=small, **settings)
+
+
+def published_derotator(grid, kind="elliptical", bounds="physical"):
+    """Return a derotator within some of `BOUNDS`, with the published retardances in our sign."""
+    start = -np.interp(grid.to_value(u.nm), BINS.value, DEROTATOR_HORIZONTAL) * u.deg
+    return derotator(kind, start, BOUNDS[bounds])

@@ -23,8 +23,9 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
-from astropolcal.instruments.base import Instrument, check_choice
+from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
+from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.quality import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
@@ -252,7 +253,7 @@ _SOURCES = {name: name for name in (*subaru.INTERNAL, *subaru.STARS)}
 _SOURCES |= {f"{name} internal": name for name in subaru.INTERNAL}
 
 
-class VAMPIRES(Instrument):
+class VAMPIRES(SubaruPolarimeter):
     """
     Subaru/SCExAO/VAMPIRES, with its internal source or on sky.
 
@@ -277,9 +278,7 @@ class VAMPIRES(Instrument):
         "vampires_dpp, https://github.com/scexao-org/vampires_dpp (keywords and detectors)",
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher, appendix on VAMPIRES",
     )
-    sources = (*subaru.INTERNAL, *subaru.STARS)
     optional_optics = ("flc",)
-    changes = subaru.CHANGES
 
     def chain(
         self,
@@ -328,19 +327,8 @@ class VAMPIRES(Instrument):
         plate : {"free", "two-layer"}
             Half-wave plate with a retardance of its own in each band, or with the law of its two
             layers, whose thicknesses are free.
-        star : str
-            Name of the source optic in a star's chain.
-        target : str, optional
-            Name of the star, for what the catalogue of standards knows of it.
 
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If a choice is unknown.
+        Others, and what is returned and raised, are as in `Instrument.chain`.
 
         Examples
         --------

@@ -356,7 +356,7 @@ class _GroupedIntensity(Intensity):
         # place at which the group of each place begins, the same at all wavelengths
         ordered = self._groups[self._order[0]]
         self._first = np.searchsorted(ordered, ordered)
-        self._flux, self._weight = flux, weight * usable
+        self._flux, self._weight, self._usable = flux, weight * usable, usable
         self._sorted = self._in_order(flux)
         self._pull = self._in_order(self._weight * flux)
         seen = self._before(self._pull * self._sorted)
@@ -369,12 +369,15 @@ class _GroupedIntensity(Intensity):
 
     def evaluate(self, right, left):
         """Return the data of fluxes, (W, P), in units of the mean flux of each group."""
-        return self._over_mean(self._flux + self._left(self._scaled(right[0])))
+        # what is masked may be NaN in the table
+        flux = np.where(self._usable, right[0], 0.0)
+        return self._over_mean(self._flux + self._left(self._scaled(flux)))
 
     def gathered(self, slopes, right, left):
         """Return the derivatives of the data; the brightness follows the model."""
         pull = self._weight * self._flux
-        turn = self._totals(pull * slopes) / self._totals(pull * right[0])
+        total = self._totals(pull * right[0])
+        turn = self._totals(pull * slopes) / np.where(total > 0, total, np.inf)
         change = self._left(self._factor(right[0]) * slopes)
         return self._over_mean(change - self._left(self._scaled(right[0])) * turn)
 

@@ -398,7 +398,7 @@ def frame_coordinate(observations, name):
             f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
         )
     if name == "flc_state":
-        return _modulator_state(observations)
+        return modulator_states(observations.frames, observations.name)
     if name in PLACES:
         return _place(observations, name)
     time = _time_or_order(observations)
@@ -526,21 +526,22 @@ def clock(frames):
     return times if np.all(known & np.isfinite(times)) else None
 
 
-def _modulator_state(observations):
-    frames = observations.frames
+def modulator_states(frames, label):
+    """Return 0 or 1 for the states A and B of a modulator in each frame, (F,)."""
     if "flc_state" not in frames.colnames:
         raise ObservationError(
-            f"{observations.name}: no column flc_state; it is needed, with A or B in each frame"
+            f"{label}: no column flc_state; it is needed, with A or B in each frame"
         )
     # strings, bytes and numbers alike become text here
     found = [_STATES.get(str(value).strip().upper()) for value in frames["flc_state"]]
     if None in found:
         i = found.index(None)
+        frame = frames["frame"][i] if "frame" in frames.colnames else i
         raise ObservationError(
-            f"{observations.name}: flc_state = {str(frames['flc_state'][i])!r} in frame "
-            f"{frames['frame'][i]}; allowed are A and B, or 0 and 1"
+            f"{label}: flc_state = {str(frames['flc_state'][i])!r} in frame {frame}; allowed are A "
+            "and B, or 0 and 1"
         )
-    return np.array(found)
+    return np.array(found, dtype=float)
 
 
 def _time_or_order(observations):

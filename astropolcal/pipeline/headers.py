@@ -51,7 +51,7 @@ def describe(header, instrument=None, stated=()):
     What is not known is None; what the user has ``stated`` is not looked for.
     """
     if instrument is None:
-        found = _recognized(header)
+        found = recognized(header)
     else:
         found = instruments.get(instrument) if isinstance(instrument, str) else instrument
     with suppress(InstrumentError):
@@ -70,7 +70,7 @@ def describe(header, instrument=None, stated=()):
         "instrument": found.name,
         "stated": own,
         "mode": None if "mode" in stated else _text(_look_up(header, "filter", layout)),
-        "date": None if time is None else time.utc.isot,
+        "date": None if time is None else time.isot,
     }
 
 
@@ -78,12 +78,12 @@ def _text(value):
     return None if value is None else str(value).strip()
 
 
-def _recognized(header):
-    """Return the instrument whose identity a header bears."""
+def recognized(header, known=None):
+    """Return the instrument, of those that are ``known``, whose identity a header bears."""
     seen = []
+    known = map(instruments.get, instruments.names()) if known is None else known
     # each instrument looks under its own keyword, so that all of them are asked
-    for name in instruments.names():
-        instrument = instruments.get(name)
+    for instrument in known:
         layout = instrument.files or instrument.headers
         told = None if layout is None else _text(_look_up(header, "instrument", layout))
         if told is None:

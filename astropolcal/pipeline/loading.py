@@ -6,7 +6,7 @@ Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
@@ -16,13 +16,16 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.calibration.result.validity import instrument_of, validity_of
-from astropolcal.calibration.system import at_wavelengths, errors, match_wavelengths
+from astropolcal.calibration.system import (
+    MuellerMatrices,
+    at_wavelengths,
+    distinct,
+    match_wavelengths,
+)
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     join,
     leaves,
-    system_mueller,
-    system_mueller_derivatives,
     warn_beyond,
     with_beam,
 )
@@ -55,7 +58,10 @@ class SystemMueller:
     """
     System Mueller matrices of frames and wavelengths, with what is known of their errors.
 
-    Parameters
+    `LoadedCalibration.system_mueller` makes it. The errors are worked out when they are asked for,
+    so that an index, ``matrices[:100]``, gives those of some frames without those of the others.
+
+    Attributes
     ----------
     value : `~numpy.ndarray`
         Shape (n_frames, n_wavelengths, 4, 4); no first axis for a single frame. The first row
@@ -66,33 +72,65 @@ class SystemMueller:
         ``"right"`` or ``"left"``.
     positions : dict of str to `~astropy.units.Quantity`
         Of every stage, in degree.
-    factor : `~numpy.ndarray`
-        Changes of ``value`` for one standard error along each direction that the data of the
-        calibration determine, shape (..., 4, 4, rank). The covariance of any two elements,
-        also of different frames, wavelengths or beams, is the sum of the products of theirs.
-    is_open, is_blind : `~numpy.ndarray`
-        Elements that move along an open direction, or depend on parameters at a bound alone.
     assumed : tuple of str
         Optics that are not calibrated: they have published values and add nothing to the errors.
 
     Examples
     --------
-    >>> from astropolcal.pipeline import SystemMueller
     >>> import astropy.units as u
-    >>> import numpy as np
-    >>> one = SystemMueller(np.eye(4)[None], [1.6] * u.um, "right", {}, np.full((1, 4, 4, 1), 0.1))
-    >>> one.covariance.shape, float(one.std[0, 0, 0])
-    ((1, 16, 16), 0.1)
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.pipeline import load
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = load(calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2)))
+    >>> positions = {"hwp": [0, 22.5, 45] * u.deg, "derotator": 60 * u.deg}
+    >>> matrices = cal.system_mueller(positions=positions, light="internal")
+    >>> matrices.value.shape, matrices[1:].covariance.shape, matrices[0].std.shape
+    ((3, 22, 4, 4), (2, 22, 16, 16), (22, 4, 4))
     """
 
     value: np.ndarray
     wavelength: u.Quantity
     beam: str
     positions: dict
-    factor: np.ndarray
-    is_open: np.ndarray | None = None
-    is_blind: np.ndarray | None = None
-    assumed: tuple = ()
+    assumed: tuple
+    _matrices: object = field(repr=False)
+
+    def __getitem__(self, frames):
+        """Return the matrices of some frames."""
+        if not self._matrices.which.ndim:
+            raise ParameterError(f"frames {frames!r}: the matrices are those of a single frame")
+        size = self._matrices.which.size
+        positions = {
+            name: np.broadcast_to(position, (size, *position.shape[1:]), subok=True)[frames]
+            for name, position in self.positions.items()
+        }
+        matrices = self._matrices.of(np.asarray(self._matrices.which[frames]))
+        given = {"value": self.value[frames], "positions": positions, "_matrices": matrices}
+        return replace(self, **given)
+
+    @property
+    def factor(self):
+        """
+        Changes of ``value`` for one standard error along each direction that is determined.
+
+        Shape (..., 4, 4, rank). The covariance of any two elements, also of different frames,
+        wavelengths or beams, is the sum of the products of theirs. It is large: some megabytes for
+        ten frames.
+        """
+        return self._matrices.factor()
+
+    @property
+    def is_open(self):
+        """Elements that move along a direction that the data do not determine."""
+        return self._matrices.flags()[0]
+
+    @property
+    def is_blind(self):
+        """Elements that depend on parameters at a bound alone."""
+        return self._matrices.flags()[1]
 
     @property
     def covariance(self):
@@ -103,7 +141,8 @@ class SystemMueller:
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
-        is_open, is_blind = (self._flat(flags) for flags in (self.is_open, self.is_blind))
+        flags = self._matrices.flags()
+        is_open, is_blind = (each.reshape(*self.value.shape[:-2], 16) for each in flags)
         unknown = is_open | is_blind
         # no covariance with what has no error, whichever of the two it is
         matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
@@ -119,22 +158,14 @@ class SystemMueller:
         polarization where the data know misalignments up to a common turn; a prior on one
         of the angles in the calibration gives an error that is right.
         """
-        # rows: the elements of a matrix; columns: the determined directions of the parameters
-        moved = self.factor.reshape(*self.value.shape[:-2], 16, -1)
+        # rows: the elements of a matrix; columns: the parameters that move them
+        moved = self._matrices.local_factor()
         return moved @ np.swapaxes(moved, -1, -2)
 
     @property
     def std(self):
         """Standard error of each element, of the shape of ``value``."""
-        std = np.sqrt(np.sum(self.factor**2, axis=-1))
-        is_open, is_blind = (
-            self._flat(flags).reshape(std.shape) for flags in (self.is_open, self.is_blind)
-        )
-        return np.where(is_open, np.inf, np.where(is_blind, np.nan, std))
-
-    def _flat(self, flags):
-        shape = (*self.value.shape[:-2], 16)
-        return np.zeros(shape, dtype=bool) if flags is None else flags.reshape(shape)
+        return self._matrices.std()
 
 
 # what a caller can do about a header that does not say enough
@@ -309,6 +340,22 @@ class LoadedCalibration:
         """Wavelengths of the calibration, a `~astropy.units.Quantity`."""
         return self.calibration.wavelength
 
+    @property
+    def chain(self):
+        """
+        The calibrated chain, an astropy model: a copy, which may be changed.
+
+        From the sky where the telescope is calibrated, otherwise from the first optic on a stage
+        of the instrument.
+
+        Raises
+        ------
+        ChainError
+            If the calibration has several sets of optics in the beam and none was stated.
+        """
+        inner = inner_optics(self.calibration, self.optics_in, label=self.path.name)
+        return join([*(telescope_optics(self.calibration) or ()), *inner]).copy()
+
     def system_mueller(
         self,
         header=None,
@@ -380,14 +427,15 @@ class LoadedCalibration:
         lam, mix = match_wavelengths(self.wavelength, chain, wavelength, interpolate)
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
         warn_beyond(chain, {k: finite_position(x, k) for k, x in positions.items() if k in PLACES})
-        value = system_mueller(chain, lam, positions)
-        slopes = system_mueller_derivatives(chain, lam, positions)
-        parts = errors(self.calibration, self._covariance, value, slopes, mix)
+        settings, which = distinct(positions)
+        if single:
+            which = which[0]
+        covariance = self._covariance
+        matrices = MuellerMatrices(self.calibration, covariance, chain, lam, settings, which, mix)
         shown = {name: _degrees(name, position) for name, position in positions.items()}
         if single:
-            value, *parts = (part[0] for part in (value, *parts))
             shown = {name: angle[0] for name, angle in shown.items()}
-        return SystemMueller(value, lam, beam, shown, *parts, assumed)
+        return SystemMueller(matrices.values(), lam, beam, shown, assumed, matrices)
 
     def correct(
         self,

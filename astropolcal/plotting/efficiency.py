@@ -99,6 +99,21 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
     return fig
 
 
+def plot_efficiencies(found, wavelength, *, title=None, figure=None):
+    """Draw the efficiency of each Stokes parameter, of a `Demodulation`, against the wavelength."""
+    lam = st.nanometres(wavelength)
+    with st.canvas(figure, 5.5, 4.5) as fig:
+        ax = fig.subplots()
+        for (color, marker), name, values in zip(
+            st.looks(len(found.components)), found.components, found.efficiency.T, strict=True
+        ):
+            st.draw_line(ax, lam, values, color=color, marker=marker, label=name)
+        ax.set(xlabel="wavelength (nm)", ylabel="efficiency", ylim=(0, 1.05))
+        ax.legend(ncols=len(found.components))
+        fig.suptitle(title or "Efficiency of each Stokes parameter")
+    return fig
+
+
 def _without_derotator(ax, lam, asked, shown, on_sky):
     """Draw lines against the parallactic angle, or points at the wavelengths."""
     if on_sky:

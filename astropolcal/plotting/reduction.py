@@ -8,7 +8,7 @@ import numpy as np
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting import _style as st
 from astropolcal.reduction.frames import open_cube
-from astropolcal.reduction.photometry import BEAMS
+from astropolcal.reduction.images import BEAMS
 
 __all__ = ["plot_apertures"]
 
@@ -109,7 +109,7 @@ def _draw_frame(panel, index, reduction, k):
     """Draw one panel; return whether pixels lack a value."""
     frame = reduction.frames[index]
     layout = reduction.instrument.files
-    with open_cube(frame.path, layout) as (_, _, cube, good):
+    with open_cube(frame.path, layout, reduction.masters) as (_, _, cube, good):
         image = np.array(cube[k], dtype=float)
         if good is not None:
             image[~good[k]] = np.nan
@@ -241,7 +241,9 @@ def _draw_places(panels, reduction, clock, k):
 
 def save_quicklook(reduction, folder):
     """Write ``apertures.png`` and ``run.png`` of a run to a folder; return their paths."""
-    folder = Path(folder)
+    folder, beams = Path(folder), reduction.instrument.files.beams
+    if tuple(beams) != BEAMS:
+        raise ParameterError(f"figures of the beams {', '.join(beams)}; they are of right and left")
     try:
         folder.mkdir(exist_ok=True)
     except FileNotFoundError:

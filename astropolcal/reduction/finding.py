@@ -21,7 +21,7 @@ _ROUNDING = 1e-12
 class Pair:
     """A star's images in both beams."""
 
-    # (x, y) of the right and the left image, (2, 2); zeros if there is none
+    # (x, y) of the right and the left image, or of all, (n_beams, 2); zeros if there is none
     positions: np.ndarray
     # diameter of the area above half of the maximum, pixels
     fwhm: float
@@ -61,6 +61,34 @@ def find_pair(image, good, offset, *, fwhm=4.0, significance=6.0, tolerance=4.0,
     elif heights.max() > 20 * strength[best] and heights.argmax() not in (right[best], left[best]):
         reason = "one beam missing"
     return Pair(positions, width, reason)
+
+
+def find_images(image, good, places, *, fwhm=4.0, significance=6.0, tolerance=4.0, companion=0.1):
+    """
+    Find the brightest star that is seen at all of some places from each other, 1 or more.
+
+    As `find_pair`; ``places`` are (x, y) of the images from a common point.
+    """
+    places = np.asarray(places, dtype=float)
+    smooth, level, noise = _smoothed(image, good, fwhm)
+    peaks, heights = _peaks(smooth, level + significance * noise, fwhm)
+    nothing = np.zeros((len(places), 2))
+    if not (noise > 0 and len(peaks)):
+        return Pair(nothing, 0.0, "no star")
+    # (first image, place, peak)
+    wanted = peaks[:, None] + places - places[0]
+    distance = np.hypot(*np.moveaxis(wanted[:, :, None] - peaks, -1, 0))
+    nearest = distance.argmin(axis=-1)
+    whole = np.flatnonzero((distance.min(axis=-1) <= tolerance).all(axis=1))
+    if not whole.size:
+        return Pair(nothing, 0.0, "one beam missing")
+    strength = (heights - level)[nearest[whole]].min(axis=1)
+    best = int(np.argmax(strength))
+    positions = peaks[nearest[whole[best]]].astype(float)
+    width = _width(smooth - level, positions)
+    apart = np.hypot(*(peaks[whole] - peaks[whole[best]]).T) > 2.0 * max(width, fwhm)
+    two = np.any(apart & (strength > companion * strength[best]))
+    return Pair(positions, width, "two stars" if two else "")
 
 
 def _smoothed(image, good, fwhm):

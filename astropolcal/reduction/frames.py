@@ -69,16 +69,16 @@ class Frame(FrameHeader):
         return cls(**content)
 
 
-def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
+def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
     """
     Read a cube and measure both beams; everything that is wrong with the file is in ``errors``.
 
-    ``raw`` are raw frames by number; options are those of `measure_internal` or `measure_stars`,
-    and a wrong one raises.
+    ``raw`` are raw frames by number, ``masters`` their dark and flat; options are those of
+    `measure_internal` or `measure_stars`, and a wrong one raises.
     """
     frame = Frame(str(path))
     try:
-        with open_cube(path, layout) as (primary, header, cube, good):
+        with open_cube(path, layout, masters) as (primary, header, cube, good):
             # the header that is open already
             known = read_header(path, layout, header=primary, raw=raw)
             frame.number, frame.values = known.number, known.values
@@ -109,12 +109,12 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
 
 
 @contextmanager
-def open_cube(path, layout):
+def open_cube(path, layout, masters=None):
     """
     Give primary header, header, cube (W, Y, X) and known pixels, for a ``with`` block.
 
     The cube is memory-mapped. Pixels with a value and an inverse variance above zero are known;
-    None if all are.
+    None if all are. ``masters`` are dark and flat, see `Masters`.
     """
     with ExitStack() as stack:
         with readable_fits(path), warnings.catch_warnings():
@@ -124,7 +124,7 @@ def open_cube(path, layout):
             stream = stack.enter_context(open_fits(path))
             try:
                 hdus = stack.enter_context(fits.open(stream, memmap=True))
-                opened = _read(path, hdus, layout)
+                opened = _read(path, hdus, layout, masters)
             except AstropyUserWarning as warning:
                 # its type tells a user nothing
                 raise OSError(str(warning)) from warning
@@ -132,8 +132,8 @@ def open_cube(path, layout):
         yield opened
 
 
-def _read(path, hdus, layout):
-    primary, header, cube, good = _read_beams(path, hdus, layout)
+def _read(path, hdus, layout, masters):
+    primary, header, cube, good = _read_beams(path, hdus, layout, masters)
     left = layout.left_file(path)
     if left is None:
         return primary, header, cube, None if good.all() else good
@@ -141,12 +141,13 @@ def _read(path, hdus, layout):
         raise ObservationError(f"{path}: no file {left.name} of the left beam beside it")
     # what is joined is in memory, so that this file need not stay open
     with readable_fits(left), open_fits(left) as stream, fits.open(stream, memmap=False) as others:
-        _, _, other, known = _read_beams(left, others, layout)
+        own = masters and masters.of_left(layout)
+        _, _, other, known = _read_beams(left, others, layout, own)
     joined, good = (np.concatenate(pair, axis=-1) for pair in ((other, cube), (known, good)))
     return primary, header, joined, None if good.all() else good
 
 
-def _read_beams(path, hdus, layout):
+def _read_beams(path, hdus, layout, masters):
     number, wanted = layout.cube_extension, layout.file_shape
     if len(hdus) <= number:
         raise ObservationError(
@@ -168,6 +169,8 @@ def _read_beams(path, hdus, layout):
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
     if weight is not None and weight.size == cube.size:
         good &= np.asarray(weight.reshape(cube.shape)) > 0
+    if masters is not None:
+        cube, good = masters.applied(cube, good, layout)
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
     if cube.shape != wanted:
@@ -186,8 +189,8 @@ def _check_header(frame, layout, source):
     frame.errors += [foreign] if foreign else []
     frame.errors += [
         f"no keyword {keywords[column]} in its header"
-        for column in ("hwp", "derotator")
-        if column not in values and not frame.errors
+        for column in layout.stages
+        if column in keywords and column not in values and not frame.errors
     ]
     with suppress(ObservationError):
         time = observation_time(values)

@@ -193,7 +193,7 @@ def _convert(frame, column, keyword, value, layout):
         except ParameterError as error:
             # the time may stand in another keyword
             frame.doubts.append(f"{error}; it was left out")
-    elif column in TEXTS:
+    elif column in TEXTS or column in layout.texts:
         frame.values[column] = " ".join(str(value).split())
     else:
         _add_number(frame, column, keyword, value, layout)
@@ -249,7 +249,9 @@ def add_pointing(frames, layout, needed=True):
     """
     found = []
     for frame in frames:
-        missing = [name for name in ("parallactic", "altitude") if name not in frame.values]
+        # a telescope in space has neither
+        sky = [name for name in ("parallactic", "altitude") if name in layout.keywords]
+        missing = [name for name in sky if name not in frame.values]
         words = [layout.keywords[name] for name in missing]
         if not missing or any(error.startswith(tuple(words)) for error in frame.errors):
             continue

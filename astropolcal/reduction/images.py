@@ -9,12 +9,14 @@ from astropy.stats import gaussian_fwhm_to_sigma
 from scipy.special import erf
 
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.reduction.photometry import BEAMS
 from astropolcal.reduction.wings import HALO_BETA
 from astropolcal.simulation import check_electrons
 from astropolcal.units import angle_to_rad
 
 __all__ = []
+
+# what is simulated are both beams of a Wollaston prism
+BEAMS = ("right", "left")
 
 # three-point Gauss rule over a pixel
 _NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.0, 5.0]) / 18

@@ -12,16 +12,13 @@ from astropolcal.observations.quality import MAD_TO_SIGMA
 
 __all__ = []
 
-BEAMS = ("right", "left")
-"""Order of the beams in all arrays."""
-
 
 @dataclass
 class Photometry:
     """
-    Fluxes of both beams in the slices of one cube.
+    Fluxes of the beams in the slices of one cube.
 
-    Arrays of shape (2, W), the right beam first, unless noted.
+    Arrays of shape (n_beams, W), in the order of the layout, unless noted.
     """
 
     # in the unit of the cube
@@ -45,9 +42,9 @@ class Photometry:
     outliers: int = 0
 
     @classmethod
-    def empty(cls, n_wavelengths):
-        """Return zeros of shape (2, ``n_wavelengths``) without a reason."""
-        flux, variance, *others = (np.zeros((2, n_wavelengths)) for _ in range(7))
+    def empty(cls, n_wavelengths, n_beams=2):
+        """Return zeros of shape (``n_beams``, ``n_wavelengths``) without a reason."""
+        flux, variance, *others = (np.zeros((n_beams, n_wavelengths)) for _ in range(7))
         covariance, scale_err = np.zeros((2, n_wavelengths))
         scale = np.ones(n_wavelengths)
         return cls(flux, variance, covariance, scale, scale_err, *others, [""] * n_wavelengths)
@@ -199,15 +196,16 @@ _EVEN = 0.5
 @lru_cache(maxsize=8)
 def rectangles(apertures, shape):
     """
-    Return the rectangles of the right and left beam: rows, columns, part of each pixel inside.
+    Return the rectangles of the beams: rows, columns, part of each pixel inside.
 
-    ``apertures`` are ((x, y) of the left, (x, y) of the right, width, height, rotation in radian).
+    ``apertures`` are those of `FileLayout`.
     """
     from photutils.aperture import RectangularAperture
 
-    left, right, width, height, angle = apertures
+    *centres, width, height, angle = apertures
     found = []
-    for x, y in (right, left):
+    # of two beams the left one is given first
+    for x, y in centres[::-1] if len(centres) == 2 else centres:
         # exact: weights are the parts of pixels inside, and their sum is the area
         mask = RectangularAperture((x, y), width, height, theta=angle).to_mask(method="exact")
         box = mask.bbox
@@ -220,23 +218,23 @@ def rectangles(apertures, shape):
 
 @lru_cache(maxsize=8)
 def _outside(apertures, shape):
-    """Return the pixels that are clear of both rectangles."""
-    left, right, width, height, angle = apertures
+    """Return the pixels that are clear of all rectangles."""
+    *centres, width, height, angle = apertures
     # the wings of the beams reach farther than the rectangles
-    grown = (left, right, width + 2 * _CLEAR, height + 2 * _CLEAR, angle)
+    grown = width + 2 * _CLEAR, height + 2 * _CLEAR
     y, x = np.indices(shape)
     clear = np.ones(shape, dtype=bool)
-    for cx, cy in grown[:2]:
+    for cx, cy in centres:
         # into the axes of the rectangle
         along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
         across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
-        clear &= (np.abs(along) > grown[2] / 2) | (np.abs(across) > grown[3] / 2)
+        clear &= (np.abs(along) > grown[0] / 2) | (np.abs(across) > grown[1] / 2)
     return clear
 
 
 def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
     """
-    Measure both beams of an internal source in all slices of a cube (W, Y, X).
+    Measure the beams of an internal source in all slices of a cube (W, Y, X).
 
     Pixels without a value are left out, and the sum is scaled to the full area. So are single
     pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The
@@ -246,7 +244,7 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         raise ParameterError(f"background = {background!r}; allowed are {', '.join(_BACKGROUNDS)}")
     if not 0 <= max_masked < 1:
         raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
-    result = Photometry.empty(len(cube))
+    result = Photometry.empty(len(cube), len(layout.beams))
     level, spread, number = np.zeros(len(cube)), np.full(len(cube), detector.read_noise**2), np.inf
     if background == "outside":
         level, spread, number = _level(cube, good, detector, layout)
@@ -265,12 +263,12 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
         pixel = np.maximum(spread, own.read_noise**2)
         result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
-        result.flag(kept < (1 - max_masked) * area, f"{BEAMS[beam]} aperture masked")
+        result.flag(kept < (1 - max_masked) * area, f"{layout.beams[beam]} aperture masked")
         # -inf never is the brightest
         values = cut if known is None else np.where(known, cut, -np.inf)
         result.flag(values[:, weights > 0].max(axis=1) >= own.saturation, "saturated")
         areas.append(area)
-    if background == "outside":
+    if background == "outside" and layout.two_beams:
         result.covariance[:] = shared_background(*areas, spread, number)
     result.flag((result.flux <= 0).any(axis=0), "no light")
     return result

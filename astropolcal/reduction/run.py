@@ -26,11 +26,14 @@ from astropolcal.observations.reading import stated_date
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames
+from astropolcal.reduction.masters import Masters
 from astropolcal.reduction.sorting import sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
+# stages whose angles have sequences that are known
+_HALF_WAVE = {"hwp", "derotator"}
 # below this number of files a process, its start costs more than it saves
 _FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
@@ -58,6 +61,8 @@ class Reduction:
         Of the table.
     options : dict
         Of the photometry.
+    masters : object, optional
+        Dark and flat of the frames.
 
     Examples
     --------
@@ -73,6 +78,7 @@ class Reduction:
     doubts: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
     options: dict = field(default_factory=dict)
+    masters: object = None
 
     @property
     def table(self):
@@ -170,6 +176,8 @@ def reduce_run(
     *,
     source="internal",
     raw=None,
+    dark=None,
+    flat=None,
     meta=None,
     workers=None,
     resume=None,
@@ -197,6 +205,11 @@ def reduce_run(
         ``unpolarized`` where the fluxes leave no doubt.
     raw : path-like, optional
         Folder of raw frames, whose headers are looked into by frame number.
+    dark, flat : path-like, optional
+        FITS files of a dark, which is subtracted from each exposure, and of a flat, by which it is
+        divided, of the shape of an image of a frame; for raw frames. Pixels without a value in
+        them, or where the flat is not above zero, are not used. Where each camera writes a file of
+        its own, that of the right beam is named, and that of the left one stands beside it.
     meta : dict, optional
         More for the table's meta, such as ``{"yjh50_dichroic": "in"}``.
     workers : int, optional
@@ -257,8 +270,12 @@ def reduce_run(
     stated_date(meta or {}, "reduced")
     n_files = len(files)
     files, layout, lost = sort_beams(files, instrument.files)
+    masters = Masters(*(None if path is None else str(path) for path in (dark, flat)))
+    # a dark that does not fit is no fault of the frames
+    masters.check(layout)
     task = {
         "layout": layout,
+        "masters": None if masters == Masters() else masters,
         "source": photometry,
         "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
@@ -267,12 +284,14 @@ def reduce_run(
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    reduction = Reduction(instrument, photometry, problems=lost, options=options)
+    known = {"options": options, "masters": task["masters"]}
+    reduction = Reduction(instrument, photometry, problems=lost, **known)
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
-    frames = consistent(frames, reduction, layout, hwp_sequence is None)
-    if photometry == "internal" and not keep_repeats:
+    check = hwp_sequence is None and _HALF_WAVE <= {*layout.stages}
+    frames = consistent(frames, reduction, layout, check)
+    if photometry == "internal" and not keep_repeats and _HALF_WAVE <= {*layout.stages}:
         frames = without_repeats(frames, reduction)
     if not frames:
         raise ObservationError(_nothing(n_files, reduction.problems) + _hint(task, reduction))
@@ -352,7 +371,7 @@ def _hint(task, reduction):
 
 def _measure_all(files, task, workers, resume, progress):
     """Return the frames of all files in their order, from the journal or measured now."""
-    settings = {name: repr(task[name]) for name in ("layout", "source", "options")}
+    settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
     settings |= {"raw": task["raw"] is not None, "checked": False}
     journal = Journal(resume, settings)
@@ -463,9 +482,10 @@ def _meta(frames, instrument, source, given):
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
+    modulated = instrument.files.two_beams and "hwp" in instrument.files.stages
     if source != "internal":
         meta["source"] = source
-    elif "source" not in given and (seen := _seen_source(frames)):
+    elif "source" not in given and modulated and (seen := _seen_source(frames)):
         meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
@@ -522,7 +542,9 @@ def set_aside(frames, reduction):
     kept = _kept(frames, reduction, why)
     # before the rest: fluxes in other units cannot be compared at all
     kept = _of_one_kind(kept, "unit", lambda frame: frame.unit, reduction)
-    for name in _KINDS[reduction.source]:
+    # the state of a stage differs from frame to frame
+    stages = reduction.instrument.files.stages if reduction.instrument else ()
+    for name in (name for name in _KINDS[reduction.source] if name not in stages):
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
     # what has no number comes last, by time
     time = {frame.path: frame.values.get("mjd", np.inf) for frame in kept}

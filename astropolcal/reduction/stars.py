@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Photometry of stars in both Wollaston beams, at each wavelength.
+Photometry of stars in the beams of an image, at each wavelength.
 
 References
 ----------
@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.quality import MAD_TO_SIGMA
-from astropolcal.reduction.finding import find_pair, fit_gaussians
-from astropolcal.reduction.photometry import BEAMS, Photometry, flux_variance, shared_pixels
+from astropolcal.reduction.finding import find_images, find_pair, fit_gaussians
+from astropolcal.reduction.photometry import Photometry, flux_variance, shared_pixels
 from astropolcal.reduction.wings import wing_shares
 
 __all__ = []
@@ -50,35 +50,45 @@ def measure_stars(
     max_masked=0.1,
 ):
     """
-    Measure a star in both beams in all slices of a cube (W, Y, X).
+    Measure a star in the beams in all slices of a cube (W, Y, X).
 
     The star is found in the mean of the slices. In each slice a Gaussian gives centre and width in
-    both beams; both are measured with the same radius, so that light outside of it does not look
+    each beam; all are measured with the same radius, so that light outside of it does not look
     like polarization. Pixels without a value are filled with the Gaussian and what the pixels
     around them have beyond it. The options are described in `reduce_run`.
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked, aperture_correction)
-    result = Photometry.empty(len(cube))
+    if aperture_correction is True and not layout.two_beams:
+        raise ParameterError(
+            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
+            "the wings is that of two beams, allowed are False and 'growth'"
+        )
+    result = Photometry.empty(len(cube), len(layout.beams))
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
     mean, known = _mean(cube, good)
-    pair = find_pair(mean, known, layout.star_offset, fwhm=layout.fwhm, companion=companion)
+    if layout.two_beams and not layout.star_offsets:
+        pair = find_pair(mean, known, layout.star_offset, fwhm=layout.fwhm, companion=companion)
+    else:
+        places = layout.star_offsets or ((0.0, 0.0),) * len(layout.beams)
+        pair = find_images(mean, known, places, fwhm=layout.fwhm, companion=companion)
     if pair.reason:
         result.flag(True, pair.reason)
         return result
     images, there, origin = _cutouts(cube, good, pair)
     starts = np.repeat(pair.positions - origin, len(cube), axis=0)
-    _check_light(result, images, there, starts, pair.fwhm, detector)
+    _check_light(result, images, there, starts, pair.fwhm, detector, layout.beams)
     fits = fit_gaussians(images, there, x=starts[:, 0], y=starts[:, 1], fwhm=pair.fwhm)
     _judge(result, fits, origin, pair)
     result.radius[:] = _radii(result.fwhm, radius, factor, max_radius, mean, known, pair)
     run = _Cube(cube, good, fits, origin, detector, layout.edge, annulus, max_masked)
     level_variance = _measure(result, run)
     usable = ~result.failed
-    # between both images of a slice
-    distance = np.hypot(*(np.diff(axis[:, usable], axis=0)[0] for axis in (result.x, result.y)))
-    pixel = detector.variance(result.background[:, usable].mean(axis=0))
-    result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
+    if layout.two_beams:
+        # between both images of a slice
+        distance = np.hypot(*(np.diff(a[:, usable], axis=0)[0] for a in (result.x, result.y)))
+        pixel = detector.variance(result.background[:, usable].mean(axis=0))
+        result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
     if aperture_correction == "growth":
         _correct(result, *_growth_shares(result, run, max_radius))
     elif aperture_correction:
@@ -132,35 +142,35 @@ def _cutouts(cube, good, pair):
     return images, known, origin.astype(float)
 
 
-def _check_light(result, images, there, starts, fwhm, detector):
+def _check_light(result, images, there, starts, fwhm, detector, beams):
     """Flag slices that are saturated, or whose light at the star's place is not significant."""
     n = len(result.reasons)
-    values = np.where(there, images, np.nan).reshape(2 * n, -1)
+    values = np.where(there, images, np.nan).reshape(len(beams) * n, -1)
     values[~there.any(axis=(1, 2))] = 0.0
     # before the fit: a saturated core has no centre
-    bright = np.nanmax(values, axis=1).reshape(2, n) >= detector.saturation
+    bright = np.nanmax(values, axis=1).reshape(-1, n) >= detector.saturation
     result.flag(bright.any(axis=0), "saturated")
     level = np.nanmedian(values, axis=1)[:, None]
     noise = MAD_TO_SIGMA * np.nanmedian(np.abs(values - level), axis=1)
     rows, columns = np.indices(images.shape[1:])
     distance = (columns.ravel() - starts[:, :1]) ** 2 + (rows.ravel() - starts[:, 1:]) ** 2
-    shape = np.exp(-4.0 * np.log(2.0) * distance / fwhm**2) * there.reshape(2 * n, -1)
+    shape = np.exp(-4.0 * np.log(2.0) * distance / fwhm**2) * there.reshape(len(beams) * n, -1)
     light = np.nansum((values - level) * shape, axis=1)
     scale = np.maximum(noise, detector.read_noise) * np.sqrt((shape**2).sum(axis=1))
-    lost = ~(light > _SIGNIFICANT * scale).reshape(2, n)
-    for beam in range(2):
-        result.flag(lost[beam] & ~lost[1 - beam], f"{BEAMS[beam]} beam missing")
+    lost = ~(light > _SIGNIFICANT * scale).reshape(-1, n)
+    for own, name in zip(lost, beams, strict=True):
+        result.flag(own & ~lost.all(axis=0), f"{name} beam missing")
     result.flag(lost.all(axis=0), "lost star")
 
 
 def _judge(result, fits, origin, pair):
     """Store centres and widths, and flag slices where they cannot be right."""
     n = len(result.reasons)
-    result.x[:] = fits.x.reshape(2, n) + origin[:, :1]
-    result.y[:] = fits.y.reshape(2, n) + origin[:, 1:]
-    result.fwhm[:] = fits.fwhm.reshape(2, n)
+    result.x[:] = fits.x.reshape(-1, n) + origin[:, :1]
+    result.y[:] = fits.y.reshape(-1, n) + origin[:, 1:]
+    result.fwhm[:] = fits.fwhm.reshape(-1, n)
     wild = ~fits.converged | (fits.elongation > 3.0) | (fits.amplitude <= 0)
-    wild = wild.reshape(2, n)
+    wild = wild.reshape(-1, n)
     # a blurred image is found less precisely
     limit = max(_OFF_TRACK[0], _OFF_TRACK[1] * pair.fwhm)
     usable = ~result.failed & ~wild.any(axis=0)
@@ -226,7 +236,7 @@ def _measure(result, cube):
 def _both(result, cube, k, radius):
     """Return flux, variance, background and its share in the variance, or why there are none."""
     places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
-    found = [_aperture(cube, k, beam, places, radius) for beam in range(2)]
+    found = [_aperture(cube, k, beam, places, radius) for beam in range(len(places))]
     wrong = [one for one in found if isinstance(one, str)]
     return wrong[0] if wrong else np.transpose(found)
 
@@ -257,10 +267,13 @@ def _aperture(cube, k, beam, places, radius):
 
 
 def _ring(shape, places, beam, radius, annulus):
-    """Return the pixels of the ring around a star's image, without those near the other one."""
+    """Return the pixels of the ring around a star's image, without those near the others."""
     rows, columns = np.ogrid[: shape[0], : shape[1]]
-    own, other = (np.hypot(columns - x, rows - y) for x, y in (places[beam], places[1 - beam]))
-    return (own >= radius) & (own <= radius + annulus) & (other > radius + annulus)
+    own, *others = (np.hypot(columns - x, rows - y) for x, y in np.roll(places, -beam, axis=0))
+    ring = (own >= radius) & (own <= radius + annulus)
+    for other in others:
+        ring &= other > radius + annulus
+    return ring
 
 
 def _flux(inside, weights, ring, detector):

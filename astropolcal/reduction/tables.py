@@ -12,7 +12,6 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path, check_new, one_line, understood
 from astropolcal.observations import Observations
-from astropolcal.reduction.photometry import BEAMS
 from astropolcal.units import plain_number
 
 __all__ = ["read_pypolcal"]
@@ -35,7 +34,8 @@ def reduced_table(frames, instrument, meta):
     flux, variance, covariance = (
         _stack(frames, name) for name in ("flux", "variance", "covariance")
     )
-    columns = dict(zip([f"flux_{beam}" for beam in BEAMS], flux, strict=True))
+    names = flux_names(instrument.files)
+    columns = dict(zip(names, flux, strict=True))
     # errors of the beams alone cannot say what they share
     if (covariance[~failed] != 0).any():
         # var(R -+ L) = var(R) + var(L) -+ 2 cov
@@ -43,7 +43,7 @@ def reduced_table(frames, instrument, meta):
         columns["single_difference_err"] = np.sqrt(np.maximum(both - 2 * covariance, 0.0))
         columns["single_sum_err"] = np.sqrt(np.maximum(both + 2 * covariance, 0.0))
     else:
-        columns |= {f"flux_{b}_err": np.sqrt(v) for b, v in zip(BEAMS, variance, strict=True)}
+        columns |= {f"{n}_err": np.sqrt(v) for n, v in zip(names, variance, strict=True)}
     for name, values in columns.items():
         table[name] = _column(np.where(failed, 0.0, values), failed, u.Unit(frames[0].unit))
     reasons = [reason for frame in frames for reason in frame.photometry.reasons]
@@ -53,13 +53,18 @@ def reduced_table(frames, instrument, meta):
     return table
 
 
+def flux_names(layout):
+    """Return the columns of the fluxes of the beams."""
+    return ["flux"] if len(layout.beams) == 1 else [f"flux_{beam}" for beam in layout.beams]
+
+
 def _column(values, failed, unit):
     column = MaskedColumn(values, mask=failed, unit=unit)
     return column if failed.any() else column.filled()
 
 
 def _stack(frames, name):
-    """Return an array of the photometry, (2, rows) or (rows,)."""
+    """Return an array of the photometry, (n_beams, rows) or (rows,)."""
     return np.concatenate([getattr(frame.photometry, name) for frame in frames], axis=-1)
 
 
@@ -74,16 +79,19 @@ def _frame_columns(frames, instrument):
     table["wavelength"] = np.tile(instrument.wavelength.to_value(u.nm), len(frames)) * u.nm
     if frames and all(frame.number is not None for frame in frames):
         table["number"] = np.repeat([frame.number for frame in frames], n)
-    units = dict.fromkeys(_ANGLES, u.deg) | {"exposure_time": u.s, "mjd": u.day}
+    layout = instrument.files
+    own = [name for name in layout.stages if name not in layout.texts]
+    units = dict.fromkeys((*_ANGLES, *own), u.deg) | {"exposure_time": u.s, "mjd": u.day}
     for name, unit in units.items():
         values = [frame.values.get(name) for frame in frames]
         # a column is there for all frames or not at all
         if frames and None not in values:
             column = "time" if name == "mjd" else name
             table[column] = np.repeat(np.array(values, dtype=float), n) * unit
-    states = [frame.values.get("flc_state") for frame in frames]
-    if frames and None not in states:
-        table["flc_state"] = np.repeat(states, n)
+    for name in ("flc_state", *layout.texts):
+        states = [frame.values.get(name) for frame in frames]
+        if frames and None not in states:
+            table[name] = np.repeat(states, n)
     return table
 
 
@@ -99,7 +107,7 @@ def photometry_table(frames, instrument):
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
     for name, unit in (_GEOMETRY | {"background": frames[0].unit}).items():
-        for beam, values in zip(BEAMS, _stack(frames, name), strict=True):
+        for beam, values in zip(instrument.files.beams, _stack(frames, name), strict=True):
             table[f"{name}_{beam}"] = _column(values, failed, u.Unit(unit))
     for name in ("scale", "scale_err"):
         table[name] = _column(_stack(frames, name), failed, u.one)

@@ -11,6 +11,7 @@ from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
     check_suffix,
     edit_chains,
+    follow_laws,
     instrument_of,
     is_quiet,
     printer,
@@ -31,6 +32,8 @@ examples:
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
+  astropolcal calibrate t1.ecsv t2.ecsv --own hwp.theta
+  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time"
   astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
   astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
   astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
@@ -59,6 +62,11 @@ files FILE * Input  observation tables (ECSV)
 --errors {scatter,white} =scatter  errors from how the residuals scatter and are correlated
     (default), or those of independent data with the noise of --weights
 @ fix free
+--own NAME[=GROUP,...] ...  a parameter with a value of its own in each table, or in each group of
+    tables, such as hwp.theta=july,july,october; all others are shared
+--follow NAME:LAW:INPUTS[:SINCE] ...  let a parameter follow Polynomial1D(DEGREE) of an input, or
+    Polynomial2D(DEGREE) of two: time (zero on the first day of the tables, or SINCE), x, y,
+    wavelength or a stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
 @ prior
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
@@ -102,6 +110,7 @@ def run(arguments):
     chains = instrument.chains_for(tables[:n], **exact, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in tables[n:]]
+    chains = follow_laws(chains, arguments.follow, datasets)
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     if arguments.start:
         edits["free"] = []
@@ -172,7 +181,17 @@ def _fitted(arguments, chains, datasets, positions, instrument):
         return restart(old, datasets, arguments.free, chain=chains, **options)
     options |= {"strategy": arguments.strategy, "observable": arguments.observable}
     options |= {"fix": _held(arguments, chains), "instrument": instrument.name}
-    return calibrate(chains, datasets, **options)
+    return calibrate(chains, datasets, own=_own(arguments.own), **options)
+
+
+def _own(texts):
+    """Return the parameters of ``--own``, with the groups of the tables where these are named."""
+    pairs = [text.partition("=")[::2] for text in texts]
+    if len(pairs) > 1 and len({bool(groups) for _, groups in pairs}) > 1:
+        raise ParameterError("--own: name the groups of all parameters, or of none")
+    if pairs and pairs[0][1]:
+        return {name: groups.split(",") for name, groups in pairs}
+    return [name for name, _ in pairs]
 
 
 def _check_start(arguments):
@@ -180,7 +199,11 @@ def _check_start(arguments):
     if not arguments.start:
         return
     # they would contradict what the old calibration holds
-    given = [f"--{key}" for key in ("fix", "prior", "without") if getattr(arguments, key)]
+    given = [
+        f"--{key}"
+        for key in ("fix", "prior", "without", "own", "follow")
+        if getattr(arguments, key)
+    ]
     given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
     if given:
         raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.modeling import models
 
-from astropolcal.chain import find_optic, leaves, remove_optic
+from astropolcal.chain import find_optic, follow, leaves, remove_optic
 from astropolcal.exceptions import (
     AstropolcalError,
     AstropolcalWarning,
@@ -23,7 +24,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.progress import clear
-from astropolcal.units import plain_number
+from astropolcal.units import mjd_of, plain_number
 from astropolcal.words import did_you_mean
 
 # what a terminal has that nobody made wider
@@ -310,6 +311,14 @@ _SHARED = """
 --online  fetch new tables of the Earth's rotation; by default the network is not used
 -q --quiet  print only warnings and errors
 --plots DIR Folder  save the figures in this folder
+--archive DIR Folder  work on all sequences in the folders that are named and in those inside, and
+    write products, index and manifest to this folder; what is there already is not done again
+--gap MINUTES float =30  with --archive: time without a frame after which another sequence begins
+    (default: 30)
+--cycles N int  with --archive: cut sequences after so many cycles of the half-wave plate
+--target PATTERN  with --archive: only objects such as 'HD*'
+--retry  with --archive: try the sequences that failed again
+--timeout MINUTES float  with --archive: give a sequence up after this time
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
 --prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
@@ -504,6 +513,9 @@ def _check_table(path):
 
 # ---- the model ------------------------------------------------------------------------------
 
+# what a typed law may be
+_LAWS = {"Polynomial1D": models.Polynomial1D, "Polynomial2D": models.Polynomial2D}
+
 
 def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     """
@@ -541,6 +553,38 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
         for parameter in _parameters(chains, name):
             parameter.prior = _normal(name, parameter, value)
             parameter.fixed = False
+    return chains
+
+
+def follow_laws(chains, texts, tables):
+    """
+    Return the chains in which parameters follow laws, each NAME:MODEL(DEGREE):INPUTS[:SINCE].
+
+    Time is zero on the first day of the tables where no date is given.
+    """
+    dated = [mjd_of(table.frames["time"]) for table in tables if "time" in table.frames.colnames]
+    for text in texts:
+        # a time of day has colons too
+        match = re.fullmatch(r"([^:]+):(\w+)\((\d{1,2})\):([\w,]+)(?::(.+))?", text, re.ASCII)
+        model = match and _LAWS.get(match[2])
+        if not model or int(match[3]) < 1:
+            raise ParameterError(
+                f"--follow {text}: write NAME:MODEL(DEGREE):INPUTS[:SINCE], such as "
+                f"hwp.theta:Polynomial1D(1):time:2026-03-01; allowed are {' and '.join(_LAWS)}"
+            )
+        name, _, degree, of, since = match.groups()
+        optic = name.rpartition(".")[0]
+        have = [any(leaf.name == optic for leaf in leaves(chain)) for chain in chains]
+        if not any(have):
+            # raises, with near matches
+            find_optic(chains[0], optic)
+        law, of = model(int(degree)), of.split(",")
+        if "time" in of and since is None and dated:
+            since = np.floor(min(one.min() for one in dated))
+        chains = [
+            follow(chain, name, law, of, since=since) if here else chain
+            for chain, here in zip(chains, have, strict=True)
+        ]
     return chains
 
 

@@ -3,6 +3,8 @@
 
 import argparse
 import copy
+import os
+from functools import lru_cache
 from pathlib import Path
 
 import astropy.units as u
@@ -15,6 +17,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import one_line
+from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
@@ -37,13 +40,14 @@ examples:
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
   astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \\
       --rotation pupil --camera-angle 113 --open-directions ignore
+  astropolcal correct --calibration library/ nights/ --archive out --workers 8
 """
 
 OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --calibration LIB_OR_FILE Input required  a calibration file, or a folder of them, from which the
     one that holds for the frames is taken
--o --output OUT.fits Output required  the product; overwritten if it exists
+-o --output OUT.fits Output  the product; overwritten if it exists
 --mode {stokes,ip} =stokes  stokes (default): invert the Mueller matrices; ip: instrumental
     polarization only
 --observable {intensity,single,double}  what is fitted: the beams, or their single or double
@@ -81,9 +85,11 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --spectrum OUT.ecsv Output  table of the star in an aperture
 --radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
 --plot FILE Output  figure of the result
---workers N int  threads of dask
---cluster ADDRESS  scheduler of dask.distributed
+--workers N int  threads of dask; with --archive: processes (default: one per processor)
+--cluster ADDRESS  scheduler of dask.distributed, in place of these
 @ full json online quiet
+[whole archives]
+@ archive gap cycles target retry timeout
 """
 # options that `correct` calls the same
 _PASSED_ON = (
@@ -149,9 +155,11 @@ def run(arguments):
     from astropolcal.correction import ScienceFrames, correct
     from astropolcal.reduction.science import configured, survey_frames
 
-    check_suffix("-o", arguments.output, ".fits")
-    check_suffix("--spectrum", arguments.spectrum, ".ecsv")
     _check_options(arguments)
+    check_suffix("--spectrum", arguments.spectrum, ".ecsv")
+    if is_archive(arguments, ("spectrum", "plot")):
+        return run_archive("correct", arguments)
+    check_suffix("-o", arguments.output, ".fits")
     files = cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
@@ -199,6 +207,7 @@ def run(arguments):
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
         _report(summary, result.systematic, arguments)
+    return 0
 
 
 def _sorted(files, instrument):
@@ -256,26 +265,41 @@ def choose_calibration(arguments, files):
     A file that says itself that it does not hold for the frames is refused like one in a library,
     unless the user asks for it for any date.
     """
-    from astropolcal import Calibration, instruments
-    from astropolcal.converters.calibration import content_hash
+    from astropolcal import instruments
     from astropolcal.correction.rows import sky_chain
     from astropolcal.reduction.science import read_night
 
     path = Path(arguments.calibration)
     # a folder is searched when it is known what the frames need
-    calibration = None if path.is_dir() else Calibration.read(path)
+    calibration, digest = (None, None) if path.is_dir() else _read(path)
     name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
     night = read_night(files, instruments.get(name))
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
         entry = _of_library(path, arguments, night, beam, files)
-        calibration, path = entry.calibration, entry.path
+        path = entry.path
+        calibration, digest = _read(path)
     _check_validity(calibration, path, arguments, night)
     wanted = {"optics_in": arguments.optics_in, "beam": beam, "date": night.dates or None}
     chain = sky_chain(calibration, label=str(path), **wanted)
-    made = {"calibration": str(path), "calibration_hash": content_hash(calibration)}
+    made = {"calibration": str(path), "calibration_hash": digest}
     return calibration, chain, made
+
+
+def _read(path):
+    """Return a calibration and its hash, which many sequences of an archive have in common."""
+    state = os.stat(path) if os.path.exists(path) else None
+    return _read_once(path, None if state is None else (state.st_size, state.st_mtime_ns))
+
+
+@lru_cache(maxsize=8)
+def _read_once(path, state):
+    from astropolcal import Calibration
+    from astropolcal.converters.calibration import content_hash
+
+    calibration = Calibration.read(path)
+    return calibration, content_hash(calibration)
 
 
 def _check_validity(calibration, path, arguments, night):

@@ -1,23 +1,32 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal efficiency``: how much of the polarization an observation measures."""
 
+from contextlib import suppress
+
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from astropolcal import instruments
 from astropolcal.chain import stages
+from astropolcal.efficiency import demodulation, has_plate
 from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.optics import COORDINATES
 from astropolcal.scripts._common import give, printer, say_written, sky_position
 from astropolcal.units import iso_date
+from astropolcal.words import counted
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
+# from which efficiency on V is solved for, too
+_MODULATED = 0.1
 HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
 DESCRIPTION = """\
 Share of the linear polarization that an observation measures, over
 wavelength, derotator angle, altitude and parallactic angle; and the derotator
 offset that loses least of it. Without a calibration the published values are
-taken."""
+taken. Without a half-wave plate, the efficiencies of I, Q, U and V in the
+frames that were calibrated."""
 EXAMPLES = """\
 examples:
   astropolcal efficiency                         published values of CHARIS
@@ -54,7 +63,10 @@ def run(arguments):
     tabulated = not planned or any(a is not None for a in asked)
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
     arguments.parallactic = arguments.parallactic or 0.0
-    instrument, chain, grid = _chain(arguments)
+    instrument, chain, grid, settings = _chain(arguments)
+    if not has_plate(chain):
+        _any_modulation(arguments, instrument, chain, grid, settings)
+        return
     content = _table(arguments, instrument, chain, grid)
     texts, best = [_table_text(content)] if tabulated else [], None
     if planned:
@@ -74,7 +86,7 @@ def _chain(arguments):
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
         chain, grid = instrument.published(), instrument.wavelength
-        return instrument, _on_sky(instrument, chain, grid, arguments), grid
+        return instrument, _on_sky(instrument, chain, grid, arguments), grid, {}
     calibration = Calibration.read(arguments.file)
     own, grid = calibration.instrument, calibration.wavelength
     if not (arguments.instrument or own):
@@ -85,7 +97,65 @@ def _chain(arguments):
         raise InstrumentError(f"{arguments.file}: {words}")
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
-    return instrument, _on_sky(instrument, chains[0], grid, arguments), grid
+    chain = _on_sky(instrument, chains[0], grid, arguments)
+    return instrument, chain, grid, calibration.fit.get("sky_settings") or {}
+
+
+def _any_modulation(arguments, instrument, chain, grid, settings):
+    """Give the efficiencies of the frames that were calibrated, of any modulator."""
+    from astropolcal.calibration.identifiability.sky import chain_from_sky, sequence_of
+
+    for option in ("derotator", "target", "night", "law"):
+        if getattr(arguments, option):
+            raise ParameterError(f"--{option}: is for instruments with a half-wave plate")
+    chain = chain_from_sky([chain])[0]
+    own = [stage for stage in stages(chain) if stage not in ("altitude", "parallactic")]
+    placed = sequence_of(own, settings)
+    if placed is None:
+        raise ParameterError(f"{instrument.name}: no frames are known; give a calibration file")
+    frames, pointing = QTable(), _pointing(arguments, chain)
+    for stage, values in placed[0].items():
+        device, is_state, state = stage.partition("=")
+        if not is_state:
+            frames[stage] = values * (1 if stage in COORDINATES else u.rad)
+            continue
+        before = frames.columns.get(device, np.full(len(values), "", dtype=object))
+        frames[device] = np.where(values > 0, state, before)
+    for stage, angle in pointing.items():
+        frames[stage] = np.full(len(frames), angle.value) * angle.unit
+    # what lacks Q or U is refused; a V that is hardly modulated would only add its noise to them
+    found = demodulation(chain, grid, frames, components="IQU")
+    with suppress(ParameterError):
+        whole = demodulation(chain, grid, frames)
+        found = whole if whole.efficiency[:, 3].min() > _MODULATED else found
+    rows = _rows(arguments.wavelength, grid)
+    content = {"instrument": instrument.name, "n_frames": len(frames)}
+    content |= {f"{key}_deg": angle.value for key, angle in pointing.items()}
+    content |= {"wavelength_nm": grid.to_value(u.nm)[rows], "components": list(found.components)}
+    content["efficiency"] = found.efficiency.T[:, rows]
+    if arguments.output:
+        from astropolcal.plotting._style import save
+        from astropolcal.plotting.efficiency import plot_efficiencies
+
+        save(plot_efficiencies(found, grid, title=_title(instrument)), arguments.output)
+    give(arguments, [_modulation_text(content)], content)
+    say_written(printer(arguments), [path for path in (arguments.output, arguments.json) if path])
+
+
+def _modulation_text(content):
+    lines = [
+        f"Efficiencies of {counted(content['n_frames'], 'frame')} of {content['instrument']} "
+        "(del Toro Iniesta & Collados 2000)",
+        "",
+        " " + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
+    ]
+    for name, row in zip(content["components"], content["efficiency"], strict=True):
+        lines.append(name + "".join(f"{value:8.3f}" for value in row))
+    return "\n".join(lines)
+
+
+def _title(instrument):
+    return f"Polarimetric efficiency of {instrument.name}"
 
 
 def _on_sky(instrument, chain, grid, arguments):
@@ -209,7 +279,7 @@ def _draw(arguments, instrument, chain, grid, best=None):
     from astropolcal.plotting._style import save
     from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
-    title = f"Polarimetric efficiency of {instrument.name}"
+    title = _title(instrument)
     if best is not None:
         title = f"{title}\ntarget {arguments.target}, {arguments.night}"
         save(plot_derotator_offsets(best, title=title), arguments.output)

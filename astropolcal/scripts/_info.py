@@ -18,7 +18,7 @@ and for what it is valid. Without a file, what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only
---frame FITS Input  of a folder: which calibration holds for this frame, and why none of the others
+--frame FILE Input  of a folder: which calibration holds for this frame, and why none of the others
 --context NAME  of a folder: the files of this context only
 @ full
 --json FILE Output  write it for machines (- for stdout)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
+from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
@@ -33,14 +34,19 @@ examples:
   astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
   astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
   astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside
+  astropolcal reduce nights/ --source star --archive tables/ --workers 8
 """
 
 
 OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
--o --output OBS.ecsv Output required  the table; overwritten if it exists
+-o --output OBS.ecsv Output  the table; overwritten if it exists
 --instrument NAME  default: the one that the headers name, else charis
 --raw DIR Frames  folder of raw frames, for keywords that the cubes lack
+--dark FILE Input  raw frames: dark that is subtracted (FITS); of two cameras the file of the right
+    beam, beside that of the left one
+--flat FILE Input  raw frames: flat by which they are divided; pixels where it is not above zero, or
+    that have no value in dark or flat, are not used
 --source KIND =internal  internal (default), polarized, unpolarized (internal source with and
     without its polarizer), star, 'unpolarized standard star', 'polarized standard star'
 --meta KEY=VALUE pair ...  more for the table's meta, such as yjh50_dichroic=in
@@ -51,9 +57,12 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
     of the light) or pixels
 --aperture-correction  stars: scale the fluxes to all of the star's light, by a profile of its wings
 --workers N int  number of processes
+--cluster ADDRESS  with --archive: scheduler of dask.distributed, in place of processes
 --resume FILE Continued  journal of what is done, to go on after a stop
 --quicklook DIR Folder  write figures to this folder
 @ full json online quiet
+[whole archives]
+@ archive gap cycles target retry timeout
 """
 
 
@@ -72,6 +81,11 @@ def run(arguments):
     from astropolcal import instruments
     from astropolcal.reduction import reduce_run
 
+    _options(arguments)
+    if is_archive(arguments, ("resume", "quicklook")):
+        return run_archive("reduce", arguments)
+    if arguments.cluster:
+        raise ParameterError(f"--cluster {arguments.cluster}: is for --archive DIR")
     check_suffix("-o", arguments.output, ".ecsv")
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument or _recognized(files))
@@ -80,6 +94,8 @@ def run(arguments):
         instrument,
         source=arguments.source,
         raw=arguments.raw,
+        dark=arguments.dark,
+        flat=arguments.flat,
         meta=dict(arguments.meta),
         workers=arguments.workers,
         resume=arguments.resume,
@@ -97,6 +113,7 @@ def run(arguments):
         summary = {"output": str(arguments.output)} | reduction.summary()
         write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
     _report(reduction, arguments, figures)
+    return 0
 
 
 def _recognized(files):

@@ -2,7 +2,7 @@
 """
 Entry point of the ``astropolcal`` command.
 
-Exit status 0, or 2 with one clear line on bad input.
+Exit status 0; 1 if sequences of an archive failed; or 2 with one clear line on bad input.
 """
 
 import argparse
@@ -120,7 +120,7 @@ def main(argv=None):
     Returns
     -------
     int
-        Exit status: 0, or 2 on bad input.
+        Exit status: 0, 1 if sequences of an archive failed, or 2 on bad input.
 
     Examples
     --------
@@ -191,8 +191,8 @@ def _run(argv):
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            with _earth(arguments), shown(not getattr(arguments, "quiet", False)):
-                arguments.run(arguments)
+            with earth(arguments), shown(not getattr(arguments, "quiet", False)):
+                return arguments.run(arguments) or 0
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
             return 2
@@ -200,10 +200,9 @@ def _run(argv):
             words = _one_line(error) or "give it less to do at a time"
             print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
             return 2
-    return 0
 
 
-def _earth(arguments):
+def earth(arguments):
     """Return in what to run a command that may ask for new tables of the Earth's rotation."""
     if not getattr(arguments, "online", False):
         return nullcontext()

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Speed and memory of the correction of cubes, against copying and summing them with numpy.
+Speed and memory of the correction of cubes, against copying them with numpy.
 
 Not part of the normal run: ``pytest tests/benchmarks``.
 """
@@ -21,8 +21,8 @@ from astropolcal.correction.geometry import derotate
 N_FRAMES = 100
 #: Cubes of CHARIS; the two beams of a frame are two such arrays.
 SHAPE = (22, 201, 201)
-#: Least share of the speed of a copy and a sum.
-GOAL = 0.5
+#: Most time, in that of copying the images once; reading them twice is all that it takes.
+GOAL = 1.3
 
 
 def positions(n):
@@ -50,13 +50,9 @@ def beams():
     return [rng.uniform(1, 2, size=shape) for _ in "rl"]
 
 
-def seconds(function, repeat=3):
-    best = np.inf
-    for _ in range(repeat):
-        started = time.perf_counter()
-        function()
-        best = min(best, time.perf_counter() - started)
-    return best
+def copy(arrays):
+    for array in arrays:
+        array.copy()
 
 
 def copy_and_sum(arrays):
@@ -69,14 +65,18 @@ def test_speed(beams, chain, capsys, workers):
     frames = ScienceFrames.from_arrays(
         *beams, instruments.get("charis").wavelength, positions(N_FRAMES // 2)
     )
-    ours = seconds(lambda: correct(chain, frames, workers=workers))
-    theirs = seconds(lambda: copy_and_sum(beams))
-    with capsys.disabled():
-        print(
-            f"\n  {N_FRAMES} images x {' x '.join(map(str, SHAPE))}, workers {workers}: "
-            f"{ours:.2f} s, copy and sum {theirs:.2f} s, ratio {theirs / ours:.2f}"
-        )
-    assert theirs / ours > GOAL
+    ours, copied, summed = fastest(
+        lambda: correct(chain, frames, workers=workers),
+        lambda: copy(beams),
+        lambda: copy_and_sum(beams),
+        repeats=9,
+        clock=time.perf_counter,
+    )
+    shape = " x ".join(map(str, SHAPE))
+    ratios = f"{ours / copied:.2f} of copying, {ours / summed:.2f} of copying and summing"
+    report(capsys, f"{N_FRAMES} images x {shape}, workers {workers}: {ours:.2f} s, {ratios}")
+    # threads of a busy machine wait for each other
+    assert ours < GOAL * (copied if workers is None else summed)
 
 
 def test_derotation_of_cubes(capsys):

@@ -5,16 +5,13 @@ Speed of the reduction of cubes, against a plain loop with photutils.
 Not part of the normal run: ``pytest tests/benchmarks``.
 """
 
-import resource
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from timing import fastest, report
+from timing import fastest, in_new_process, report
 
 from astropolcal import instruments
 from astropolcal.reduction import reduce_run
@@ -43,19 +40,15 @@ def run(request, tmp_path_factory):
 
 
 def reduced(paths, source, raw):
-    """Return the number of frames, the time of the processor (s) and the most memory (MB)."""
+    """Return the number of frames and the time of the processor (s)."""
     started = time.process_time()
     reduction = reduce_run(paths, "charis", source=source, raw=raw)
-    seconds = time.process_time() - started
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return len(reduction.frames), seconds, memory
+    return len(reduction.frames), time.process_time() - started
 
 
 def test_run_of_a_hundred_cubes(run, capsys):
     source, paths, raw = run
-    # a process of its own: the most memory is that of all that a process ever did
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        n, seconds, memory = pool.submit(reduced, paths, source, raw).result()
+    (n, seconds), memory = in_new_process(reduced, paths, source, raw)
     with capsys.disabled():
         print(f"\n  {source}: {N_CUBES} cubes in {seconds:.1f} s, at most {memory:.0f} MB")
     assert n == N_CUBES

@@ -19,14 +19,14 @@ import pytest
 from astropy.modeling.fitting import TRFLSQFitter
 from scipy.linalg import svd
 from scipy.optimize import least_squares
-from timing import interleaved, report
+from timing import in_new_process, interleaved, report
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
-from astropolcal.pipeline import Library, library
+from astropolcal.pipeline import Library, library, load
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -249,6 +249,29 @@ def test_system_mueller_against_a_plain_loop(capsys):
         capsys, f"system_mueller {times[0] * 1e3:.2f} ms, {times[1] / times[0]:.0f} times faster"
     )
     assert times[1] / times[0] >= 5
+
+
+def many_matrices(path, n):
+    """Return the processor's times (s) of matrices of so many settings, and of their errors."""
+    loaded, rng = load(path), np.random.default_rng(1)
+    positions = {name: rng.uniform(0, 180, n) * u.deg for name in ("hwp", "derotator")}
+    times = [time.process_time()]
+    matrices = loaded.system_mueller(positions=positions, light="internal")
+    times.append(time.process_time())
+    assert matrices.std.shape == (n, 22, 4, 4)
+    times.append(time.process_time())
+    return np.diff(times)
+
+
+def test_system_mueller_of_an_archive(calibration, capsys, tmp_path):
+    """All settings differ, which is the most work."""
+    calibration.write(tmp_path / "a.asdf")
+    (first, errors), _ = in_new_process(many_matrices, tmp_path / "a.asdf", 1000)
+    (_, all_errors), memory = in_new_process(many_matrices, tmp_path / "a.asdf", 100_000)
+    report(capsys, f"1,000 matrices {first:.2f} s, errors {errors:.2f} s; 100,000 with errors "
+                   f"{all_errors:.1f} s, {memory:.0f} MB")  # fmt: skip
+    assert first < 0.3
+    assert memory < 2000
 
 
 # --- processes ------------------------------------------------------------------------------

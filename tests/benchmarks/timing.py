@@ -7,8 +7,12 @@ nothing else ran; where a function takes longer than such a turn, the time of th
 not count the waiting.
 """
 
+import re
 import statistics
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
 
 # seconds that a process mostly gets without a pause
 _TURN = 2e-3
@@ -45,6 +49,24 @@ def _times(functions, repeats, clock, runs=1):
                 function()
                 kept.append(clock() - started)
     return times
+
+
+def in_new_process(function, *arguments):
+    """Return the result of a function, and the most memory (MB) that a process of its own had.
+
+    The peak of the system's accounting survives the start of another program in a process, and so
+    would be that of who started it; the one that is asked for here is forgotten first.
+    """
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(_with_memory, function, arguments).result()
+
+
+def _with_memory(function, arguments):
+    # Linux: the largest resident set is counted from now on
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    result = function(*arguments)
+    text = Path("/proc/self/status").read_text(encoding="ascii")
+    return result, int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
 
 
 def report(capsys, text):

@@ -14,7 +14,14 @@ from astropy.io import fits
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import propagate
 from astropolcal.calibration.result.validity import with_validity
-from astropolcal.chain import join, leaves, system_mueller, with_beam
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.chain import (
+    join,
+    leaves,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -118,6 +125,19 @@ def test_frames_have_an_axis_of_their_own(loaded):
     np.testing.assert_allclose(both.value[1], loaded.system_mueller(other).value, atol=1e-15)
 
 
+def test_the_chain_is_a_model_from_the_sky_with_the_values_found(calibration, loaded):
+    chain = loaded.chain
+    assert [leaf.name for leaf in leaves(chain)][:4] == ["parallactic", "m3", "altitude", "hwp"]
+    assert chain["hwp"].w_sio2 == calibration.chains[0]["hwp"].w_sio2
+    angles = {"hwp": 10.0, "derotator": 50.0, "parallactic": 20.0, "altitude": 60.0}
+    positions = {stage: angle * u.deg for stage, angle in angles.items()}
+    seen = system_mueller(with_beam(chain, "right"), WAVELENGTH, positions)
+    wanted = loaded.system_mueller(positions=positions).value
+    np.testing.assert_allclose(np.squeeze(seen), np.squeeze(wanted))
+    chain["hwp"].w_sio2 = 1 * u.mm
+    assert loaded.chain["hwp"].w_sio2.value > 1
+
+
 def test_positions_in_place_of_headers(loaded):
     angles = {"hwp": 62.5, "derotator": 60.0, "parallactic": -30.0, "altitude": 55.0}
     positions = {key: value * u.deg for key, value in angles.items()}
@@ -159,6 +179,42 @@ def test_covariance_is_that_of_the_parameters(calibration, loaded):
     for i in range(3):
         block = known.covariance()[16 * i : 16 * i + 16, 16 * i : 16 * i + 16]
         np.testing.assert_allclose(found.covariance[i], block, rtol=1e-4, atol=1e-14)
+
+
+def test_errors_of_many_frames_are_those_of_a_dense_jacobian(calibration, loaded):
+    """Worked out by settings, wavelengths and blocks of frames, nothing changes."""
+    rng = np.random.default_rng(5)
+    settings = {name: rng.uniform(20, 70, 290) for name in ("hwp", "derotator", "parallactic")}
+    # some settings occur twice, and one stage stands
+    positions = {name: np.append(angle, angle[:20]) * u.deg for name, angle in settings.items()}
+    positions["altitude"] = 55 * u.deg
+    found = loaded.system_mueller(positions=positions)
+    chain, lam = with_beam(join(leaves(calibration.chains[1])[1:]), "right"), found.wavelength
+    np.testing.assert_array_equal(found.value, system_mueller(chain, lam, positions))
+    covariance = full_covariance(calibration)
+    dense = np.zeros((310, 3, 16, len(covariance.names)))
+    for name, slope in system_mueller_derivatives(chain, lam, positions).items():
+        slope = slope.value if hasattr(slope, "unit") else slope
+        for i, full in enumerate(covariance.names):
+            bare, _, bin_ = full.removesuffix("]").partition("[")
+            if bare == name:
+                at = slice(None) if not bin_ else int(bin_)
+                dense[:, at, :, i] = slope[:, at].reshape(dense[:, at, :, i].shape)
+    moved = dense @ covariance.factor.T
+    std = np.sqrt(np.sum(moved**2, axis=-1)).reshape(found.value.shape)
+    np.testing.assert_allclose(found.std, std, rtol=1e-12, atol=1e-15)
+    whole = moved @ moved.swapaxes(-1, -2)
+    np.testing.assert_allclose(found.covariance_in_gauge, whole, rtol=1e-12, atol=1e-15)
+    factor = found.factor.reshape(310, 48, -1)
+    far = np.einsum("ir,jr->ij", factor[0], factor[300])
+    expected_far = np.einsum("ir,jr->ij", *(moved[i].reshape(48, -1) for i in (0, 300)))
+    np.testing.assert_allclose(far, expected_far, rtol=1e-12, atol=1e-15)
+    some = found[[300, 2]]
+    np.testing.assert_allclose(some.covariance, found.covariance[[300, 2]], rtol=1e-12, atol=1e-18)
+    assert some.positions["altitude"].shape == (2,)
+    np.testing.assert_array_equal(found[3].std, found[3:4].std[0])
+    with pytest.raises(ParameterError, match="single frame"):
+        found[3][0]
 
 
 @pytest.mark.slow
@@ -532,6 +588,7 @@ assert {"matplotlib", "photutils", "specutils", "jinja2", "scipy"} <= set(blocke
 
 from astropolcal.pipeline.loading import load
 from astropolcal.calibration.result.validity import with_validity
+from astropolcal.calibration.uncertainty.covariance import full_covariance
 header = {"INSTRUME": "CHARIS", "MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0,
           "FILTNAME": "broadband JHK"}
 calibration = load(sys.argv[1], header)

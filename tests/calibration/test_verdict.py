@@ -258,7 +258,7 @@ def test_a_target_that_is_not_known():
     ):
         assert verdicts._too_far([table(s_p, s_chi)], sky) == words
     assert verdicts._too_far([], {}) == []
-    assert verdicts._accuracy([], {}) == "On sky      unknown: the chain has no half-wave plate"
+    assert verdicts._accuracy([], {}) == "On sky      unknown: the frames do not measure Q and U"
     words = verdicts._accuracy([table(0.0001, np.inf), table(0.02, np.inf)], {})
     assert words == "On sky      30, 30 % to <0.001, 0.02 %, AoLP open"
     words = verdicts._accuracy([table(0.0253, 1.26), table(1.234, 60.0)], {})

@@ -53,9 +53,9 @@ def cubes_of_stars(sky, charis, track, tmp_path):
 
 def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
     pytest.importorskip("distributed", reason="distributed is not installed")
-    from astropolcal.correction import correcting as engine
+    from astropolcal.pipeline import tasks
 
-    monkeypatch.setattr(engine, "_TIMEOUT", 0.5)
+    monkeypatch.setattr(tasks, "_TIMEOUT", 0.5)
     frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
     with pytest.raises(AstropolcalError, match=r"cluster tcp://127\.0\.0\.1:1: cannot be used"):
         correct(sky, frames, cluster="tcp://127.0.0.1:1")

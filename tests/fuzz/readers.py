@@ -324,7 +324,7 @@ class Index(Reader):
             held = {"instrument": "bench", "mode": "J", "valid_from": f"202{i}-01-01"}
             held |= {"valid_until": f"202{i + 2}-05-01T10:00:00.000", "optics_in": optics_in}
             record = {"state": list(self._state), "validity": held, "content_hash": f"{i}" * 64}
-            files[f"{i}.asdf"] = record | {"quality": quality}
+            files[f"{i}.asdf"] = record | {"quality": quality, "supersedes": ["0" * 64] * (i == 2)}
         return {"index": json.dumps(library._index(files)).encode()}
 
     def mutate(self, rng, content):

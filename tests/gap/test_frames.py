@@ -8,8 +8,10 @@ import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
+from astropy.table import QTable
 
-from astropolcal import instruments
+from astropolcal import instruments, optics
+from astropolcal.chain import join
 from astropolcal.gap.frames import suspect_frames, without_frames
 from astropolcal.gap.model import nominal_model
 from astropolcal.observations import Observations
@@ -201,3 +203,95 @@ def test_cases_of_another_simulator(shared_data):
             chains = instruments.get("charis").chains_for(seen, derotator="linear")
             faults = harmful(suspect_frames(nominal_model(chains, seen)))
             assert {(fault.frame, fault.what) for fault in faults} == named, case
+
+
+# --- frames of a single beam -------------------------------------------------------------------
+
+WAVELENGTH = [0.6, 0.7, 0.8] * u.um
+
+
+def single_chain(turning):
+    """A polarizer that turns, and a wheel of polarizers or a plate that turns and a polarizer."""
+    lamp = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    if not turning:
+        states = [
+            optics.StateAnalyser(
+                efficiency=0.95, theta=t * u.deg, name=f"pol{t}", mount=f"filter=POL{t}"
+            )
+            for t in (0, 60, 120)
+        ]
+        return join([lamp, *states])
+    plate = optics.LinearRetarder(
+        retardance=[60, 105, 150] * u.deg, mount="plate", name="plate", fixed={"theta": False}
+    )
+    return join([lamp, plate, optics.LinearPolarizer(name="analyser")])
+
+
+def single(turning, error=(), factor=1.0, at=(), seed=1):
+    """Frames of a single beam, in some of which a stage stood elsewhere or the lamp was bright."""
+    if turning:
+        n = 40
+        columns = {
+            "calibrator": np.linspace(3, 178, n),
+            "plate": (13.7 + 39.1 * np.arange(n)) % 180,
+        }
+        frames = QTable({key: angle * u.deg for key, angle in columns.items()})
+    else:
+        turns = np.linspace(3, 178, 24)
+        frames = QTable({"calibrator": np.repeat(turns, 3) * u.deg})
+        frames["filter"] = np.tile(["POL0", "POL60", "POL120"], 24)
+        frames["group"] = np.repeat(np.arange(24), 3)
+    stood = frames.copy()
+    for stage, offset in error:
+        stood[stage][list(at)] += offset * u.deg
+    lamp = np.ones(len(frames))
+    lamp[list(at)] = factor
+    seen = simulate(single_chain(turning), WAVELENGTH, stood, lamp=lamp, flux=1e6, seed=seed)
+    seen = seen.to_table()
+    for stage, _ in error:
+        seen[stage] = frames[stage][np.searchsorted(np.arange(len(frames)), seen["frame"])]
+    return Observations.from_table(seen, name="single")
+
+
+def found_of_single(turning, **options):
+    chain = single_chain(turning)
+    return suspect_frames(nominal_model([chain], [single(turning, **options)]))
+
+
+def test_frame_of_a_single_beam_is_named_with_what_its_design_can_tell():
+    (fault,) = found_of_single(True, factor=1.05, at=[17])
+    assert (fault.frame, fault.what) == (17, "brightness")
+    assert abs(fault.value - 1.05) < 5 * fault.error
+    # at one wavelength an angle cannot be distinguished from a brightness, at three it hardly can
+    (fault,) = found_of_single(True, error=[("plate", 3)], at=[17])
+    assert fault.frame == 17
+    assert fault.what == "plate angle" or "cannot tell" in fault.words
+    (fault,) = found_of_single(False, factor=0.95, at=[20])
+    assert (fault.frame, fault.what, fault.value) == (20, "unknown", None)
+    assert "calibrator stood at" in fault.words
+    assert "its brightness is off" in fault.words
+    assert fault.words.endswith("its design cannot tell")
+
+
+def test_angle_of_a_whole_group_is_found():
+    faults = found_of_single(False, error=[("calibrator", 4)], at=[21, 22, 23])
+    assert [(fault.frame, fault.what) for fault in faults] == [
+        (21, "calibrator angle"),
+        (22, "calibrator angle"),
+        (23, "calibrator angle"),
+    ]
+    stood = 3 + 7 * 175 / 23 + 4
+    assert abs(faults[0].value - stood) < 0.5
+
+
+def test_clean_frames_of_a_single_beam_are_not_accused():
+    assert not any(found_of_single(turning, seed=s) for turning in (True, False) for s in range(5))
+
+
+def test_of_two_frames_neither_is_known_to_be_the_wrong_one():
+    seen = single(False, factor=0.9, at=[20])
+    # of the group of frame 20 there is no third one
+    mask = np.arange(seen.n_frames) == 18
+    faults = suspect_frames(nominal_model([single_chain(False)], [seen.with_mask(mask, "lost")]))
+    assert len(faults) == 1
+    assert "frames 19 and 20 alone cannot tell which of them is wrong" in faults[0].words

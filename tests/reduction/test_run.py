@@ -15,8 +15,15 @@ from astropy.time import Time
 from reduction_lab import Small, expose, pair, reduce_frame_or_die, star_image, write_cube
 
 from astropolcal import instruments
-from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
+from astropolcal.instruments.layout import FileLayout
 from astropolcal.observations import Observations, pointing
+from astropolcal.plotting.reduction import save_quicklook
 from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.reduction.frames import Frame, reduce_frame
@@ -283,6 +290,39 @@ def test_headers_say_which_optics_are_in_the_beam(tmp_path, small):
     assert given.meta["dichroic_x"] == "in"
 
 
+def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
+    rng = np.random.default_rng(5)
+    clean, raw = tmp_path / "clean", tmp_path / "raw"
+    dark = rng.uniform(20, 60, (201, 201))
+    flat = rng.uniform(0.5, 1.5, (201, 201))
+    paths = []
+    for folder in (clean, raw):
+        folder.mkdir()
+        paths.append(flat_frames(folder))
+    for path in paths[1]:
+        with fits.open(path, mode="update") as hdus:
+            hdus[1].data = (hdus[1].data * flat + dark).astype("f4")
+    # a bad pixel of each in a rectangle
+    (rows, columns, _), _ = rectangles(LAYOUT.internal_apertures, (201, 201))
+    bad = rows.start + 9, columns.start + 9
+    dark[bad], flat[bad[0] + 3, bad[1]] = np.nan, 0.0
+    for name, image in (("dark", dark), ("flat", 3 * flat)):
+        fits.writeto(tmp_path / f"{name}.fits", image)
+    masters = {name: tmp_path / f"{name}.fits" for name in ("dark", "flat")}
+    wanted = reduce_run(paths[0], small).observations
+    found = reduce_run(paths[1], small, **masters).observations
+    # up to the median of the flat
+    ratio = found.flux_right / wanted.flux_right
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=2e-3)
+    np.testing.assert_allclose(np.median(ratio), np.median(flat), rtol=5e-3)
+    spoilt = reduce_run(paths[1], small).observations
+    assert abs(spoilt.flux_right / wanted.flux_right - 1).max() > 0.05
+    fits.writeto(tmp_path / "other.fits", np.ones((20, 20)))
+    for path, words in (("other.fits", r"\(20, 20\); .* is needed"), ("none.fits", "no such file")):
+        with pytest.raises(AstropolcalError, match=words):
+            reduce_run(paths[1], small, dark=tmp_path / path)
+
+
 def test_nothing_usable_is_an_error_that_says_why(tmp_path, small):
     with pytest.raises(ObservationError, match=r"none of the 2 files .*no such file.*1 more"):
         reduce_cubes([tmp_path / "a.fits", tmp_path / "b.fits"], small)
@@ -466,3 +506,70 @@ def test_pypolcal_agrees_with_the_table_made_of_it(tmp_path, shared_data):
     ours = read_pypolcal(tmp_path, {"source": "polarized"})
     np.testing.assert_allclose(ours.flux_right, theirs.flux_right[:, :2], rtol=1e-9)
     np.testing.assert_array_equal(ours.pairs(), theirs.pairs())
+
+
+# --- one beam, and more than two ------------------------------------------------------------------
+
+
+def beams_of(layout, places, states=(), **settings):
+    """Return an instrument whose images hold a star or a lamp at some places, one for each beam."""
+    keywords = {"angle": "ROTOR", "exposure_time": "EXPTIME", "mjd": "MJD", "object": "OBJECT"}
+    keywords |= {name: name.upper() for name in states}
+    own = FileLayout(
+        keywords,
+        (1, 201, 201),
+        beams=layout,
+        stages=("angle", *states),
+        texts=states,
+        star_offsets=places,
+        units={"mjd": "d"},
+        gain=2.0,
+        read_noise=10.0,
+        **settings,
+    )
+
+    class Other(Small):
+        name, aliases, wavelength, files = "other", (), [0.6] * u.um, own
+
+    return Other()
+
+
+def test_one_beam_and_four_beams_are_measured_as_two_are(tmp_path):
+    cases = {
+        ("only",): [(100.0, 90.0)],
+        ("i0", "i45", "i90", "i135"): [(50.0, 50.0), (150.0, 55.0), (50.0, 150.0), (150.0, 155.0)],
+    }
+    for number, (names, places) in enumerate(cases.items()):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        star = beams_of(names, tuple(places), ("wheel",))
+        lamp = beams_of(names, (), internal_apertures=(*places, 20.0, 20.0, 0.0))
+        shares, files = 1 + 0.3 * np.arange(len(names)), []
+        for i, angle in enumerate((0.0, 30.0, 60.0)):
+            image = star_image([(x, y, f) for (x, y), f in zip(places, shares, strict=True)])
+            more = {"ROTOR": angle, "WHEEL": "POL60", "MJD": 61000.0 + i}
+            header = fits.Header(more | {"EXPTIME": 1.0, "OBJECT": "HD 1"})
+            files.append(folder / f"frame{i}.fits")
+            data = expose(image, star.files, seed=i, n_wavelengths=1)
+            fits.HDUList([fits.PrimaryHDU(header=header), fits.ImageHDU(data)]).writeto(files[-1])
+        table = reduce_run(files, star, source="star").table
+        columns = ["flux"] if len(names) == 1 else [f"flux_{name}" for name in names]
+        assert table["angle"].tolist() == [0, 30, 60]
+        assert table["wheel"].tolist() == ["POL60"] * 3
+        for column, share in zip(columns, shares, strict=True):
+            pulls = (table[column] - 2e5 * share) / table[f"{column}_err"]
+            assert np.all(np.abs(pulls) < 5), (column, pulls)
+        found = Observations.from_table(table)
+        assert found.single_beam
+        assert found.n_frames == 3 * len(names)
+        rectangles = reduce_run(files, lamp).table
+        ratio = rectangles[columns[-1]] / rectangles[columns[0]]
+        background = 20.0 * 20**2
+        wanted = (2e5 * shares[-1] + background) / (2e5 + background)
+        np.testing.assert_allclose(ratio, wanted, rtol=0.02)
+        with pytest.raises(ParameterError, match="allowed are False and 'growth'"):
+            reduce_run(files, star, source="star", aperture_correction=True)
+        with pytest.raises(ParameterError, match="they are of right and left"):
+            save_quicklook(reduce_run(files, star, source="star"), folder)
+    with pytest.raises(InstrumentError, match="beams = \\('a', 'a'\\)"):
+        beams_of(("a", "a"), ())

@@ -7,6 +7,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.time import Time
 from star_data import WAVELENGTH as STAR_WAVELENGTH
 from star_data import observe_star, star_chain
 
@@ -558,3 +559,54 @@ def test_saturated_frames_are_masked_with_a_reason(lamp, unpolarized, tmp_path, 
     assert "1 of 32 frames masked, saturated: frame 4" in capsys.readouterr().err
     reasons = result["datasets"][1]["masked"]
     assert reasons == {"saturated": 3, "incomplete half-wave-plate cycle": 9}
+
+
+# --- several nights, and time ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def nights(tmp_path_factory):
+    """Tables of two nights between which the plate has turned by 0.5 deg."""
+    folder, paths = tmp_path_factory.mktemp("nights"), []
+    meta = CHARIS.published_meta() | {"yjh50_dichroic": "out", "source": "polarized"}
+    for day in (0, 10):
+        chain = CHARIS.chain("polarized", ["nbs"], wavelength=WAVELENGTH)
+        chain["hwp"].theta = 0.05 * day * u.deg
+        frames = half_wave_plate_cycles(derotator=[50, 62.5, 80, 100] * u.deg)
+        frames["time"] = Time("2026-03-01") + np.full(len(frames), day) * u.day
+        paths.append(folder / f"night{day}.ecsv")
+        table = simulate(chain, WAVELENGTH, frames, seed=day, meta=meta, name=f"night {day}")
+        table.write(paths[-1])
+    return paths
+
+
+def test_parameters_of_each_night_and_a_drift(nights, tmp_path):
+    held = ["-q", "--fix", "derotator.theta=0", "--fix", "calibration_polarizer.theta"]
+    out = tmp_path / "cal.asdf"
+    for options, name, value, tolerance in (
+        (["--own", "hwp.theta"], ("hwp_night10", "theta"), 0.5, 0.02),
+        (["--own", "hwp.theta=march,april"], ("hwp_april", "theta"), 0.5, 0.02),
+        (["--follow", "hwp.theta:Polynomial1D(1):time"], ("hwp", "theta_c1"), 0.05, 0.002),
+        (["--follow", "hwp.theta:Polynomial1D(1):time:61090"], ("hwp", "theta_c1"), 0.05, 0.002),
+    ):
+        assert main(["calibrate", *map(str, nights), *held, *options, "-o", str(out)]) == 0
+        found = {leaf.name: leaf for chain in Calibration.read(out).chains for leaf in chain}
+        seen = getattr(found[name[0]], name[1]).value
+        # only the turn between the nights is known
+        seen -= found["hwp"].theta.value if name[0] != "hwp" else 0
+        assert seen == pytest.approx(value, abs=tolerance)
+
+
+def test_laws_and_groups_that_do_not_fit_get_one_line(nights, capsys):
+    for options, words in (
+        (["--follow", "hwp.theta:__import__('os')(1):time"], "write NAME:MODEL"),
+        (["--follow", "hwp.theta:Gaussian1D(1):time"], "allowed are Polynomial1D and Polynomial2D"),
+        (["--follow", "hwq.theta:Polynomial1D(1):time"], "did you mean 'hwp'"),
+        (["--follow", "hwp.theta:Polynomial2D(1):time"], "Polynomial2D has 2 inputs"),
+        (["--follow", "hwp.theta:Polynomial1D(1):time:soon"], "is not a date"),
+        (["--own", "hwp.thetta"], "no parameter 'hwp.thetta'"),
+        (["--own", "hwp.theta=march"], "has 1 groups; there are 2 datasets"),
+        (["--own", "hwp.theta", "--own", "wollaston.efficiency=a,b"], "or of none"),
+        (["--own", "hwp.theta", "--start", "old.asdf"], "--own cannot be combined with --start"),
+    ):
+        assert words in complaint(capsys, *nights, *options)

@@ -15,8 +15,8 @@ from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.result.validity import with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.correction import Corrected
-from astropolcal.correction import correcting as engine
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.pipeline import tasks
 from astropolcal.pipeline.library import Library
 from astropolcal.reduction import science
 from astropolcal.reduction.cubes import (
@@ -238,7 +238,7 @@ def test_bad_input(night, tmp_path, monkeypatch):
         (["-o", "out.asdf"], r"-o out\.asdf: the name must end with \.fits"),
         (["--spectrum", "star.txt"], r"--spectrum star\.txt: the name must end with \.ecsv"),
     ]:
-        monkeypatch.setattr(engine, "_TIMEOUT", 1)
+        monkeypatch.setattr(tasks, "_TIMEOUT", 1)
         if "--centre" not in words:
             words = [*words, "--centre", "69.9,84.7"]
         out = ["-o", tmp_path / "out.fits", "-q", "--size", "5"]

@@ -7,9 +7,11 @@ import re
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 
 from astropolcal import calibrate, instruments
-from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
+from astropolcal.efficiency import polarimetric_efficiency
+from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError, ParameterError
 from astropolcal.plotting import _style
 from astropolcal.scripts.main import build_parser
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -178,3 +180,27 @@ def test_law_and_coating_are_those_of_the_instrument(tmp_path):
     assert found[0].shape == (7, 4)
     assert np.abs(found[0] - found[1]).max() > 1e-5
     assert np.abs(found[1] - found[2]).max() > 1e-5
+
+
+def test_without_a_half_wave_plate_it_is_that_of_the_frames_that_were_calibrated(tmp_path, capsys):
+    roman = instruments.get("roman")
+    frames = QTable({"roll": np.repeat([-13, 0, 13], 2) * u.deg})
+    frames["prism"] = np.tile([0, 45], 3) * u.deg
+    meta = {"instrument": "roman", "source": "polarized standard"}
+    chain = roman.chain("polarized standard")
+    star = simulate(chain, roman.wavelength, frames, flux=1e9, seed=1, meta=meta)
+    chain["wollaston"].efficiency.fixed = chain["wollaston"].theta.fixed = True
+    chain["mirrors"].retardance.fixed = True
+    path, out = tmp_path / "roman.asdf", tmp_path / "out.json"
+    calibrate(chain, star, instrument="roman", cross_validate=False).write(path)
+    run(path, "-o", tmp_path / "figure.png", "--json", out)
+    content = json.loads(out.read_text())
+    assert content["components"] == ["I", "Q", "U"]
+    # Q and U are measured one after the other
+    np.testing.assert_allclose(content["efficiency"][1:], 0.7, atol=0.02)
+    assert "Efficiencies of 6 frames of roman" in capsys.readouterr().out
+    assert (tmp_path / "figure.png").exists()
+    with pytest.raises(ParameterError, match="--derotator: is for instruments with a half-wave"):
+        run(path, "--derotator", 45)
+    with pytest.raises(ChainError, match="demodulation gives the efficiencies of its frames"):
+        polarimetric_efficiency(chain, roman.wavelength, parallactic=0 * u.deg)

@@ -169,7 +169,7 @@ def test_options_that_cannot_be_understood(capsys):
             ["calibrate", "--derotater", "linear"],
             "--derotater; did you mean '--derotator'? (see astropolcal calibrate --help)",
         ),
-        (["reduce", "x.fits"], "required: -o/--output (see astropolcal reduce --help)"),
+        (["correct", "x"], "required: --calibration (see astropolcal correct --help)"),
         (["correct", "--size", "wide"], "argument --size: invalid int value: 'wide'"),
         (["correct", "--size", "2_1"], "argument --size: invalid int value: '2_1'"),
         (["simulate", "--flux", "\u0661"], "argument --flux: invalid float value: '\u0661'"),

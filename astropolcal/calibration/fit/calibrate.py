@@ -318,6 +318,12 @@ def _run(measurement, weighting, fitter):
     for _ in range(ROUNDS):
         outcome = _fit(measurement, weighting, fitter)
         before, weighting = weighting, weighting.updated(measurement)
+        if not np.isfinite(weighting.sigma).all():
+            raise FitError(
+                f"{measurement.free.size} free parameters and {measurement.n_data} data leave none "
+                "for the noise, against which priors weigh; fix some, add frames, or take "
+                "weights='errors'"
+            )
         if weighting.agrees(before):
             return outcome, weighting
     message = f"the noise from the residuals did not settle in {ROUNDS} fits"
@@ -526,7 +532,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     observations = (dataset.observations for dataset in measurement.datasets)
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
-    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
+    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
@@ -543,14 +549,14 @@ def _errors(measurement, whitened, how):
     return covariance, model_error(measurement, scatter)
 
 
-def _lack_of_fit(calibration):
+def _lack_of_fit(calibration, whitened):
     """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
     live = calibration.measurement
     for method in (noise_from_errors, _noise_of_frames):
         try:
             noise = method(live)
-            test = lack_of_fit(live, calibration, noise)
+            test = lack_of_fit(live, calibration, noise, whitened=whitened)
         except AstropolcalError:
             continue  # no errors in the table, or too few frames: nothing to hold against
         # unknown where no degree of freedom is left

@@ -384,7 +384,17 @@ class RunsCalibration:
 
     Examples
     --------
-    See `calibrate_runs`.
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import calibrate_runs
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear", wavelength=[1200, 1600, 2000] * u.nm)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> tables = [simulate(chain, [1200, 1600, 2000] * u.nm, frames, seed=i) for i in range(2)]
+    >>> found = calibrate_runs(chain, tables, vary=None)
+    >>> len(found), found.converged, found.runs.colnames
+    (2, True, ['date', 'tables', 'rms', 'rms_alone', 'stands_out'])
     """
 
     def __init__(self, model, rounds, converged):

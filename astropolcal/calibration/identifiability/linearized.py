@@ -122,10 +122,15 @@ class Whitened:
         return decompose(np.concatenate([self._square, self.prior_rows])[:, self.live])
 
     @cached_property
+    def slopes(self):
+        """Derivatives of the data to the determined directions, each one error long."""
+        return self.along(self.rows)
+
+    @cached_property
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
         # diagonal of the hat matrix J (J^T J + P)^-1 J^T
-        return np.sum(self.along(self.rows) ** 2, axis=1)
+        return np.sum(self.slopes**2, axis=1)
 
     @cached_property
     def n_taken(self):

@@ -23,7 +23,7 @@ from astropolcal.chain import join, leaves, stages, standing
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.optics import COORDINATES
+from astropolcal.optics import COORDINATES, LinearPolarizer
 
 __all__ = []
 
@@ -62,16 +62,26 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
         known = {"wavelength": wavelength, "date": date}
         options = {key: known[key] for key in instrument.sky_options}
         return instrument.on_sky(chains[0], **options), PUBLISHED
-    return from_first_stage(without_nuisance(chains[0])), LEFT_OUT
+    train = leaves(without_nuisance(chains[0]))
+    # a polarizer upstream of what modulates belongs to the lamp
+    lamp = [i for i, leaf in enumerate(train) if isinstance(leaf, LinearPolarizer) and leaf.stage]
+    lamp = [i for i in lamp if any(leaf.stage for leaf in train[i + 1 :])]
+    return join(train[lamp[-1] + 1 :]) if lamp else from_first_stage(join(train)), LEFT_OUT
 
 
 def settings_of(measurement):
     """Return a few of the angles at which each stage but plate and telescope stood, in radian.
 
-    Without a half-wave plate they are those of the frames, so that states go together.
+    Without a half-wave plate, or with devices that have states, they are those of the frames, so
+    that what varies together stays together.
     """
-    angles, stood = {}, [dataset.positions for dataset in measurement.datasets]
-    if not any("hwp" in positions for positions in stood):
+    angles, stood = {}, []
+    for dataset in measurement.datasets:
+        states = {s: x[..., dataset.frames.T] for s, x in dataset._given.items() if "=" in s}
+        stood.append(dataset.positions | states)
+    if not any("hwp" in one for one in stood) or any(
+        "=" in stage for one in stood for stage in one
+    ):
         shared = set.intersection(*map(set, stood)) - {*_TELESCOPE, *COORDINATES}
         if not shared:
             return {}
@@ -124,8 +134,9 @@ def _view(chains, free, lam, metas, name, settings):
             chain, telescope = chain_from_sky(chains)
         except ChainError:
             return None
-    if "hwp" not in stages(chain):
-        placed = _sequence(stages(chain), settings)
+    wanted = stages(chain)
+    if "hwp" not in wanted or any("=" in stage for stage in wanted):
+        placed = sequence_of(wanted, settings)
         view = placed and SkyView(chain, telescope, free, lam, placed)
         return view if view and view.good.any() else None
     law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
@@ -138,14 +149,13 @@ def _view(chains, free, lam, metas, name, settings):
     return view if view.good.any() else None
 
 
-def _sequence(wanted, settings):
+def sequence_of(wanted, settings):
     """Return the positions of all stages in the frames of a sequence, None if they are not known.
 
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_TELESCOPE, *COORDINATES)]
-    # devices with states have no angles
-    if not own or not {*own} <= {*settings} or any("=" in stage for stage in wanted):
+    if not own or not {*own} <= {*settings}:
         return None
     if len({len(settings[stage]) for stage in own}) > 1:
         return None
@@ -156,7 +166,7 @@ def _sequence(wanted, settings):
     placed = dict(zip(own, np.tile(frames, (count, 1)).T, strict=True))
     placed |= {"altitude": np.repeat(altitude, len(frames))}
     placed |= {"parallactic": np.repeat(parallactic, len(frames))}
-    placed |= {stage: np.zeros(1) for stage in wanted if stage in COORDINATES}
+    placed |= {stage: np.zeros(1) for stage in wanted if stage not in placed}
     return {stage: placed[stage] for stage in wanted}, count
 
 
@@ -199,7 +209,7 @@ class SkyView:
         self._model = Rows(chain, lam, self.placed, free)
         # beams first, then wavelengths, settings, frames of a setting, and I, Q and U
         self._rows = self._by_setting(self._model)
-        self.has_plate = "hwp" in self.placed
+        self.has_plate = "hwp" in self.placed and not any("=" in stage for stage in self.placed)
         self._gain, self.good = _solve(self._rows, self.has_plate)
 
     def _by_setting(self, model):

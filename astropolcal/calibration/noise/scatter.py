@@ -211,7 +211,7 @@ class Scatter:
         self._level = 1.0 / weight * np.ones(measurement.n_data)
         residuals = measurement.residuals() * weight
         #: Derivatives of the data to the determined directions, each one standard error long.
-        self.slopes = whitened.along(whitened.rows)
+        self.slopes = whitened.slopes
         groups = leave_out_groups(measurement)
         self.parts = [
             self._part(i, groups, residuals, whitened.leverage)

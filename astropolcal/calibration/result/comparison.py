@@ -8,7 +8,7 @@ from astropy.table import QTable
 from astropolcal import instruments
 from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
-from astropolcal.efficiency import has_derotator, polarimetric_efficiency, sky_path
+from astropolcal.efficiency import has_derotator, has_plate, polarimetric_efficiency, sky_path
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import diattenuation_vector, retardance_vector
@@ -188,6 +188,8 @@ class _Optics:
 
     def efficiency(self, path, angles):
         """Return the efficiency, shape (n_angles, n_wavelengths); one angle without derotator."""
+        if not has_plate(path):
+            return np.full((np.size(angles), self.wavelength.size), np.nan)
         turn = angles if self.turns else None
         found = polarimetric_efficiency(path, self.wavelength, derotator=turn, aolp=None)
         return np.atleast_2d(found)

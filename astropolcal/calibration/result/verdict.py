@@ -313,7 +313,7 @@ def _cautions(calibration, free):
 def _accuracy(tables, sky):
     """Return what is known of light from the sky, medians over the wavelengths."""
     if not tables:
-        return "On sky      unknown: the chain has no half-wave plate"
+        return "On sky      unknown: the frames do not measure Q and U"
     dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
     s_p, s_chi = (
         [_number(_median(t[key].value), what in sky, *limits) for t in tables]

@@ -271,16 +271,21 @@ class _Axes:
 
     def spread(self, along_known, along_open, along_blind):
         """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
+        flags = self.flags(along_known, along_open, along_blind)
+        return _Spread(along_known * self.sigmas, *flags)
+
+    def flags(self, along_known, along_open, along_blind):
+        """Return which quantities are open and which are blind, from slopes (..., n_axes)."""
         parts = [along_known, along_open, along_blind]
-        size = np.sqrt(sum(np.sum(part**2, axis=1) for part in parts))
+        size = np.sqrt(sum(np.sum(part**2, axis=-1) for part in parts))
         # a rounding error along an open direction is no movement
         limit = STILL * size
-        is_open = np.abs(along_open).max(axis=1, initial=0.0) > limit
-        blind = np.abs(along_blind).max(axis=1, initial=0.0) > limit
+        is_open = np.abs(along_open).max(axis=-1, initial=0.0) > limit
+        blind = np.abs(along_blind).max(axis=-1, initial=0.0) > limit
         if not self.partial:
             # with a parameter at its bound taken as known there is an error, unless it is all
-            blind &= np.abs(along_known).max(axis=1, initial=0.0) <= limit
-        return _Spread(along_known * self.sigmas, is_open, blind & ~is_open)
+            blind &= np.abs(along_known).max(axis=-1, initial=0.0) <= limit
+        return is_open, blind & ~is_open
 
 
 @dataclass

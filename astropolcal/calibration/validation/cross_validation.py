@@ -197,6 +197,8 @@ def _fit_without(measurement, vector, out, weights):
 
 
 # fewer degrees of freedom than this give no test
+# weights that differ by less than this share are equal
+_EQUAL = 1e-12
 _LEAST_FREEDOM = 0.5
 # what happens by chance less often than this is no chance
 _UNLIKELY = 0.01
@@ -240,7 +242,7 @@ class LackOfFit:
     priors: dict | None = None
 
 
-def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=True):
+def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=True, whitened=None):
     r"""
     Test whether residuals are larger than the noise.
 
@@ -272,6 +274,8 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
         Weights of the fit (one over sigma), by default equal; shape (n_data,).
     fitted : bool
         Whether the parameters come from these data.
+    whitened : Whitened, optional
+        The linear problem of the fit at these parameters, where it is known already.
 
     Returns
     -------
@@ -307,9 +311,9 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     if hasattr(vector, "measurement"):
         vector, weights, fitted = _of_calibration(measurement, vector)
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    left, right = _low_rank(measurement, vector, noise.sigma_of_data, weights, fitted)
-    table, whole = _test_by_wavelength(measurement, vector, noise, left, right)
-    priors = _test_of_priors(measurement, vector, left, right)
+    hat = _Hat.of(measurement, vector, noise.sigma_of_data, weights, whitened) if fitted else None
+    table, whole = _test_by_wavelength(measurement, vector, noise, hat)
+    priors = _test_of_priors(measurement, vector, hat)
     chi2, expected, p_value = _together(table, whole, noise.dof, priors)
     words = _verdict(chi2, expected, p_value, noise, priors)
     return LackOfFit(table, chi2, expected, p_value, words, priors)
@@ -320,22 +324,23 @@ def _of_calibration(measurement, calibration):
     return measurement.vector(), weighting_of(calibration).weight if fitted else None, fitted
 
 
-def _test_of_priors(measurement, vector, left, right):
+def _test_of_priors(measurement, vector, hat):
     """Return chi-square of the priors that were rows of the fit, its mean and probability."""
     n = measurement.n_data
-    if len(left) == n:
+    if hat is None or len(hat.basis) == n:
         return None
     chi2 = np.sum(measurement.free.prior_residuals(vector) ** 2)
-    mean, dof = _moments(left[n:], right[n:], 0.0)
+    rows = np.arange(n, len(hat.basis))
+    mean, dof = _moments(hat, len(rows), hat.products(rows), 0.0)
     p = _chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
     return {"chi2": float(chi2), "expected": float(mean), "p_value": float(p)}
 
 
-def _test_by_wavelength(measurement, vector, noise, left, right):
+def _test_by_wavelength(measurement, vector, noise, hat):
     """Return the table of the test, and mean and freedom of the whole chi-square."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
     residuals, sigma = measurement.residuals(vector), noise.sigma_of_data
-    usable = np.isfinite(np.append(sigma, np.ones(len(left) - sigma.size)))
+    usable, counted, total = np.isfinite(sigma), 0, 0.0
     replicates = noise.method == "replicates"
     chi2, mean, dof = np.full((3, len(rows)), np.nan)
     for i, row in enumerate(rows):
@@ -343,7 +348,9 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
             # scatter among replicates is noise by definition
             own = noise.dof[i] if replicates else 0.0
             chi2[i] = np.sum((residuals[row] / sigma[row]) ** 2) - own
-            mean[i], dof[i] = _moments(left[row], right[row], own)
+            products = 0.0 if hat is None else hat.products(row)
+            mean[i], dof[i] = _moments(hat, row.size, products, own)
+            counted, total = counted + row.size, total + products
     from scipy.special import fdtrc
 
     with np.errstate(invalid="ignore"):
@@ -363,26 +370,54 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
             "p_value": p,
         }
     )
-    return table, _moments(left[usable], right[usable], 0.0)
+    if hat is not None and len(hat.basis) > sigma.size:
+        rest = np.arange(sigma.size, len(hat.basis))
+        counted, total = counted + rest.size, total + hat.products(rest)
+    return table, _moments(hat, counted, total, 0.0)
 
 
-def _low_rank(measurement, vector, sigma, weights, fitted):
-    """Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
+@dataclass
+class _Hat:
+    """The covariance 1 + P Q^T of residuals over the noise, a row per datum and then per prior."""
 
-    One row per datum, and after them one a prior of the fit.
-    """
-    nothing = np.zeros((measurement.n_data, 0))
-    if not fitted:
-        return nothing, nothing
-    problem = Problem(measurement, assumed(measurement, weights))
-    whitened = problem.around(vector)
-    weights = np.append(problem.weights, np.full(measurement.n_priors, problem.noise))
-    basis = whitened.along(np.concatenate([whitened.rows, whitened.prior_rows]))
-    # in units of the noise the hat matrix is a b^T
-    known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
-    by_noise = (weights * known)[:, None]
-    a, b = basis / by_noise, basis * by_noise
-    return np.hstack([a, b]), np.hstack([a @ (b.T @ b) - b, -a])
+    basis: np.ndarray
+    by_noise: np.ndarray
+    inner: np.ndarray
+
+    @classmethod
+    def of(cls, measurement, vector, sigma, weights, whitened):
+        problem = Problem(measurement, assumed(measurement, weights))
+        if whitened is None or measurement.n_priors:
+            whitened = problem.around(vector)
+        basis, weights = whitened.slopes, problem.weights
+        known = np.where(np.isfinite(sigma), sigma, 1.0)
+        if measurement.n_priors:
+            basis = np.concatenate([basis, whitened.along(whitened.prior_rows)])
+            weights = np.append(weights, np.full(measurement.n_priors, problem.noise))
+            known = np.append(known, np.ones(measurement.n_priors))
+        by_noise = (weights * known)[:, None]
+        if not np.all(by_noise > 0):
+            # data without noise, which the fit meets exactly
+            return None
+        # in units of the noise the hat matrix is a b^T
+        return cls(basis, by_noise, (basis * by_noise).T @ (basis * by_noise))
+
+    def products(self, rows):
+        """Return a^T a, a^T b and b^T b of some rows, (3, rank, rank)."""
+        basis, by_noise = self.basis[rows], self.by_noise[rows]
+        if np.ptp(by_noise) <= _EQUAL * by_noise[0]:
+            gram, by = basis.T @ basis, by_noise[0]
+            return np.stack([gram / by**2, gram, gram * by**2])
+        a, b = basis / by_noise, basis * by_noise
+        return np.stack([a.T @ a, a.T @ b, b.T @ b])
+
+    def moments(self, products):
+        """Return tr(Q^T P) and tr((Q^T P)^2) of the products of some rows."""
+        aa, ab, bb = products
+        # P = (a, b) and Q = (a K - b, -a), with K = b^T b of all rows
+        first, second = self.inner @ aa - ab.T, self.inner @ ab - bb
+        square = np.sum(first * first.T) - 2 * np.sum(second * aa.T) + np.sum(ab * ab.T)
+        return np.trace(first) - np.trace(ab), square
 
 
 def _chi2_above(chi2, dof):
@@ -392,13 +427,12 @@ def _chi2_above(chi2, dof):
     return gammaincc(dof / 2, np.maximum(chi2, 0) / 2)
 
 
-def _moments(left, right, own):
+def _moments(hat, n, products, own):
     """Return mean and effective freedom of chi-square without the replicates' own."""
-    # tr(C) and tr(C^2) of C = 1 + P Q^T from the small matrix Q^T P, not the n x n one
-    inner = right.T @ left
-    n = len(left)
-    mean = n + np.trace(inner) - own
-    square = n + 2 * np.trace(inner) + np.sum(inner * inner.T) - own
+    # tr(C) and tr(C^2) of C = 1 + P Q^T from small matrices, not the n x n one
+    once, twice = (0.0, 0.0) if hat is None else hat.moments(products)
+    mean = n + once - own
+    square = n + 2 * once + twice - own
     if mean <= _LEAST_FREEDOM or square <= 0:
         return max(mean, 0.0), np.nan
     # mean and variance of chi-square match those of a scaled chi-square of this freedom

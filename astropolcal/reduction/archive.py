@@ -1,0 +1,374 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+An archive: the headers of a tree of files, its sequences, and what was done with them.
+
+The index is a SQLite file that is made again where it cannot be read. What was done is a text file
+with one line of JSON per sequence, to which lines are appended.
+"""
+
+import hashlib
+import json
+import os
+import re
+import sqlite3
+import warnings
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from fnmatch import fnmatchcase
+from itertools import groupby
+from pathlib import Path
+
+from astropolcal import instruments
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    InstrumentError,
+    ObservationError,
+)
+from astropolcal.files import append_line, one_line, understood
+from astropolcal.fitscheck import primary_header
+from astropolcal.pipeline.headers import recognized
+from astropolcal.pipeline.tasks import ended_tasks
+from astropolcal.progress import counting
+from astropolcal.reduction.headers import _SUFFIXES, observation_time, read_header
+
+__all__ = []
+
+# of the columns below; another one is made again
+_VERSION = 1
+_COLUMNS = (
+    *("path", "size", "changed", "instrument", "object", "mode"),
+    *("mjd", "seconds", "hwp", "number", "problem"),
+)
+# headers that are read at a time by one process
+_BATCH = 64
+_DAY = 86400.0
+# degree; two commanded angles that differ by less are one
+_SAME_ANGLE = 0.3
+
+
+# ---- the index -----------------------------------------------------------------------------------
+
+
+class Index:
+    """
+    What the primary headers of all FITS files of a tree say, kept in a file.
+
+    Only files that are new, or whose size or time of change differ, are opened.
+    """
+
+    def __init__(self, path):
+        self.path = Path(path)
+        try:
+            self._connect()
+        except sqlite3.OperationalError as problem:
+            words = "another run works on this archive" if "locked" in str(problem) else problem
+            raise AstropolcalError(f"{path}: {words}") from None
+        except sqlite3.DatabaseError as problem:
+            warnings.warn(
+                f"{path}: not a readable index ({problem}); it is made again",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
+            self._base.close()
+            self.path.unlink()
+            self._connect()
+
+    def _connect(self):
+        if self.path.is_dir():
+            raise AstropolcalError(f"{self.path}: is a folder, not an index")
+        self._base = sqlite3.connect(self.path, timeout=0.5)
+        # for as long as this run: two would do everything twice
+        self._base.execute("PRAGMA locking_mode = EXCLUSIVE")
+        self._base.execute("BEGIN EXCLUSIVE")
+        (words,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
+        if words != "ok":
+            raise sqlite3.DatabaseError(words)
+        (version,) = self._base.execute("PRAGMA user_version").fetchone()
+        if version != _VERSION:
+            self._base.execute("DROP TABLE IF EXISTS frames")
+            self._base.execute(f"PRAGMA user_version = {_VERSION}")
+        kinds = f"path TEXT PRIMARY KEY, {', '.join(_COLUMNS[1:])}"
+        self._base.execute(f"CREATE TABLE IF NOT EXISTS frames ({kinds})")
+        self._base.commit()
+
+    def close(self):
+        self._base.close()
+
+    def update(self, tree, *, instrument=None, besides=None, workers=None, cluster=None):
+        """
+        Bring it up to date with a tree; return the numbers of files, and of those that were read.
+
+        What is in the folder ``besides`` is not looked at. Without ``instrument``, its name, the
+        headers say which it is.
+        """
+        base, keys = self._base, ", ".join(_COLUMNS)
+        base.execute("CREATE TEMP TABLE seen (path TEXT PRIMARY KEY, size, changed)")
+        with base:
+            base.executemany("INSERT INTO seen VALUES (?, ?, ?)", _files(tree, besides))
+            base.execute("DELETE FROM frames WHERE path NOT IN (SELECT path FROM seen)")
+        (total,) = base.execute("SELECT count(*) FROM seen").fetchone()
+        if not total:
+            raise ObservationError(f"{tree}: no FITS file in this folder or those inside")
+        rows = base.execute(
+            "SELECT seen.* FROM seen LEFT JOIN frames USING (path) WHERE frames.path IS NULL "
+            "OR frames.size != seen.size OR frames.changed != seen.changed ORDER BY path"
+        ).fetchall()
+        n_read, reader = len(rows), _Reader(instrument)
+        batches = (rows[i : i + _BATCH] for i in range(0, n_read, _BATCH))
+        given = {"workers": workers, "cluster": cluster, "preload": [__name__]}
+        put = f"INSERT OR REPLACE INTO frames ({keys}) VALUES ({', '.join('?' * len(_COLUMNS))})"
+        ended = ended_tasks(reader, batches, **given)
+        with closing(ended), counting(total, "headers", total - n_read) as add:
+            for each in ended:
+                with base:
+                    base.executemany(put, _rows(each))
+                add(len(each.task))
+        base.execute("DROP TABLE seen")
+        return total, n_read
+
+    def problems(self):
+        """Yield path and reason of the files that belong to no sequence."""
+        yield from self._base.execute(
+            "SELECT path, problem FROM frames WHERE problem IS NOT NULL ORDER BY path"
+        )
+
+    def sequences(self, *, gap, cycles=None, target=None):
+        """
+        Yield the sequences, `Sequence`, one after the other, however many there are.
+
+        Frames of one instrument, object and mode that follow each other within ``gap`` seconds;
+        no more than so many ``cycles`` of the half-wave plate. ``target`` is a pattern for the
+        object, such as ``HD*``.
+        """
+        rows = self._base.cursor().execute(
+            f"SELECT {', '.join(_COLUMNS[:-1])} FROM frames WHERE problem IS NULL "
+            "ORDER BY instrument, object, mode, mjd IS NULL, mjd, number, path"
+        )
+        taken, pattern = set(), re.sub(r"[\s_]", "", target or "*").casefold()
+        for (instrument, name, mode), group in groupby(map(_Frame._make, rows), _Frame.kind):
+            if not fnmatchcase(name or "", pattern):
+                continue
+            for frames in _cut(group, gap / _DAY, cycles):
+                words = (instrument, name or "unnamed", mode, frames[0].moment)
+                text = "_".join(re.sub(r"[^A-Za-z0-9+-]+", "-", str(w)) for w in words if w)
+                unique, count = text, 1
+                while unique in taken:
+                    unique, count = f"{text}_{count + 1}", count + 1
+                taken.add(unique)
+                yield Sequence(unique, instrument, name, mode, frames)
+
+
+def _files(tree, besides):
+    """Yield path, size and time of change of the FITS files of a tree."""
+    avoid = None if besides is None else os.path.realpath(besides)
+    for folder, inside, names in os.walk(tree):
+        inside[:] = [n for n in inside if os.path.realpath(os.path.join(folder, n)) != avoid]
+        for name in names:
+            if name.lower().endswith(_SUFFIXES) and not name.startswith("."):
+                path = os.path.join(folder, name)
+                with suppress(OSError):
+                    state = os.stat(path)
+                    yield os.path.abspath(path), state.st_size, state.st_mtime_ns
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads the headers of some files into rows of the index."""
+
+    instrument: str | None = None
+
+    def __call__(self, files):
+        # once for all files: plug-ins are looked for on the disk
+        names = [self.instrument] if self.instrument else instruments.names()
+        known = list(map(instruments.get, names))
+        return [self._row(known, *file) for file in files]
+
+    def _row(self, known, path, size, changed):
+        row = dict.fromkeys(_COLUMNS) | {"path": path, "size": size, "changed": changed}
+        try:
+            row |= self._values(known, path)
+        except AstropolcalError as problem:
+            row["problem"] = one_line(str(problem).removeprefix(f"{path}: "), None)
+        return tuple(row.values())
+
+    def _values(self, known, path):
+        header = primary_header(path)
+        if "CALHASH" in header and "POLCONV" in header:
+            raise ObservationError("a corrected product of this package, not a frame")
+        found = known[0] if self.instrument else recognized(header, known)
+        with suppress(InstrumentError):
+            # which keyword holds the mode may depend on the mode
+            found = found.configured(header)
+        if found.files is None:
+            raise InstrumentError(f"{found.name}: it is not known how its files look")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            frame = read_header(path, found.files, header=header)
+        values, moment = frame.values, None
+        with suppress(ObservationError):
+            moment = observation_time(values).mjd
+        name = re.sub(r"[^\w+-]|_", "", values.get("object") or "").casefold()
+        return {
+            "instrument": found.name,
+            "object": name or None,
+            "mode": values.get("filter"),
+            "mjd": None if moment is None else float(moment),
+            "seconds": values.get("exposure_time", 0.0) * values.get("exposures", 1.0),
+            "hwp": values.get("hwp"),
+            "number": frame.number,
+        }
+
+
+def _rows(ended):
+    """Return the rows of a batch of files, with the reason if its process died."""
+    if ended.reason is None:
+        return ended.result
+    lost = dict.fromkeys(_COLUMNS) | {"problem": ended.reason}
+    files = (dict(zip(_COLUMNS, file, strict=False)) for file in ended.task)
+    return [tuple((lost | file).values()) for file in files]
+
+
+# ---- sequences -----------------------------------------------------------------------------------
+
+
+class _Frame:
+    """A row of the index."""
+
+    __slots__ = _COLUMNS[:-1]
+
+    @classmethod
+    def _make(cls, row):
+        frame = cls()
+        for name, value in zip(cls.__slots__, row, strict=True):
+            setattr(frame, name, value)
+        return frame
+
+    def kind(self):
+        return self.instrument, self.object, self.mode
+
+    @property
+    def moment(self):
+        """What tells a sequence from the others: when it began, else a number or a name."""
+        if self.mjd is None:
+            return Path(self.path).stem if self.number is None else f"{self.number:08d}"
+        moment = datetime(1858, 11, 17) + timedelta(milliseconds=round(self.mjd * 1e3 * _DAY))
+        return moment.strftime("%Y%m%dT%H%M%S")
+
+
+@dataclass
+class Sequence:
+    """Frames that are worked on together."""
+
+    name: str
+    instrument: str
+    target: str | None
+    mode: str | None
+    frames: list
+
+    @property
+    def files(self):
+        """Their paths."""
+        return [frame.path for frame in self.frames]
+
+    def key(self, settings):
+        """Return what a result depends on, in short: files and settings."""
+        text = json.dumps([[(f.path, f.size, f.changed) for f in self.frames], settings])
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _cut(frames, gap, cycles):
+    """Yield lists of frames, cut where there is a gap in time, and after some cycles."""
+    part, end, count, seen = [], None, 1, []
+    for frame in frames:
+        late = None not in (end, frame.mjd) and frame.mjd - end > gap
+        angle = None if frame.hwp is None else frame.hwp % 180
+        again = angle is not None and any(_same(angle, other) for other in seen[:-1])
+        if again:
+            # an angle that was there before the last one begins another cycle
+            count, seen = count + 1, []
+        if part and (late or (cycles and count > cycles)):
+            yield part
+            part, count, seen = [], 1, []
+        part.append(frame)
+        if angle is not None and not (seen and _same(angle, seen[-1])):
+            seen.append(angle)
+        if frame.mjd is not None:
+            end = frame.mjd + (frame.seconds or 0.0) / _DAY
+    if part:
+        yield part
+
+
+def _same(angle, other):
+    return abs((angle - other + 90) % 180 - 90) < _SAME_ANGLE
+
+
+# ---- what was done -------------------------------------------------------------------------------
+
+
+class Manifest:
+    """
+    What became of each sequence, in lines of JSON that are appended as sequences end.
+
+    The last line of a sequence counts. A line that was cut off is ignored.
+    """
+
+    def __init__(self, path):
+        self.path, self.entries = Path(path), {}
+        self._is_cut = False
+        if os.path.exists(self.path):
+            self._read()
+
+    def _read(self):
+        n_bad = 0
+        with understood(self.path, AstropolcalError, "cannot be read as a manifest"):
+            with closing(open(self.path, encoding="utf-8")) as lines:
+                for line in lines:
+                    self._is_cut = not line.endswith("\n")
+                    try:
+                        entry = json.loads(line)
+                        self.entries[str(entry["name"])] = entry
+                    except (ValueError, KeyError, TypeError, RecursionError):
+                        n_bad += 1
+        if n_bad and not self.entries:
+            raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
+        if n_bad > self._is_cut:
+            warnings.warn(
+                f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
+
+    def add(self, entry):
+        """Write down what became of a sequence."""
+        start, self._is_cut = "\n" if self._is_cut else "", False
+        append_line(self.path, start + json.dumps(entry), AstropolcalError)
+        self.entries[entry["name"]] = entry
+
+    def state(self, name, key):
+        """Return "done" or "failed" of a sequence of such files and settings, else ""."""
+        entry = self.entries.get(name)
+        if entry is None or entry.get("key") != key:
+            return ""
+        if entry.get("state") != "done":
+            return "failed"
+        return "done" if _is_there(self.path.parent / str(entry.get("product")), entry) else ""
+
+
+def _is_there(path, entry):
+    """Return whether a product is the one that was written."""
+    try:
+        state = os.stat(path)
+    except (OSError, ValueError):
+        return False
+    if state.st_size != entry.get("size"):
+        return False
+    # a copy has another time, and the same content
+    return state.st_mtime_ns == entry.get("changed") or checksum(path) == entry.get("sha256")
+
+
+def checksum(path):
+    """Return the SHA-256 of a file."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

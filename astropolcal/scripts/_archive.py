@@ -1,0 +1,253 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Whole archives: ``astropolcal correct`` and ``reduce`` with ``--archive``."""
+
+import copy
+import io
+import json
+import os
+import time
+import warnings
+from collections import Counter
+from contextlib import closing, redirect_stderr
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.files import one_line
+from astropolcal.scripts._common import give
+from astropolcal.words import counted
+
+# what sequences are worked on by, and what does not change a product
+_SUFFIX = {"correct": ".fits", "reduce": ".ecsv"}
+_DRIVING = (
+    *("run", "command", "cubes", "output", "json", "quiet", "full", "online", "archive", "target"),
+    *("retry", "timeout", "workers", "cluster", "gap", "cycles"),
+)
+_ONLY = ("gap", "cycles", "target", "retry", "timeout")
+_DEFAULTS = {"gap": 30.0}
+# reasons in the summary for machines: all are in the manifest
+_MOST_LISTED, _MOST_DOUBTS = 1000, 20
+
+
+def is_archive(arguments, single):
+    """Return whether a whole archive is asked for; refuse options that have no meaning then."""
+    if arguments.archive is None:
+        for name in _ONLY:
+            if getattr(arguments, name) not in (None, False, _DEFAULTS.get(name)):
+                raise ParameterError(f"--{name}: is for --archive DIR")
+        if arguments.output is None:
+            raise ParameterError("-o FILE is needed, or --archive DIR for a whole archive")
+        return False
+    for name in ("output", *single):
+        if getattr(arguments, name, None) is not None:
+            label = "-o" if name == "output" else f"--{name}"
+            raise ParameterError(
+                f"{label} {getattr(arguments, name)}: names one file; --archive has a product for "
+                "each sequence"
+            )
+    for name in ("gap", "cycles", "timeout"):
+        value = getattr(arguments, name)
+        if value is not None and not (value > 0 and np.isfinite(value)):
+            raise ParameterError(f"--{name} {value:g}: a number above zero is needed")
+    return True
+
+
+def run_archive(command, arguments):
+    """Work on all sequences of a tree that are not done; return the exit status."""
+    from astropolcal.pipeline.tasks import ended_tasks
+    from astropolcal.progress import counting
+    from astropolcal.reduction.archive import Index, Manifest
+
+    folder = Path(arguments.archive)
+    folder.mkdir(parents=True, exist_ok=True)
+    work = _Work(command, _settled(arguments), os.path.abspath(folder))
+    where = {"workers": arguments.workers, "cluster": arguments.cluster}
+    with closing(Index(folder / "index.sqlite")) as index:
+        manifest = Manifest(folder / "manifest.jsonl")
+        counts = _indexed(index, arguments, where)
+
+        def sequences():
+            options = {"cycles": arguments.cycles, "target": arguments.target}
+            for sequence in index.sequences(gap=60 * arguments.gap, **options):
+                key = sequence.key(work.settings)
+                yield sequence, key, manifest.state(sequence.name, key)
+
+        skipped = ("done",) if arguments.retry else ("done", "failed")
+        before = Counter(state for *_, state in sequences())
+        total, rest = before.total(), before.total() - sum(before[state] for state in skipped)
+        if not total:
+            raise AstropolcalError(f"{arguments.cubes[0]}: no sequence in it{_first(index)}")
+        todo = ((s.name, key, s.instrument, s.files) for s, key, state in sequences()
+                if state not in skipped)  # fmt: skip
+        preload = [f"astropolcal.scripts._{name}" for name in _SUFFIX]
+        preload += [
+            "astropolcal.correction",
+            "astropolcal.reduction",
+            "astropolcal.pipeline.library",
+        ]
+        limit = None if arguments.timeout is None else 60 * arguments.timeout
+        ended = ended_tasks(work, todo, timeout=limit, preload=preload, **where)
+        with closing(ended), counting(total, "sequences", total - rest) as add:
+            for each in ended:
+                manifest.add(_entry(each))
+                add()
+        found = [manifest.entries[s.name] for s, *_ in sequences()]
+        content = counts | _content(found, rest, index, folder, arguments)
+    give(arguments, _lines(content, folder, arguments), content)
+    return 1 if content["n_failed"] else 0
+
+
+def _settled(arguments):
+    """Return the arguments as workers need them, whose folder may be another."""
+    arguments = copy.copy(arguments)
+    for name in ("calibration", "raw"):
+        value = getattr(arguments, name, None)
+        if value is not None:
+            setattr(arguments, name, type(value)(os.path.abspath(value)))
+    return arguments
+
+
+def _indexed(index, arguments, where):
+    """Bring the index up to date, and return what was found."""
+    if len(arguments.cubes) > 1:
+        raise ParameterError(f"{arguments.cubes[1]}: --archive takes one folder")
+    (tree,) = arguments.cubes
+    if not os.path.isdir(tree):
+        raise AstropolcalError(f"{tree}: no such folder; --archive takes one")
+    started = time.monotonic()
+    options = {"instrument": arguments.instrument, "besides": arguments.archive}
+    n_files, n_read = index.update(tree, **options, **where)
+    seconds = time.monotonic() - started
+    return {"n_files": n_files, "n_headers_read": n_read, "index_seconds": round(seconds, 3)}
+
+
+def _first(index):
+    """Return why the first file belongs to no sequence, for a message."""
+    return next((f"; {path}: {why}" for path, why in index.problems()), "")
+
+
+@dataclass
+class _Work:
+    """Corrects or reduces a sequence, in any process that sees the files."""
+
+    command: str
+    arguments: object
+    folder: str
+
+    @property
+    def settings(self):
+        """What a product depends on besides its files."""
+        given = {k: v for k, v in vars(self.arguments).items() if k not in _DRIVING}
+        return json.loads(json.dumps(given, sort_keys=True, default=str))
+
+    def __call__(self, task):
+        from astropolcal.reduction.archive import checksum
+        from astropolcal.scripts.main import earth
+
+        name, _, instrument, files = task
+        started, arguments = time.monotonic(), copy.copy(self.arguments)
+        product = os.path.join(self.folder, f"{name}{_SUFFIX[self.command]}")
+        arguments.cubes, arguments.output, arguments.archive = files, product, None
+        arguments.json, arguments.quiet = os.path.join(self.folder, f"{name}.json"), True
+        arguments.gap, arguments.cycles, arguments.target = _DEFAULTS["gap"], None, None
+        arguments.retry, arguments.timeout, arguments.cluster = False, None, None
+        arguments.workers = 1 if self.command == "reduce" else None
+        if os.path.isdir(getattr(arguments, "calibration", "")):
+            arguments.instrument = arguments.instrument or instrument
+        said = io.StringIO()
+        with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            warnings.filterwarnings("ignore", message="ERFA function")
+            with earth(arguments):
+                import_module(f"astropolcal.scripts._{self.command}").run(arguments)
+        doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
+        with open(arguments.json, encoding="utf-8") as stream:
+            summary = json.load(stream)
+        state = os.stat(product)
+        return {
+            "product": os.path.basename(product),
+            "size": state.st_size,
+            "changed": state.st_mtime_ns,
+            "sha256": checksum(product),
+            "calibration": summary.get("calibration"),
+            "calibration_hash": summary.get("calibration_hash"),
+            "seconds": round(time.monotonic() - started, 3),
+            "megabytes": _megabytes(),
+            "warnings": [one_line(words) for words in dict.fromkeys(doubts)][:_MOST_DOUBTS],
+        }
+
+
+def _megabytes():
+    """Return the most memory that this process has had, None where the system does not say."""
+    try:
+        text = Path("/proc/self/status").read_text(encoding="ascii")
+        return round(int(text.split("VmHWM:")[1].split()[0]) / 1024, 1)
+    except (OSError, IndexError, ValueError):
+        return None
+
+
+def _entry(ended):
+    name, key, _, files = ended.task
+    entry = {"name": name, "key": key, "n_files": len(files), "first": files[0]}
+    if ended.reason is not None:
+        return entry | {"state": "failed", "reason": ended.reason}
+    return entry | {"state": "done"} | ended.result
+
+
+def _content(found, n_worked, index, folder, arguments):
+    """Return the summary for machines."""
+    done = [entry for entry in found if entry["state"] == "done"]
+    failed = {entry["name"]: entry["reason"] for entry in found if entry["state"] != "done"}
+    unread = dict(index.problems())
+    sizes = [entry["megabytes"] for entry in done if entry.get("megabytes")]
+    return {
+        "archive": str(folder),
+        "n_sequences": len(found),
+        "n_worked_on": n_worked,
+        "n_done": len(done),
+        "n_failed": len(failed),
+        "n_left_out": len(unread),
+        "n_warned": sum(bool(entry.get("warnings")) for entry in done),
+        "median_seconds": float(np.median([e["seconds"] for e in done])) if done else None,
+        "most_megabytes": max(sizes, default=None),
+        "calibrations": Counter(e["calibration"] for e in done if e.get("calibration")),
+        "failed": dict(islice(failed.items(), _MOST_LISTED)),
+        "left_out": dict(islice(unread.items(), _MOST_LISTED)),
+    }
+
+
+def _lines(content, folder, arguments):
+    """Return the summary, and what failed as far as there is room."""
+    from astropolcal.calibration.result.verdict import shortened
+    from astropolcal.scripts._ending import with_ending, written_lines
+
+    n_failed, total = content["n_failed"], content["n_sequences"]
+    n_left, n_warned = content["n_left_out"], content["n_warned"]
+    body = [f"  failed: {name}: {why}" for name, why in content["failed"].items()]
+    body += [f"  left out: {path}: {why}" for path, why in content["left_out"].items()]
+    verdict = f"All {counted(total, 'sequence')} done"
+    if n_failed:
+        verdict = f"NOT COMPLETE: {n_failed} of {counted(total, 'sequence')} failed"
+    now = f"{content['n_worked_on']} worked on now, {content['n_files']} files in the index"
+    used = ", ".join(f"{Path(k).name} ({n})" for k, n in content["calibrations"].items())
+    cost = "not known"
+    if content["n_done"]:
+        most = content["most_megabytes"]
+        memory = "" if most is None else f", at most {most:.0f} MB of memory"
+        cost = f"{content['median_seconds']:.2g} s per sequence{memory}"
+    lines = {
+        "Sequences": now,
+        "Left out": counted(n_left, "file") if n_left else None,
+        "Warnings": f"in {counted(n_warned, 'sequence')}, see the manifest" if n_warned else None,
+        "Calibration": used or None,
+        "Cost": cost,
+        "Next": "--retry tries what failed again" if n_failed else None,
+    }
+    ends = [shortened(f"{key + ':':<13}{words}") for key, words in lines.items() if words]
+    names = [str(Path(folder) / "manifest.jsonl"), arguments.json]
+    shown = body if arguments.full else [shortened(line) for line in body]
+    return with_ending(shown, [verdict, *ends, *written_lines(names)], arguments.full)
