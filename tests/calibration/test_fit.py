@@ -14,6 +14,7 @@ from astropy.modeling.fitting import (
     TRFLSQFitter,
 )
 
+from astropolcal import instruments
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import search_branches
 from astropolcal.calibration.result.summary import to_dict
@@ -22,6 +23,7 @@ from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, Fit
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
 from astropolcal.observations.observables import NormalizedSingleDifference
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 FEW = [1.2, 1.6, 2.0, 2.2] * u.um
 
@@ -494,3 +496,23 @@ def test_words_name_what_matters(calibrated):
     assert "11 free parameters, rank 11" in repr(calibrated)
     assert calibrated._repr_html_().startswith("<p>Calibration of ")
     assert "<th>std</th>" in calibrated._repr_html_()
+
+
+def test_few_wavelengths_do_not_end_in_a_wrong_minimum():
+    """Three wavelengths tell no noise; the errors of the table do, and other starts are tried."""
+    grid = [1200, 1600, 2000] * u.nm
+    charis = instruments.get("charis")
+    chain = charis.chain(derotator="linear", wavelength=grid)
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80, 95] * u.deg)
+    found = []
+    for seed, angle in ((8000, -0.5214799195490646), (1, 1.2), (2, -2.0)):
+        truth = chain.copy()
+        truth["hwp"].theta = angle * u.deg
+        truth["wollaston"].efficiency = [0.98, 0.975, 0.97]
+        table = simulate(truth, grid, frames, seed=seed, flux=1e6)
+        one = calibrate(chain, table, cross_validate=False)
+        (test,) = one.fit["lack_of_fit"]
+        found.append(test["times_noise"])
+        known = one.parameter_values()["hwp.w_sio2"]
+        assert abs(known["value"] - truth["hwp"].w_sio2.value) < 5 * known["std"]
+    assert max(found) < 1.5

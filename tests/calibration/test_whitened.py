@@ -42,6 +42,21 @@ def test_directions_are_orthonormal_and_complete(n_rows, n_columns, seed):
     np.testing.assert_allclose(back, rows.T @ rows, atol=1e-10)
 
 
+def test_directions_are_the_same_where_the_quick_decomposition_fails(monkeypatch):
+    def fails(*args, **kwargs):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    for n_data in (30, 2):
+        rows = _rows(n_data).T
+        quick = decompose(rows)
+        with monkeypatch.context() as patch:
+            patch.setattr(np.linalg, "svd", fails)
+            slow = decompose(rows)
+        assert slow.rank == quick.rank
+        np.testing.assert_allclose(slow.singular, quick.singular, rtol=1e-10)
+        np.testing.assert_allclose(slow.half.T @ slow.half, quick.half.T @ quick.half, rtol=1e-8)
+
+
 def test_a_copy_of_a_column_is_one_direction_less():
     rows = _rows().T
     rows[:, 1] = 2 * rows[:, 0]
