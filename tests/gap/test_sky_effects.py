@@ -331,6 +331,9 @@ def test_real_star_misses_the_tertiary_mirror(standard):
     found = select(model, SMOOTH, None, lambda line: None, cells=False)
     assert found.groups[0].best.name == "m3_diattenuation"
     assert found.model.is_physical("m3_diattenuation")
-    measured = found.model.chains[0]["gap_m3_diattenuation"].diattenuation.value
+    # what else these data ask for takes some of it, with little probability
+    alone = model.with_effects([found.groups[0].best.recipe])
+    measured = alone.chains[0]["gap_m3_diattenuation"].diattenuation.value
     published = published_mirror().diattenuation(star.wavelength)
     assert np.sqrt(np.mean((measured - published) ** 2)) < 0.0015
+    assert all(group.probability < 0.5 for group in found.groups[1:])
