@@ -254,8 +254,8 @@ def fetch(url, folder, *, sha256):
         raise CalibrationFileError(f"{url}: neither an archive nor the name of an .asdf file")
     path = Path(folder) / name
     if not (path.exists() and sha256_of(path) == sha256.lower()):
-        check_new(path, error=CalibrationFileError)
         path.parent.mkdir(parents=True, exist_ok=True)
+        check_new(path, error=CalibrationFileError)
         with atomic_path(path, CalibrationFileError) as new:
             shutil.copyfile(cached, new)
     return path
