@@ -648,5 +648,5 @@ def test_thicknesses_of_dataset_3_are_degenerate(paper):
     correlation = paper.covariance.correlation
     assert correlation[0, 1] > 0.99
     assert correlation[2, 4] > 0.99
-    # the paper: 80 steps (10,000 are 125 times as long); ours in 10,000 steps: 64
-    assert 25 < paper.autocorrelation_times.max() < 120
+    # the paper, with stretch moves: 80 steps; steps around the fit: 10
+    assert paper.autocorrelation_times.max() < 20
