@@ -825,7 +825,11 @@ def _canonical(column):
     if values.dtype.kind in "iuf":
         # adding zero turns -0 into 0
         # 12 digits: what conversions between units leave of a double
-        values = np.char.mod("%.11e", np.asarray(values, dtype=float) + 0.0)
+        numbers = (np.asarray(values, dtype=float) + 0.0).ravel().tolist()
+        text = ("%.11e\x1f" * len(numbers) % tuple(numbers))[:-1]
+        if not mask.any():
+            return unit, text
+        values = np.reshape(text.split("\x1f"), values.shape)
     elif values.dtype.kind in "US":
         # a file of text has no blanks about a word, and a word that is empty is masked in it
         values = np.char.strip(values.astype(str))

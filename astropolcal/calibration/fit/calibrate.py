@@ -44,6 +44,7 @@ from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
     ROUNDS,
+    TALL,
     Problem,
     Weighting,
     describe,
@@ -333,6 +334,15 @@ def _run(measurement, weighting, fitter):
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     stage(f"fitting {measurement.free.size} parameters")
+    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL * measurement.free.size:
+        # the same steps by triangular factors, for which the fitter has no place
+        vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
+        measurement.stand_at(vector)
+        return {
+            "converged": found.success,
+            "message": found.message,
+            "evaluations": int(found.nfev),
+        }
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:

@@ -140,6 +140,8 @@ _CHANCE = 2.0
 _INDEPENDENT = 0.05
 # and principal components of the errors at settings below so many times what they have by chance
 _MORE = 1.5
+# columns of derivatives that are worked on at once
+_COLUMNS = 16
 # a part of which the fit leaves less than this share is not seen in the residuals
 _LEFT = 0.05
 
@@ -254,11 +256,17 @@ class Scatter:
         # what a component of the scatter (columns) adds to a product of residuals (rows):
         # tr(A M B M) with M = 1 - U U^T, the residuals of a fit
         full = part.overlaps()
-        before = [matrix / part.amplitude[:, None] for matrix in part.applied(down)]
-        behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up)]
-        inner = [(slopes.T @ a, slopes.T @ b) for a, b in zip(before, behind, strict=True)]
-        seen = full - 2 * np.array([[np.sum(a * b) for b in behind] for a in before])
-        seen += np.array([[np.sum(a * b.T) for _, b in inner] for a, _ in inner])
+        n, rank = len(full), slopes.shape[1]
+        seen, inner = full.copy(), np.empty((rank, 2 * n, rank))
+        for i in range(0, rank, _COLUMNS):
+            # a few columns at a time: all components of all of them need not be held at once
+            some = slice(i, i + _COLUMNS)
+            before = [matrix / part.amplitude[:, None] for matrix in part.applied(down[:, some])]
+            behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up[:, some])]
+            seen -= 2 * np.array([[np.vdot(a, b) for b in behind] for a in before])
+            product = slopes.T @ np.concatenate([*before, *behind], axis=1)
+            inner[:, :, some] = product.reshape(rank, 2 * n, -1)
+        seen += np.einsum("iaj,jbi->ab", inner[:, :n], inner[:, n:], optimize=True)
         size = np.diag(full)
         told = np.diag(seen) > _LEFT * size
         if not np.isfinite(seen).all():

@@ -459,8 +459,8 @@ def _resample(refit, counts, wanted):
     """Return the fit to a resample; None if it determines less than all data, or fails."""
     if np.any(_singular_values(refit, np.sqrt(counts))[: wanted.size] < _LOST * wanted):
         return None
-    vector, _, arrived = refit.fit(refit.solution, counts)
-    return vector if arrived else None
+    vector, _, found = refit.fit(refit.solution, counts)
+    return vector if found.success else None
 
 
 def _singular_values(refit, scale):
