@@ -262,7 +262,7 @@ def test_settings_say_what_was_sampled(calibration):
     assert settings["noise"]["from"] == "errors"
     assert settings["held"] == [n for n in calibration.covariance.names if n != "hwp.w_sio2"]
     assert settings["priors"] == []
-    assert settings["moves"] == [["StretchMove", 1.0]]
+    assert settings["moves"] == [["DEMove", 0.3], ["CrankNicolsonMove", 0.5]]
     with pytest.warns(AstropolcalWarning):
         given = sample(
             calibration,
