@@ -25,7 +25,7 @@ from astropolcal.observations.reading import (
 )
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
-from astropolcal.words import counted, html
+from astropolcal.words import check_choice, counted, html
 
 __all__ = ["Observations", "example_table"]
 
@@ -397,10 +397,7 @@ class Observations:
         in a table of single differences with that column: the state of a modulator.
         """
         value = self.meta.get("pairing", PAIRINGS[0])
-        if value not in PAIRINGS:
-            raise ObservationError(
-                f"{self._label}: pairing = {value!r} in the meta; allowed are {', '.join(PAIRINGS)}"
-            )
+        check_choice(f"{self._label}: pairing of the meta", value, PAIRINGS, ObservationError)
         return value
 
     def paired_by(self, pairing):

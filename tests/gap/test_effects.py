@@ -648,7 +648,7 @@ def refused():
     yield tinted(category="discrete"), "discrete and has parameters"
     yield tinted(when=lambda roles: False), "has no place"
     yield tinted(title=""), "lacks title"
-    yield tinted(category="magic"), "kind 'magic'; allowed are optic"
+    yield tinted(category="magic"), "kind = 'magic'; allowed are optic"
 
 
 def test_check_refuses():

@@ -481,7 +481,7 @@ def test_nuisance_of_one_dataset(tables, tmp_path):
 
 def test_unknown_nuisance_is_refused(tables, capsys):
     line = complaint(capsys, tables["first"], "--nuisance", "fog")
-    assert "nuisance 'fog'; allowed are background, beam_gain, lamp" in line
+    assert "nuisance = 'fog'; allowed are background, beam_gain, lamp" in line
 
 
 def test_derotator_of_three_mirrors(tables, tmp_path):

@@ -69,6 +69,7 @@ from astropolcal.measurement.parameters import ROUNDING, with_own
 from astropolcal.progress import stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
+from astropolcal.words import check_choice
 
 __all__ = ["calibrate"]
 
@@ -250,8 +251,7 @@ def calibrate(
 def _check_choices(*values):
     choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
     for (name, allowed), value in zip(choices.items(), values, strict=True):
-        if value not in allowed:
-            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+        check_choice(name, value, allowed, FitError)
 
 
 def _fixed(chain, fix):

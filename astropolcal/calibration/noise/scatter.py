@@ -24,6 +24,7 @@ import numpy as np
 from astropolcal.exceptions import FitError
 from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.observations.quality import clusters, cycle_numbers, is_star, runs_of_frames
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -71,8 +72,7 @@ def groups_by(measurement, by="derotator"):
     plate angle (of one state of a modulator) comes again or the derotator moves. The plus frame of
     a datum counts.
     """
-    if by not in GROUPS:
-        raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
+    check_choice("groups", by, GROUPS, FitError)
     groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
     names = _members(measurement, groups, by)
     if len(names) < 2:
@@ -416,8 +416,7 @@ BLOCKS = ("derotator", "pair")
 
 def labels_of(measurement, block):
     """Return the number of the block of each datum; datasets have their own blocks."""
-    if block not in BLOCKS:
-        raise FitError(f"block = {block!r}; allowed are {', '.join(BLOCKS)}")
+    check_choice("block", block, BLOCKS, FitError)
     if block == "derotator":
         return leave_out_groups(measurement)
     sizes = [len(dataset.frames) for dataset in measurement.datasets]

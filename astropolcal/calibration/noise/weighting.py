@@ -22,6 +22,7 @@ from astropolcal.calibration.identifiability.linearized import Whitened, triangl
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.quality import MAD_TO_SIGMA, brightness
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]
 
@@ -45,8 +46,7 @@ LOSSES = {
 
 def robust_sigma(measurement, loss):
     """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
-    if loss not in LOSSES:
-        raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
+    check_choice("loss", loss, LOSSES, FitError)
     residuals = measurement.residuals()
     scale = _scales(measurement, residuals)
     # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
@@ -328,8 +328,10 @@ def first_weighting(measurement, weights):
     if weights == GIVEN:
         raise FitError("weights='given': this measurement was not fitted with a noise given to it")
     if weights not in CHOICES:
+        hint = did_you_mean(weights, CHOICES[1:])
         raise FitError(
             f"weights = {weights!r}; allowed are None, 'wavelength', 'errors', or the noise itself"
+            f"{hint}"
         )
     if weights != "errors":
         return Weighting(weights, np.full(measurement.n_data, np.nan))

@@ -41,6 +41,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.progress import counting, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
+from astropolcal.words import check_choice
 
 __all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
@@ -555,8 +556,7 @@ def standard_errors(calibration, method=None, groups=None):
     ['calibration_polarizer.theta', 'hwp.theta']
     """
     method = ("covariance" if groups is None else "robust") if method is None else method
-    if method not in METHODS:
-        raise FitError(f"method = {method!r}; allowed are {', '.join(METHODS)}")
+    check_choice("method", method, METHODS, FitError)
     if groups is not None and method != "robust":
         raise FitError(f"method = {method!r} knows no groups; 'robust' does")
     covariance = calibration.covariance
@@ -651,8 +651,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     >>> bool(0.5 < robust.std("hwp.w_sio2") / cal.covariance.std("hwp.w_sio2") < 2)
     True
     """
-    if correction not in CORRECTIONS:
-        raise FitError(f"correction = {correction!r}; allowed are {', '.join(CORRECTIONS)}")
+    check_choice("correction", correction, CORRECTIONS, FitError)
     problem = problem_of(calibration)
     measurement, whitened = problem.measurement, problem.around()
     labels = _labels(measurement, groups)
