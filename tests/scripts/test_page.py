@@ -44,9 +44,7 @@ def test_every_option_is_on_its_page(sections):
     for command in COMMANDS:
         named = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", sections[command]))
         missing = options(COMMANDS[command]) - named
-        assert not missing, (
-            f"docs/commands/{command}.rst: describe {', '.join(sorted(missing))}"
-        )
+        assert not missing, f"docs/commands/{command}.rst: describe {', '.join(sorted(missing))}"
 
 
 def test_the_table_has_no_option_that_is_gone(sections):
@@ -54,9 +52,7 @@ def test_the_table_has_no_option_that_is_gone(sections):
         named = set(re.findall(r"--[a-z][a-z0-9-]*", table_of(sections[command])))
         assert named, command
         unknown = named - options(COMMANDS[command]) - {"--quiet"}
-        assert not unknown, (
-            f"docs/commands/{command}.rst: {', '.join(sorted(unknown))} is gone"
-        )
+        assert not unknown, f"docs/commands/{command}.rst: {', '.join(sorted(unknown))} is gone"
 
 
 def test_stated_defaults_are_those_of_the_parser(sections):
