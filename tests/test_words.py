@@ -73,7 +73,7 @@ def test_irregular_plural():
 
 def test_choices_are_named_with_what_may_have_been_meant():
     for value, allowed, words in [
-        ("doublo", ("double", "single"), r"x = 'doubel'; allowed are double, single; did you mean"),
+        ("doublo", ("double", "single"), r"x = 'doublo'; allowed are double, single; did you mean"),
         (["double"], ("double",), r"x = \['double'\]; allowed are double"),
         (1, (), r"x = 1; allowed are none$"),
     ]:
