@@ -334,7 +334,7 @@ def _run(measurement, weighting, fitter):
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     stage(f"fitting {measurement.free.size} parameters")
-    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL * measurement.free.size:
+    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL:
         # the same steps by triangular factors, for which the fitter has no place
         vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
         measurement.stand_at(vector)

@@ -28,8 +28,8 @@ __all__ = ["outlying_data"]
 
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
-# data beyond so many times the number of parameters are fitted by their triangular factor
-TALL = 100
+# more data than these are fitted by their triangular factor
+TALL = 20_000
 # smallest weight, so that no datum is lost altogether
 _LEAST = 1e-4
 
@@ -283,7 +283,7 @@ class Problem:
         def slopes(part):
             return self.jacobian(place(part), weights)[:, live]
 
-        if self.measurement.n_data > TALL * live.size:
+        if self.measurement.n_data > TALL:
             residuals, slopes = _short(residuals, slopes)
         found = least_squares(
             residuals,
