@@ -99,7 +99,7 @@ def test_steps_around_the_fit_are_worth_it_in_many_dimensions():
     target = Normal(60)
     moves = default_moves(emcee, Laplace(target))
     around, alone = (
-        autocorrelation_times(run(target, these, 2500)).max()
+        autocorrelation_times(run(target, these, 1500)).max()
         for these in (moves, [(emcee.moves.DEMove(), 1.0)])
     )
     assert around < 40

@@ -150,20 +150,6 @@ def joint(prepared):
 
 
 @pytest.mark.slow
-def test_joint_fit_is_fast(joint, prepared):
-    data = prepared("dataset3", "dataset4", "hd293396")
-    chains = CHARIS.chains_for(data)
-    seconds = []
-    for _ in range(2):
-        start = time.process_time()
-        cal = calibrate(chains, data, cross_validate=False)
-        seconds.append(time.process_time() - start)
-    assert cal.converged
-    # 2 s on a quiet machine
-    assert min(seconds) < 8
-
-
-@pytest.mark.slow
 def test_diattenuation_of_m3_falls_from_1_6_to_1_2_percent(joint, prepared):
     """If the star were exactly unpolarized; as nobody knows that, it is up to 0.2 % less."""
     data = prepared("dataset3", "dataset4", "hd293396")
