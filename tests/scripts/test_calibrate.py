@@ -580,6 +580,7 @@ def nights(tmp_path_factory):
     return paths
 
 
+@pytest.mark.slow
 def test_parameters_of_each_night_and_a_drift(nights, tmp_path):
     held = ["-q", "--fix", "derotator.theta=0", "--fix", "calibration_polarizer.theta"]
     out = tmp_path / "cal.asdf"
