@@ -66,7 +66,6 @@ def test_asdf_finds_both_functions():
         assert len(named) == 1, group
 
 
-@pytest.mark.slow
 def test_no_physics_is_imported_for_files_of_others():
     """Both are called whenever any file of ASDF is opened."""
     code = """

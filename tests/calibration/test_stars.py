@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Polarization of stars, simulated and real: M3, the accuracy on sky, HD 30675."""
 
-import time
 import warnings
 
 import astropy.units as u

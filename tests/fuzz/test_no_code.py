@@ -57,7 +57,6 @@ def _in_call(node):
     return found
 
 
-@pytest.mark.slow
 def test_nothing_can_be_executed():
     for path in FILES:
         assert found_in(path.read_text(encoding="utf-8")) == [], (
