@@ -5,35 +5,35 @@ const fs = require("fs"), path = require("path"), vm = require("vm");
 
 // what people type, and pages of which one has to come first
 const QUESTIONS = {
-  "how do i fix a parameter": ["faq"],
-  "fix a parameter": ["faq", "parameters"],
+  "how do i fix a parameter": ["fit_settings", "faq"],
+  "fix a parameter": ["fit_settings", "faq"],
   "load a calibration in a pipeline": ["faq", "pipelines"],
   "pipeline": ["pipelines"],
-  "trust": ["trust"],
-  "which parameters can i trust": ["faq"],
+  "trust": ["parameters", "trust"],
+  "which parameters can i trust": ["parameters", "faq"],
   "units": ["conventions", "faq"],
   "correct science images": ["correction"],
   "install": ["installation"],
   "calibrate": ["first_calibration", "commands/calibrate"],
   "diagnose": ["diagnosis", "commands/diagnose"],
-  "half-wave plate angle": ["conventions", "gauge"],
+  "half-wave plate angle": ["conventions"],
   "standard stars": ["standards"],
   "reduce cubes": ["reduction", "commands/reduce"],
   "archive": ["archives"],
-  "prior": ["faq", "uncertainty", "fit_settings"],
+  "prior": ["fit_settings", "faq"],
 };
 
 const root = process.argv[2];
 const element = () => new Proxy(function () {}, {
-  get: (_, key) => (key === Symbol.toPrimitive ? () => "" : element()),
+  get: (_, key) => (key === Symbol.toPrimitive ? () => "" : key === "lastChild" ? null : element()),
   apply: () => element(),
   set: () => true,
 });
 const sandbox = {
-  console, document: element(), window: element(), location: element(), navigator: element(),
-  localStorage: element(), URLSearchParams, DOMParser: element(), setTimeout, fetch: element(),
+  console, document: element(), location: element(), localStorage: element(), URLSearchParams,
   SPHINX_HIGHLIGHT_ENABLED: false, DOCUMENTATION_OPTIONS: {}, _ready: () => {}, _: (x) => x,
 };
+sandbox.window = sandbox;
 vm.createContext(sandbox);
 for (const name of ["_static/language_data.js", "_static/search_scorer.js", "_static/searchtools.js"]) {
   const file = path.join(root, name);
