@@ -125,22 +125,17 @@ def _replaced(path):
         with open(temporary, "rb+") as stream:
             os.fsync(stream.fileno())
         if old is not None:
-            _keep_permissions(temporary, old)
+            with suppress(AttributeError, OSError):
+                os.chown(temporary, -1, old.st_gid)
+                os.chown(temporary, old.st_uid, -1)
+            with suppress(OSError):
+                os.chmod(temporary, stat.S_IMODE(old.st_mode))
         # atomic within a file system, hence the temporary file beside the final one
         os.replace(temporary, path)
         _sync_folder(path.parent)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def _keep_permissions(path, old):
-    # as far as the file system has them; to give a file away is for root only
-    with suppress(AttributeError, OSError):
-        os.chown(path, -1, old.st_gid)
-        os.chown(path, old.st_uid, -1)
-    with suppress(OSError):
-        os.chmod(path, stat.S_IMODE(old.st_mode))
 
 
 @contextmanager

@@ -149,7 +149,11 @@ class Propagator:
         self.leaves = leaves(chain)
         _check(self.leaves, positions, len(wavelength))
         self.wavelength = wavelength
-        self.shape = (len(wavelength), _column_count(positions))
+        counts = {name: np.shape(np.atleast_1d(angle))[-1] for name, angle in positions.items()}
+        several = {count for count in counts.values() if count != 1}
+        if len(several) > 1:
+            raise ChainError(f"the stages have different numbers of positions: {counts}")
+        self.shape = (len(wavelength), (several.pop() if several else 1))
         self.source = np.asarray(source, dtype=float).reshape(1, 1, 4)
         # of a single beam the arm is the last optic that is more than a turn of the frame
         acting = [i for i, leaf in enumerate(self.leaves) if not leaf.rotates_frame]
@@ -231,14 +235,6 @@ def _check(found, positions, n_wavelengths):
             )
         if len(shape) == 3 and not leaf.depends_on_beam and leaf.stage != "total_flux":
             raise ChainError(f"{label}, which differs between the beams, but the optic does not")
-
-
-def _column_count(positions):
-    counts = {name: np.shape(np.atleast_1d(angle))[-1] for name, angle in positions.items()}
-    several = {count for count in counts.values() if count != 1}
-    if len(several) > 1:
-        raise ChainError(f"the stages have different numbers of positions: {counts}")
-    return several.pop() if several else 1
 
 
 def _meeting(common, arms):

@@ -304,7 +304,13 @@ def check_calibration(calibration):
         _check_laws(calibration.chains, wavelength.to_value("um"))
     _check_values(calibration.chains, free)
     _check_shared(calibration.chains, free)
-    _check_covariance(calibration.covariance, free)
+    _check_names("covariance", calibration.covariance.names, free.names)
+    # a parameter with one value per wavelength has as many rows of the covariance
+    for name, unit, expected in zip(
+        free.names, calibration.covariance.units, free.units, strict=True
+    ):
+        if unit != expected:
+            raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
     _check_identifiability(calibration.identifiability, free.names)
     _check_fit(calibration.fit)
     unknown = sorted(set(calibration.at_bound) - set(free.names))
@@ -354,14 +360,6 @@ def _check_shared(chains, free):
         first, *others = (parameter.value for parameter in table[name])
         if not all(np.array_equal(first, other) for other in others):
             raise CalibrationFileError(f"{name} has different values in different datasets")
-
-
-def _check_covariance(covariance, free):
-    _check_names("covariance", covariance.names, free.names)
-    # a parameter with one value per wavelength has as many rows of the covariance
-    for name, unit, expected in zip(free.names, covariance.units, free.units, strict=True):
-        if unit != expected:
-            raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
 
 
 def _check_names(what, names, expected):

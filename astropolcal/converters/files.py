@@ -62,7 +62,10 @@ def write_calibration(calibration, path, overwrite=False):
     """Write a calibration to an ASDF file, which appears complete or not at all."""
     path = check_new(path, overwrite, CalibrationFileError)
     with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
-        content = _to_bytes(calibration)
+        buffer = io.BytesIO()
+        with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+            file.write_to(buffer)
+        content = buffer.getvalue()
     with atomic_path(path, error=CalibrationFileError) as temporary:
         temporary.write_bytes(content)
 
@@ -82,13 +85,6 @@ def read_calibration(path):
 
 
 # ---- to and from bytes -------------------------------------------------------------
-
-
-def _to_bytes(calibration):
-    buffer = io.BytesIO()
-    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
-        file.write_to(buffer)
-    return buffer.getvalue()
 
 
 def _from_bytes(content):

@@ -168,7 +168,10 @@ class _Setting:
 
         Only frames at most ``width`` places apart in ``frames`` count.
         """
-        first, second = _neighbours(frames, width)
+        ahead = np.arange(1, min(width, frames.size - 1) + 1)
+        place = np.arange(frames.size)[:, None] + ahead
+        here, there = np.nonzero(place < frames.size)
+        first, second = frames[here], frames[place[here, there]]
         gap = self.hwp[second] - self.hwp[first]
         # 45 and 135 degrees are alike for a pair: both are 45 from a multiple of 90
         good = np.abs(np.mod(gap, _HALF) - _QUARTER) <= self.tolerance
@@ -200,15 +203,6 @@ class _Setting:
                 backwards,
             )
         )
-
-
-def _neighbours(frames, width):
-    """Return all pairs of frames that are at most ``width`` places apart."""
-    # a band of the matrix of all pairs, (frames, width)
-    ahead = np.arange(1, min(width, frames.size - 1) + 1)
-    place = np.arange(frames.size)[:, None] + ahead
-    here, there = np.nonzero(place < frames.size)
-    return frames[here], frames[place[here, there]]
 
 
 def _paired(setting, share):

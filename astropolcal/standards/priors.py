@@ -294,7 +294,11 @@ def angles(table):
 
 def turning(x, theta, error, lambda_max):
     """Return theta at lambda_max and rotation, their covariance, and what is assumed."""
-    mean, offset = _centered(theta, error)
+    double = np.exp(2j * np.deg2rad(theta))
+    # an angle of polarization has a period of 180 deg, so the double angle
+    # is averaged on the circle
+    mean = np.angle(np.sum(double / error**2))
+    mean, offset = np.rad2deg(mean) / 2, np.rad2deg(np.angle(double * np.exp(-1j * mean))) / 2
     line, words = _line(x - lambda_max, offset, error), []
     if line is None:
         weight = error**-2.0
@@ -308,15 +312,6 @@ def turning(x, theta, error, lambda_max):
     (theta, turn), inverse = line
     inverse[0, 0] += _ZERO_POINT**2
     return (float(np.mod(mean + theta, 180)), float(turn)), inverse, words
-
-
-def _centered(theta, error):
-    """Return the weighted mean of angles, and how far each is from it, in degree."""
-    double = np.exp(2j * np.deg2rad(theta))
-    # an angle of polarization has a period of 180 deg, so the double angle
-    # is averaged on the circle
-    mean = np.angle(np.sum(double / error**2))
-    return np.rad2deg(mean) / 2, np.rad2deg(np.angle(double * np.exp(-1j * mean))) / 2
 
 
 def _line(x, offset, error):

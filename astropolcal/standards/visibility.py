@@ -61,7 +61,12 @@ def night_times(site, night, *, twilight, step):
     """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
     with offline():
         # from noon to noon, so that a night is never cut in two whatever the longitude
-        times = _evening_noon(site, night) + np.arange(0, 1, step.to_value(u.day)) * u.day
+        date = Time(date_of(night), scale="utc")
+        # a time of its own, which is printed to the second
+        noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
+        times = (noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day) + np.arange(
+            0, 1, step.to_value(u.day)
+        ) * u.day
         sun = get_sun(times).transform_to(AltAz(obstime=times, location=site)).alt
     dark = sun < twilight
     if not np.any(dark):
@@ -70,15 +75,6 @@ def night_times(site, night, *, twilight, step):
             f"at this site; it gets to {sun.min().to_value(u.deg):.1f} deg"
         )
     return times[dark]
-
-
-def _evening_noon(site, night):
-    """Return the local mean noon of the date on which the night begins."""
-    date = Time(date_of(night), scale="utc")
-    # a time of its own, which is printed to the second
-    noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
-    # local mean noon is 12 h UTC minus the east longitude
-    return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
 
 
 def date_of(night):

@@ -49,8 +49,11 @@ def summary(calibration, targets=TARGETS, full=False):
     if not full:
         return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
     known, stars = calibration.parameter_values(), fitted_stars(calibration)
+    told = [*found.reasons, *found.cautions]
+    hidden = told and "; ".join(told) not in found.words[0]
+    gauge = calibration.settings.get("gauge")
     parts = [
-        [*found.words, *_more_reasons(found)],
+        [*found.words, *(list(_wrap(f"  - {words}" for words in told)) if hidden else [])],
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
         _law_lines(calibration),
@@ -68,7 +71,7 @@ def summary(calibration, targets=TARGETS, full=False):
         mirror_lines(calibration),
         _goodness_lines(calibration),
         list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
-        _gauge_lines(calibration),
+        (list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []),
         _bound_lines(calibration, known),
         _posterior_lines(calibration),
     ]
@@ -79,13 +82,6 @@ def _stars(stars):
     """Say what was found of the standard stars, and how far it rests on the catalogue."""
     words = [f"  {' '.join(star.meta['words'].split())}" for star in stars]
     return ["Standard stars", *_wrap(words)] if words else []
-
-
-def _more_reasons(found):
-    """Return in full what the first line has no space for."""
-    told = [*found.reasons, *found.cautions]
-    hidden = told and "; ".join(told) not in found.words[0]
-    return list(_wrap(f"  - {words}" for words in told)) if hidden else []
 
 
 def _wrap(lines):
@@ -338,11 +334,6 @@ def _outlier_lines(outliers):
     ]
     more = len(outliers) - _MOST_OUTLIERS
     return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
-
-
-def _gauge_lines(calibration):
-    gauge = calibration.settings.get("gauge")
-    return list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []
 
 
 def _bound_lines(calibration, known):

@@ -78,7 +78,10 @@ def star_stokes(calibration, chain, observations, positions=None):
     >>> table["q"].round(1)
     <Quantity [2., 2., 2.] %>
     """
-    chain = _with_free_star(chain)
+    first, *rest = leaves(chain)
+    if not isinstance(first, PolarizedSource):
+        raise ChainError("the chain of a star begins with a PolarizedSource")
+    chain = join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
     predicted = predicted_chain(calibration, chain, observations)
     measurement = Measurement(
         predicted,
@@ -88,7 +91,12 @@ def star_stokes(calibration, chain, observations, positions=None):
     )
     vector, (part,) = measurement.vector(), measurement.datasets
     # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
-    residuals, slopes = measurement.residuals(vector), _star_slopes(measurement, vector)
+    name = leaves(measurement.chains[0])[0].name
+    jacobian = measurement.jacobian(vector)
+    residuals, slopes = (
+        measurement.residuals(vector),
+        np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"]),
+    )
     cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
     labels = np.unique(cycle)
     found = np.full((2, len(part.bins), len(labels)), np.nan)
@@ -99,20 +107,6 @@ def star_stokes(calibration, chain, observations, positions=None):
     if np.isnan(found).all():
         raise ObservationError(f"{observations.name}: no cycle determines q and u")
     return _table(observations.wavelength, found)
-
-
-def _with_free_star(chain):
-    first, *rest = leaves(chain)
-    if not isinstance(first, PolarizedSource):
-        raise ChainError("the chain of a star begins with a PolarizedSource")
-    return join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
-
-
-def _star_slopes(measurement, vector):
-    """Return the derivatives of the data to q and u, (2, n_data)."""
-    name = leaves(measurement.chains[0])[0].name
-    jacobian = measurement.jacobian(vector)
-    return np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
 
 
 def _solved(slopes, residuals):

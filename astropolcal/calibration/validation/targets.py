@@ -55,7 +55,7 @@ class SkyErrors:
         """
         weights = _weights(dolp, double).reshape(-1, 9)
         variance, known, is_open, blind = (
-            _quadratic(matrix, weights)
+            np.sum((matrix @ weights.T) * weights.T, axis=-2)
             for matrix in (self._covariance, self._known, self._open, self._blind)
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
@@ -74,11 +74,6 @@ class SkyErrors:
 
 def _products(rows):
     return rows @ np.swapaxes(rows, -1, -2)
-
-
-def _quadratic(matrices, weights):
-    """Return w M w for each of the weights, (n_wavelengths, n_settings, n_weights)."""
-    return np.sum((matrices @ weights.T) * weights.T, axis=-2)
 
 
 def _weights(dolp, double):
