@@ -132,7 +132,12 @@ def _replaced(path):
                 os.chmod(temporary, stat.S_IMODE(old.st_mode))
         # atomic within a file system, hence the temporary file beside the final one
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        with suppress(OSError):
+            number = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -229,16 +234,6 @@ def _remove_stale(path):
             with suppress(OSError):
                 if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
                     os.unlink(other.path)
-
-
-def _sync_folder(folder):
-    """Make a new name last through a loss of power, where the system can."""
-    with suppress(OSError):
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 # ---- what is read ------------------------------------------------------------------

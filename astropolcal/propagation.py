@@ -430,21 +430,16 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
             # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
             _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))
         if wanted and max(wanted) > 0:
-            _at_optic(step, wanted, adjoint, result)
+            derivatives = step.node.derivatives(step.values)
+            for parameter in wanted:
+                if parameter > 0:
+                    changed = act(derivatives[parameter - 1], step.light)
+                    # a product with ones sums the four of a column faster than sum or einsum
+                    slope = (adjoint * changed) @ np.ones(4)
+                    _add(result, (step.node.index, parameter), slope)
         behind = pair
         adjoint = turned(pair[0][0], inverse(step.phase))
     return adjoint, behind
-
-
-def _at_optic(step, wanted, adjoint, result):
-    """Add the derivatives to the wanted parameters of one optic other than ``theta``."""
-    derivatives = step.node.derivatives(step.values)
-    for parameter in wanted:
-        if parameter > 0:
-            changed = act(derivatives[parameter - 1], step.light)
-            # a product with ones sums the four of a column faster than sum or einsum
-            slope = (adjoint * changed) @ np.ones(4)
-            _add(result, (step.node.index, parameter), slope)
 
 
 def _add(result, key, value):

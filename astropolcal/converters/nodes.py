@@ -93,10 +93,6 @@ def plain(value, where="value"):
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # a copy: views of one array would share a block
         return value.copy() if value.ndim or isinstance(value, u.Quantity) else value.item()
-    return _plain_scalar(value, where)
-
-
-def _plain_scalar(value, where):
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, (datetime.date, datetime.datetime)):
         return value.isoformat()
@@ -137,17 +133,16 @@ def _spelled(node, expand):
     if node is None or isinstance(node, (str, int)):
         return node
     if hasattr(node, "__array__"):
-        return _spelled_array(np.asarray(node))
+        array = np.asarray(node)
+        if array.dtype.kind == "f":
+            # YAML knows one not-a-number only, floats have many
+            array = np.where(np.isnan(array), np.nan, array)
+        # of the same bytes on machines of either order; a block in a file may have any
+        array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(
+            array.shape
+        )
+        return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
     return _spelled(expand(node), expand)
-
-
-def _spelled_array(array):
-    if array.dtype.kind == "f":
-        # YAML knows one not-a-number only, floats have many
-        array = np.where(np.isnan(array), np.nan, array)
-    # of the same bytes on machines of either order; a block in a file may have any
-    array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(array.shape)
-    return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
 
 
 # ---- priors in a calibration file ----

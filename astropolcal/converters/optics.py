@@ -26,7 +26,13 @@ __all__ = []
 
 def node_from_optic(optic):
     """Return the node of an optic, of a class in `astropolcal.optics.OPTICS`."""
-    _check_class(optic)
+    cls = type(optic)
+    # a class of the same name from elsewhere would be read back as ours
+    if OPTICS.get(cls.__name__) is not cls:
+        raise CalibrationFileError(
+            f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
+            f"which files cannot hold; allowed are {', '.join(OPTICS)}"
+        )
     settings = {key: value for key, value in optic._settings().items() if value is not None}
     return settings | {
         "parameters": {key: _parameter_node(optic, key) for key in type(optic).param_names}
@@ -44,16 +50,6 @@ def spelled_model(model):
     return {"model": type(model).__name__, "parameters": values, "domains": limits}
 
 
-def _check_class(optic):
-    cls = type(optic)
-    # a class of the same name from elsewhere would be read back as ours
-    if OPTICS.get(cls.__name__) is not cls:
-        raise CalibrationFileError(
-            f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
-            f"which files cannot hold; allowed are {', '.join(OPTICS)}"
-        )
-
-
 def _parameter_node(optic, key):
     parameter = getattr(optic, key)
     label = f"{optic.name or type(optic).__name__}.{key}"
@@ -66,7 +62,13 @@ def _parameter_node(optic, key):
     if parameter.unit != declared:
         raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
     # astropy gives the value of an array of one as a number
-    node = {"value": _stored(np.reshape(parameter.value, parameter.shape), label)}
+    value = np.reshape(parameter.value, parameter.shape)
+    value = np.array(value, dtype=float)
+    if value.ndim > 1 or not np.isfinite(value).all():
+        raise CalibrationFileError(
+            f"{label} = {value} must be a finite number, or one per wavelength"
+        )
+    node = {"value": (value if value.ndim else float(value))}
     if declared is not None:
         node["unit"] = declared.to_string()
     if parameter.grid is not None:
@@ -88,15 +90,6 @@ def _law_node(optic, key):
         "coefficients": {name: _parameter_node(optic, label) for name, label in names},
     }
     return {"law": node if law.since is None else node | {"since": law.since}}
-
-
-def _stored(value, label):
-    value = np.array(value, dtype=float)
-    if value.ndim > 1 or not np.isfinite(value).all():
-        raise CalibrationFileError(
-            f"{label} = {value} must be a finite number, or one per wavelength"
-        )
-    return value if value.ndim else float(value)
 
 
 def _bounds(parameter):

@@ -158,7 +158,19 @@ def with_own(chains, names, own, ties=None):
     table, ties, optics = parameter_table(chains), dict(ties or {}), {}
     for name, groups in own.items():
         groups = list(map(str, groups))
-        _check_own(name, groups, table, len(chains), ties)
+        count = len(chains)
+        if name not in table:
+            raise ParameterError(f"own: no parameter {name!r}; there are {', '.join(table)}")
+        if len(groups) != count:
+            raise ParameterError(
+                f"own: {name} has {len(groups)} groups; there are {count} datasets"
+            )
+        if table[name][0].fixed:
+            raise ParameterError(f"own: {name} is fixed; what has several values has to be free")
+        if name in ties or any(tie.source == name for tie in ties.values()):
+            raise ParameterError(
+                f"own: {name} is part of a tie; allowed are parameters that are not"
+            )
         optic, key = name.split(".")
         optics.setdefault(optic, {})[key] = groups
     trains, copies = [leaves(chain.copy()) for chain in chains], {}
@@ -177,17 +189,6 @@ def with_own(chains, names, own, ties=None):
                         ties[f"{leaf.name}.{key}"] = ties.get(f"{optic}.{key}", Tie(lead))
         copies |= {f"{optic}.{k}": [x for (o, _), x in first.items() if o == k] for k in keys}
     return [join(train) for train in trains], ties, copies
-
-
-def _check_own(name, groups, table, count, ties):
-    if name not in table:
-        raise ParameterError(f"own: no parameter {name!r}; there are {', '.join(table)}")
-    if len(groups) != count:
-        raise ParameterError(f"own: {name} has {len(groups)} groups; there are {count} datasets")
-    if table[name][0].fixed:
-        raise ParameterError(f"own: {name} is fixed; what has several values has to be free")
-    if name in ties or any(tie.source == name for tie in ties.values()):
-        raise ParameterError(f"own: {name} is part of a tie; allowed are parameters that are not")
 
 
 class FreeParameters:

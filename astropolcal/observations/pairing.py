@@ -61,7 +61,16 @@ def pair_frames(
     setting = _Setting(hwp, derotator, flc_state, steps, tolerance, derotator_tolerance)
     pairs, left = _paired(setting, share)
     if left:
-        _warn_left_over(left, hwp, labels, name)
+        shown = ", ".join(
+            f"{labels[frame]} (hwp {np.rad2deg(hwp[frame]):g} deg)" for frame in left[:_MAX_NAMED]
+        )
+        more = f" and {len(left) - _MAX_NAMED} more" if len(left) > _MAX_NAMED else ""
+        warnings.warn(
+            f"{name}: {len(left)} of {len(hwp)} frames left out, their partner 45 deg of half-wave "
+            f"plate away is missing or used: frame {shown}{more}",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
     return pairs
 
 
@@ -188,13 +197,8 @@ class _Setting:
             drift = distance[close] > 0.5 * self.derotator_tolerance
         forward = self.phase[first] < self.phase[second]
         plus, minus = np.where(forward, (first, second), (second, first))
-        order = self._preference(plus, minus, drift)
-        return plus[order], minus[order]
-
-    def _preference(self, plus, minus, drift):
-        # a partner at +45 degrees is preferred to the equivalent one at -45
         backwards = _apart(self.hwp[minus], self.hwp[plus] + _QUARTER) > self.tolerance
-        return np.lexsort(
+        order = np.lexsort(
             (
                 np.minimum(plus, minus),
                 np.abs(plus - minus),
@@ -203,6 +207,7 @@ class _Setting:
                 backwards,
             )
         )
+        return plus[order], minus[order]
 
 
 def _paired(setting, share):
@@ -257,19 +262,6 @@ def _choose(plus, minus, n_frames, share):
                 used[[p, m]] = True
                 chosen.append((p, m))
     return chosen, used
-
-
-def _warn_left_over(left, hwp, labels, name):
-    shown = ", ".join(
-        f"{labels[frame]} (hwp {np.rad2deg(hwp[frame]):g} deg)" for frame in left[:_MAX_NAMED]
-    )
-    more = f" and {len(left) - _MAX_NAMED} more" if len(left) > _MAX_NAMED else ""
-    warnings.warn(
-        f"{name}: {len(left)} of {len(hwp)} frames left out, their partner 45 deg of half-wave "
-        f"plate away is missing or used: frame {shown}{more}",
-        AstropolcalWarning,
-        stacklevel=3,
-    )
 
 
 # ---- data of a table -----------------------------------------------------------------------------

@@ -480,7 +480,12 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
             lowest.tick_params(labelbottom=True)
             st.wavelength_label(lowest)
         st.heading(figure, calibration, "Mirrors")
-        _mirror_legend(figure, panels)
+        entries = st.legend_entries(panels.ravel())
+        # sorting is stable: what was calibrated stays in its order, the metals come last
+        for label in sorted(entries, key=lambda label: label in METALS):
+            handle = entries[label] = entries.pop(label)
+            handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
+        st.legend_outside(figure, list(entries.values()), columns=2)
     return figure
 
 
@@ -512,15 +517,6 @@ def _draw_mirror(axes, calibration, table, key, reference):
     line = "-" if known else (0, (5, 1))
     axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=st.BLUE)
     st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
-
-
-def _mirror_legend(figure, panels):
-    entries = st.legend_entries(panels.ravel())
-    # sorting is stable: what was calibrated stays in its order, the metals come last
-    for label in sorted(entries, key=lambda label: label in METALS):
-        handle = entries[label] = entries.pop(label)
-        handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
-    st.legend_outside(figure, list(entries.values()), columns=2)
 
 
 # ---- history --------------------------------------------------------------------------------

@@ -604,20 +604,16 @@ def _degree(star, band):
     if band is not None and band in table["band"]:
         table = table[table["band"] == band]
     elif star.law is not None and (band is not None or not len(table)):
-        return _from_law(star, band)
+        place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
+        wavelength = place.get(band, 0.55) * u.um
+        q, stokes_u, covariance = star.stokes(wavelength)
+        # the error of the degree is that along the direction of polarization in the (q, u) plane
+        along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
+        # where the angle alone is uncertain rounding may leave less than zero
+        error = np.sqrt(max(along @ covariance @ along, 0.0))
+        return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
     at = int(np.argmin(np.abs(table["wavelength"] - 0.55 * u.um)))
     return table["p"][at].to_value(u.percent), table["p_err"][at].to_value(u.percent)
-
-
-def _from_law(star, band):
-    place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
-    wavelength = place.get(band, 0.55) * u.um
-    q, stokes_u, covariance = star.stokes(wavelength)
-    # the error of the degree is that along the direction of polarization in the (q, u) plane
-    along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
-    # where the angle alone is uncertain rounding may leave less than zero
-    error = np.sqrt(max(along @ covariance @ along, 0.0))
-    return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
 
 
 def _observable(table, site, night, min_altitude):

@@ -93,10 +93,8 @@ def star_stokes(calibration, chain, observations, positions=None):
     # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
     name = leaves(measurement.chains[0])[0].name
     jacobian = measurement.jacobian(vector)
-    residuals, slopes = (
-        measurement.residuals(vector),
-        np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"]),
-    )
+    residuals = measurement.residuals(vector)
+    slopes = np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
     cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
     labels = np.unique(cycle)
     found = np.full((2, len(part.bins), len(labels)), np.nan)

@@ -555,7 +555,15 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     if standard is not None:
         measurement = _independent(calibration, standard, dataset)
         name = ", ".join(part.observations.name for part in measurement.datasets)
-        result["s_standard"] = _rms_at(measurement, result["wavelength"])
+        wavelength = result["wavelength"]
+        residuals = measurement.residuals()
+        own = measurement.wavelength[measurement.bins]
+        found = [
+            residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
+            for value in wavelength.to_value(u.um)
+        ]
+        rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
+        result["s_standard"] = 100 * np.array(rms) * u.percent
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
@@ -587,15 +595,3 @@ def _independent(calibration, standard, dataset):
     for part in measurement.datasets:
         refuse_fitted(calibration, part.observations)
     return measurement
-
-
-def _rms_at(measurement, wavelength):
-    """Return the rms of the residuals at each wavelength, NaN where there are none."""
-    residuals = measurement.residuals()
-    own = measurement.wavelength[measurement.bins]
-    found = [
-        residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
-        for value in wavelength.to_value(u.um)
-    ]
-    rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
-    return 100 * np.array(rms) * u.percent
