@@ -16,14 +16,14 @@ import numpy as np
 
 from astropolcal.calibration import Calibration
 from astropolcal.calibration.identifiability.analysis import Identifiability
-from astropolcal.calibration.result.calibration import DatasetRecord
-from astropolcal.calibration.result.validity import validity_of
+from astropolcal.calibration.result.calibration import DatasetRecord, validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.converters.nodes import (
     check_posterior,
     checksum,
+    node_from_optic,
     node_from_posterior,
     node_from_priors,
     node_from_table,
@@ -31,13 +31,13 @@ from astropolcal.converters.nodes import (
     plain,
     posterior_from_node,
     restore_priors,
+    spelled_model,
     table_from_node,
     unit_from_text,
     unit_text,
     value_from_node,
     without_priors,
 )
-from astropolcal.converters.optics import node_from_optic, spelled_model
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table

@@ -26,7 +26,7 @@ from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
-from astropolcal.observations.quality import is_star, mask_saturated
+from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
 __all__ = ["VAMPIRES"]

@@ -15,7 +15,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new, one_line
 from astropolcal.observations.grid import beam_variances, build_grid
-from astropolcal.observations.pairing import PAIRINGS, frame_groups
+from astropolcal.observations.observables import PAIRINGS, frame_groups
 from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
     complete_table,

@@ -8,7 +8,7 @@ from itertools import pairwise
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.identifiability.ambiguities import _POOR, SETS, harmonic_conditions
+from astropolcal.calibration.identifiability.analysis import _POOR, SETS, harmonic_conditions
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (

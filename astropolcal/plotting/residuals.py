@@ -8,7 +8,7 @@ import numpy as np
 
 from astropolcal.chain import stages, standing
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
-from astropolcal.observations.quality import clusters, is_star
+from astropolcal.observations.grid import clusters, is_star
 from astropolcal.plotting import _style as st
 from astropolcal.propagation import Propagator
 

@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
-from astropolcal.standards.catalogues import StandardStar, check_kind, get, names
+from astropolcal.standards.priors import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
 from astropolcal.words import did_you_mean
 

@@ -16,9 +16,9 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
+from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.units import angle_to_rad
 
 __all__ = [

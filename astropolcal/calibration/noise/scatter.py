@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations.grid import clusters, cycle_numbers, is_star, runs_of_frames
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.observations.quality import clusters, cycle_numbers, is_star, runs_of_frames
 
 __all__ = []
 

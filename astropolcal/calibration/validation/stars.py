@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
-from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted
+from astropolcal.calibration.validation.cross_validation import predicted_chain, refuse_fitted
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import (
@@ -17,7 +17,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement
-from astropolcal.observations.quality import cycle_numbers
+from astropolcal.observations.grid import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle

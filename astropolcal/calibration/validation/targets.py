@@ -19,8 +19,8 @@ from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     cross_validated_residuals,
+    refuse_fitted,
 )
-from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import columns
