@@ -115,7 +115,15 @@ def _replaced(path):
     start, end = _hidden(path)
     temporary = path.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}{end}")
     try:
-        _remove_stale(path)
+        start, end = map(re.escape, _hidden(path))
+        ours = re.compile(rf"{start}\d+(-[0-9a-f]{{8}})?{end}")
+        limit = time.time() - _STALE_SECONDS
+        with suppress(OSError):
+            for other in os.scandir(path.parent):
+                # somebody else may have removed it meanwhile
+                with suppress(OSError):
+                    if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
+                        os.unlink(other.path)
         old = os.stat(path) if path.exists() else None
         if old is not None:
             # what only some may read is not for all while it is written
@@ -221,19 +229,6 @@ def _hidden(path):
     room = _LONGEST_NAME - len(os.fsencode(suffix)) - 30
     stem = os.fsencode(path.stem[:100])[:room].decode(errors="ignore")
     return f".{stem}.", f".tmp{suffix}"
-
-
-def _remove_stale(path):
-    """Remove what runs that were killed long ago left of the same file."""
-    start, end = map(re.escape, _hidden(path))
-    ours = re.compile(rf"{start}\d+(-[0-9a-f]{{8}})?{end}")
-    limit = time.time() - _STALE_SECONDS
-    with suppress(OSError):
-        for other in os.scandir(path.parent):
-            # somebody else may have removed it meanwhile
-            with suppress(OSError):
-                if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
-                    os.unlink(other.path)
 
 
 # ---- what is read ------------------------------------------------------------------

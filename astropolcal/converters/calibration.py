@@ -77,9 +77,16 @@ def node_from_calibration(calibration):
     node |= {"priors": priors} if priors else {}
     node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
+    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
     return node | {
         "checksum": _checksum(node),
-        "validity": _validity(calibration),
+        "validity": {
+            **validity_of(calibration).to_dict(),
+            "dates": sorted(dates - {None}),
+            "optics_in_beam": [
+                [leaf.name for leaf in leaves(chain)] for chain in calibration.chains
+            ],
+        },
         "written_with": {"astropolcal": version} | versions,
     }
 
@@ -92,16 +99,6 @@ def _checksum(node):
 def _expanded(item):
     """Return what a checksum says of an optic, or of a model that a parameter follows."""
     return node_from_optic(item) if isinstance(item, Optic) else spelled_model(item)
-
-
-def _validity(calibration):
-    """Return what tells whether a frame may be reduced with the calibration."""
-    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
-    return {
-        **validity_of(calibration).to_dict(),
-        "dates": sorted(dates - {None}),
-        "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in calibration.chains],
-    }
 
 
 def _chain_node(chain):

@@ -32,8 +32,8 @@ OPTIC_MODULES = {
     for module, names in {
         "mirrors": "KMirror MetalMirror ParityFlip PowerLawMirror",
         "modulated": "DriftRetarder DriftRotator FerroelectricLiquidCrystal FluxGain "
-        "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StateAnalyser StateRetarder "
-        "StrayLight",
+        "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StateAnalyser "
+        "StateRetarder StrayLight",
         "perturbations": "MuellerElement Perturbation",
         "polarizers": "BeamGain Depolarizer Diattenuator "
         "DiattenuatorRetarder LinearPolarizer VectorDiattenuator WollastonPrism",

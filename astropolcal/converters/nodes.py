@@ -178,11 +178,6 @@ def prior_node(prior, name):
     for kind, (cls, *keys) in _OURS.items():
         if type(prior) is cls:
             return {"kind": kind} | {key: node_from_value(getattr(prior, key)) for key in keys}
-    return {"kind": "scipy"} | _frozen_node(prior, name)
-
-
-def _frozen_node(prior, name):
-
     node = {
         "distribution": getattr(getattr(prior, "dist", None), "name", None),
         "args": plain(list(getattr(prior, "args", ())), f"prior of {name}"),
@@ -195,7 +190,7 @@ def _frozen_node(prior, name):
             f"prior of {name} is a {type(prior).__name__}, which files cannot hold; allowed are "
             "Normal, Uniform and frozen continuous distributions of scipy.stats"
         ) from None
-    return node
+    return {"kind": "scipy"} | node
 
 
 def _frozen(node):

@@ -229,17 +229,14 @@ class FreeParameters:
             for slot in self.slots
             if (prior := self._table[slot.name][0].prior) is not None
         ]
-        self._check_priors()
-        self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
-        self._bounds = self._limits()
-
-    def _check_priors(self):
         for slot, prior in self.priors:
             size = np.size(prior.mode)
             if size not in (1, slot.size):
                 raise ParameterError(
                     f"prior of {slot.name} has {size} values; allowed are 1 or {slot.size}"
                 )
+        self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
+        self._bounds = self._limits()
 
     def of_chains(self, chains):
         """Return the same parameters, bound to copies of the chains."""

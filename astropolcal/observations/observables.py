@@ -515,7 +515,20 @@ def pair_frames(
     tolerance = float(angle_to_rad(tolerance, "tolerance"))
     derotator_tolerance = float(angle_to_rad(derotator_tolerance, "derotator_tolerance"))
     labels = range(len(hwp)) if labels is None else labels
-    _check_partners(hwp, tolerance, rows, name)
+    there = np.sort(np.mod(hwp, _HALF))
+    # the neighbours across 0 and 90 deg
+    there = np.concatenate([there - _HALF, there, there + _HALF])
+    wanted = np.mod(hwp + _QUARTER, _HALF)
+    place = np.searchsorted(there, wanted)
+    nearest = np.minimum(wanted - there[place - 1], there[place] - wanted)
+    lonely = nearest > tolerance
+    if lonely.any():
+        frame = int(np.argmax(lonely))
+        where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
+        raise ObservationError(
+            f"{name}, {where}: hwp = {np.rad2deg(hwp[frame]):g} deg has no partner; a frame "
+            "with the half-wave plate 45 deg from it (modulo 180 deg) is needed"
+        )
     steps = np.arange(len(hwp)) if time is None else np.asarray(time, dtype=float)
     setting = _Setting(hwp, derotator, flc_state, steps, tolerance, derotator_tolerance)
     pairs, left = _paired(setting, share)
@@ -563,7 +576,14 @@ def pair_states(
     # of no partner at all, not only of none that is free: that is a table with a hole
     lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
     if lonely:
-        _refuse_lonely(min(lonely), state, angles, rows, name)
+        frame = min(lonely)
+        where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
+        own, other = ("A", "B") if state[frame] == 0 else ("B", "A")
+        hwp, derotator = (np.rad2deg(angle[frame]) for angle in angles)
+        raise ObservationError(
+            f"{name}, {where}: flc_state {own} at hwp = {hwp:g} deg and derotator = "
+            f"{derotator:g} deg has no partner; a frame in state {other} at these angles is needed"
+        )
     i, j = (frames[k] for frames, k in zip((first, second), np.nonzero(alike), strict=True))
     # the last key counts most: nearest in time, then in the file, then the earliest
     order = np.lexsort((np.minimum(i, j), np.abs(i - j), np.abs(steps[i] - steps[j])))
@@ -600,16 +620,6 @@ def quadruples(
     )
     # (Q, 2, 2): plus and minus, then states; flat it is A+, B+, A-, B-
     return np.asarray(states)[found].reshape(-1, 4)
-
-
-def _refuse_lonely(frame, state, angles, rows, name):
-    where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
-    own, other = ("A", "B") if state[frame] == 0 else ("B", "A")
-    hwp, derotator = (np.rad2deg(angle[frame]) for angle in angles)
-    raise ObservationError(
-        f"{name}, {where}: flc_state {own} at hwp = {hwp:g} deg and derotator = {derotator:g} deg "
-        f"has no partner; a frame in state {other} at these angles is needed"
-    )
 
 
 def _apart(first, second):
@@ -688,23 +698,6 @@ def _paired(setting, share):
             break
         width *= 4
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2), sorted(left.tolist())
-
-
-def _check_partners(hwp, tolerance, rows, name):
-    there = np.sort(np.mod(hwp, _HALF))
-    # the neighbours across 0 and 90 deg
-    there = np.concatenate([there - _HALF, there, there + _HALF])
-    wanted = np.mod(hwp + _QUARTER, _HALF)
-    place = np.searchsorted(there, wanted)
-    nearest = np.minimum(wanted - there[place - 1], there[place] - wanted)
-    lonely = nearest > tolerance
-    if lonely.any():
-        frame = int(np.argmax(lonely))
-        where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
-        raise ObservationError(
-            f"{name}, {where}: hwp = {np.rad2deg(hwp[frame]):g} deg has no partner; a frame "
-            "with the half-wave plate 45 deg from it (modulo 180 deg) is needed"
-        )
 
 
 def _choose(plus, minus, n_frames, share):

@@ -92,9 +92,6 @@ class Observations:
         # found when they are first asked for, and kept
         self._groups, self._hash = {}, None
         self._mask = grid.reason > 0
-        self._freeze()
-
-    def _freeze(self):
         grid = self._grid
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
         # groups and hash are kept, so that what they were made of must not change

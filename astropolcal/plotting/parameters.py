@@ -146,16 +146,6 @@ def _words(own):
             yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
 
 
-def _mark_half_wave(axes):
-    """Draw the line of a perfect half-wave plate where the data come near to it."""
-    # the limits of the data, not of the axes, which a line would widen
-    low, high = axes.dataLim.intervaly
-    for half in (180, -180):
-        if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
-            look = {"color": st.BLACK, "linestyle": "--", "linewidth": 1}
-            axes.axhline(half, label="half wave (±180°)", **look)
-
-
 # ---- legend -----------------------------------------------------------------------
 
 
@@ -261,7 +251,11 @@ def plot_retardances(calibration, *, figure=None):
             axes.set_title(f"{leaf.name}: {key}")
         else:
             _draw_law(axes, calibration, leaf, known, look)
-        _mark_half_wave(axes)
+        low, high = axes.dataLim.intervaly
+        for half in (180, -180):
+            if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
+                look = {"color": st.BLACK, "linestyle": "--", "linewidth": 1}
+                axes.axhline(half, label="half wave (±180°)", **look)
         axes.set_ylabel(f"{_RETARDANCES[key]} (°)")
 
     return _draw_all(figure, calibration, "Retardances", panels, draw)

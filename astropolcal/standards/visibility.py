@@ -631,12 +631,6 @@ def _observable(table, site, night, min_altitude):
         Observability(str(name), place, date_of(night), limit, night_table(times, a, p, limit))
         for name, a, p in zip(found["name"], altitude[up], parallactic[up], strict=True)
     ]
-    _add_night(found, seen)
-    found.sort(["m3_score", "name"])
-    return found
-
-
-def _add_night(found, seen):
     for name in ("altitude", "parallactic"):
         ranges = u.Quantity([getattr(s, name) for s in seen] or np.zeros((0, 2)), u.deg)
         found[f"{name}_min"], found[f"{name}_max"] = ranges[:, 0], ranges[:, 1]
@@ -649,3 +643,5 @@ def _add_night(found, seen):
     for name in found.colnames:
         if name in _FORMATS:
             found[name].info.format = _FORMATS[name]
+    found.sort(["m3_score", "name"])
+    return found

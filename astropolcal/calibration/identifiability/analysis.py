@@ -393,7 +393,19 @@ def mirror_branches(measurement, vector, view):
     With them the other hand of the whole instrument, if only bounds or models exclude it and it
     matters on sky.
     """
-    branches = _within_bounds(measurement, vector)
+    retarders = _retarders(measurement)
+    candidates = [
+        (
+            f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
+            {name: _other_turn},
+        )
+        for name in retarders
+    ]
+    if retarders:
+        flip = dict.fromkeys(retarders, _other_hand)
+        candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", flip))
+    others = [(words, _mirrored(measurement, vector, edits)) for words, edits in candidates]
+    branches = [{"words": words, "vector": other} for words, other in others if other is not None]
     for branch in branches:
         other = branch.pop("vector")
         chains = None if view is None else measurement.put_back(other)
@@ -440,23 +452,6 @@ def _knows_hand(measurement, vector):
         if np.abs(light[..., 3]).max() > _SAME * np.abs(light[..., 0]).max():
             return True
     return False
-
-
-def _within_bounds(measurement, vector):
-    """Return words and values of the mirror solutions within the bounds."""
-    retarders = _retarders(measurement)
-    candidates = [
-        (
-            f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
-            {name: _other_turn},
-        )
-        for name in retarders
-    ]
-    if retarders:
-        flip = dict.fromkeys(retarders, _other_hand)
-        candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", flip))
-    others = [(words, _mirrored(measurement, vector, edits)) for words, edits in candidates]
-    return [{"words": words, "vector": other} for words, other in others if other is not None]
 
 
 def _retarders(measurement):

@@ -548,7 +548,20 @@ def measurement_of_all(calibration, observations, positions=None):
         ties=calibration.ties,
         wavelength=calibration.wavelength,
     )
-    _check_residuals(calibration, measurement)
+    residuals = measurement.residuals()
+    for i, record in enumerate(calibration.datasets):
+        if record.accuracy is None:
+            continue
+        found = accuracy_table(measurement, i, residuals)["s_res"].value
+        stored = record.accuracy["s_res"].value
+        if found.shape != stored.shape or not np.allclose(
+            found, stored, rtol=_SAME_ACCURACY, equal_nan=True
+        ):
+            raise CalibrationFileError(
+                f"{record.name}: the residuals are not those of the calibration (median s_res "
+                f"{np.nanmedian(found):.4g} %, in the calibration {np.nanmedian(stored):.4g} %); "
+                "if the stages were not where the table's columns say, give positions="
+            )
     return measurement
 
 
@@ -593,24 +606,6 @@ def _positions(calibration, tables):
     if instrument is None:
         return None
     return [instrument.positions(*pair) for pair in zip(tables, calibration.chains, strict=True)]
-
-
-def _check_residuals(calibration, measurement):
-    """Refuse data that the calibration was not fitted to in this way."""
-    residuals = measurement.residuals()
-    for i, record in enumerate(calibration.datasets):
-        if record.accuracy is None:
-            continue
-        found = accuracy_table(measurement, i, residuals)["s_res"].value
-        stored = record.accuracy["s_res"].value
-        if found.shape != stored.shape or not np.allclose(
-            found, stored, rtol=_SAME_ACCURACY, equal_nan=True
-        ):
-            raise CalibrationFileError(
-                f"{record.name}: the residuals are not those of the calibration (median s_res "
-                f"{np.nanmedian(found):.4g} %, in the calibration {np.nanmedian(stored):.4g} %); "
-                "if the stages were not where the table's columns say, give positions="
-            )
 
 
 # ---- validity ------------------------------------------------------------------------------

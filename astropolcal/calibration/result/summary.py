@@ -52,12 +52,18 @@ def summary(calibration, targets=TARGETS, full=False):
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
     gauge = calibration.settings.get("gauge")
+    lines = []
+    for name, copies in (calibration.settings.get("own") or {}).items():
+        evidence = _evidence(calibration, copies)
+        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
+        words = words if np.isfinite(evidence) else "is not determined"
+        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
     parts = [
         [*found.words, *(list(_wrap(f"  - {words}" for words in told)) if hidden else [])],
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
         _law_lines(calibration),
-        _own_lines(calibration),
+        (list(_wrap(["Parameters with values of their own", *lines])) if lines else []),
         _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -126,17 +132,6 @@ def _law_lines(calibration):
         for key, law in leaf._follows.items()
     ]
     return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
-
-
-def _own_lines(calibration):
-    """Say which parameters of their own in several nights differ, by the evidence for it."""
-    lines = []
-    for name, copies in (calibration.settings.get("own") or {}).items():
-        evidence = _evidence(calibration, copies)
-        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
-        words = words if np.isfinite(evidence) else "is not determined"
-        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
-    return list(_wrap(["Parameters with values of their own", *lines])) if lines else []
 
 
 def _evidence(calibration, names):

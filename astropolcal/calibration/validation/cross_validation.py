@@ -520,12 +520,23 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     table["s_cv"] = _own_s_cv(calibration, observations.source, rows)
     with np.errstate(divide="ignore", invalid="ignore"):
         table["chi"] = (table["s_standard"] / table["s_cv"]).to_value(u.one)
+    finding, free = calibration.identifiability, measurement.free
+    place = {name: i for i, name in enumerate(finding.names)}
+    # columns of the finding that belong to the standard's free parameters, at its wavelengths
+    columns = []
+    for slot in free.slots:
+        single = slot.name in place
+        names = [slot.name] if single else [f"{slot.name}[{row}]" for row in rows]
+        columns += [place[name] for name in names]
+    # open directions of the calibration, as far as the standard's chain has the parameters
+    null = np.asarray(finding.null_vectors).reshape(-1, len(place))[:, columns]
+    moved = (null * physical_scale(free)) @ measurement.jacobian(measurement.vector())
     table.meta |= {
         "name": observations.name,
         "source": observations.source,
         "content_hash": observations.content_hash,
         "n_frames": int(observations.n_frames),
-        "open_percent": _moved_by_open(calibration, measurement, rows),
+        "open_percent": float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0)),
         "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
     table.meta["words"] = _words(table, bool(_of_source(calibration, observations.source)))
@@ -621,22 +632,6 @@ def _own_s_cv(calibration, source, rows):
         np.add.at(n, at[known], count[known])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(squares / n)[rows] * u.percent
-
-
-def _moved_by_open(calibration, measurement, rows):
-    """Return by how many percent a step along the open directions moves the prediction."""
-    finding, free = calibration.identifiability, measurement.free
-    place = {name: i for i, name in enumerate(finding.names)}
-    # columns of the finding that belong to the standard's free parameters, at its wavelengths
-    columns = []
-    for slot in free.slots:
-        single = slot.name in place
-        names = [slot.name] if single else [f"{slot.name}[{row}]" for row in rows]
-        columns += [place[name] for name in names]
-    # open directions of the calibration, as far as the standard's chain has the parameters
-    null = np.asarray(finding.null_vectors).reshape(-1, len(place))[:, columns]
-    moved = (null * physical_scale(free)) @ measurement.jacobian(measurement.vector())
-    return float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0))
 
 
 def _words(table, same_source):

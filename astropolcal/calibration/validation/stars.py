@@ -262,22 +262,17 @@ def _fitted_star(calibration, star, free):
             table[stem], table[f"{stem}_err"] = 100 * value * u.percent, 100 * std * u.percent
         share.append(1 - np.clip(error**2 / prior, 0, 1))
     table.meta |= {"name": star.name, "from_data": float(np.median(share))}
-    table.meta["words"] = _fitted_words(table)
-    return table
-
-
-def _fitted_words(table):
-    """Say q and u in the middle of the wavelengths, before and after the fit."""
     i = len(table) // 2
     parts = [
         f"{key} {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f}" for key in "qu"
     ]
     prior = max(table[f"{key}_prior_err"][i].value for key in "qu")
     nm = table["wavelength"][i].to_value(u.nm)
-    return (
+    table.meta["words"] = (
         f"{table.meta['name']:<27} {', '.join(parts)} % ({nm:.0f} nm; +- {prior:.2f} before; "
         f"{100 * table.meta['from_data']:.0f} % by the data)"
     )
+    return table
 
 
 # ---- check of a calibration with a star of known polarization that no fit has seen ----
@@ -360,7 +355,12 @@ def star_check(calibration, chain, observations, positions=None, star=None):
         table[key] = accuracy[key]
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
-    _add_claims(table, calibration, rows)
+    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
+    angles = np.nan_to_num(table["aolp_known"])
+    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
+    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
+        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
+        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
     table.meta["words"] = _words(table)
     return table
 
@@ -401,16 +401,6 @@ def _add_known(table, q, stokes_u, covariance):
     table["dolp_known_err"] = along * percent
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
-
-
-def _add_claims(table, calibration, rows):
-    """Add the errors that the calibration claims for light of the catalogue's polarization."""
-    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
-    angles = np.nan_to_num(table["aolp_known"])
-    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
-    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
-        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
-        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
 
 
 def _pull(table, key):

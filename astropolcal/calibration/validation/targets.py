@@ -549,7 +549,9 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         table = _cross_validated(calibration, dataset, groups)
     result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
     record = calibration.datasets[dataset]
-    result["s_standard"] = _remembered(record)
+    table = record.accuracy
+    unknown = np.full(len(table), np.nan) * u.percent
+    result["s_standard"] = table["s_standard"] if "s_standard" in table.colnames else unknown
     known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
     name = ", ".join(entry["name"] for entry in known) or None
     if standard is not None:
@@ -567,13 +569,6 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
-
-
-def _remembered(record):
-    # files that were written before the column existed do not have it
-    table = record.accuracy
-    unknown = np.full(len(table), np.nan) * u.percent
-    return table["s_standard"] if "s_standard" in table.colnames else unknown
 
 
 def _cross_validated(calibration, dataset, groups):
