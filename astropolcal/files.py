@@ -115,7 +115,15 @@ def _replaced(path):
     start, end = _hidden(path)
     temporary = path.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}{end}")
     try:
-        _remove_stale(path)
+        start, end = map(re.escape, _hidden(path))
+        ours = re.compile(rf"{start}\d+(-[0-9a-f]{{8}})?{end}")
+        limit = time.time() - _STALE_SECONDS
+        with suppress(OSError):
+            for other in os.scandir(path.parent):
+                # somebody else may have removed it meanwhile
+                with suppress(OSError):
+                    if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
+                        os.unlink(other.path)
         old = os.stat(path) if path.exists() else None
         if old is not None:
             # what only some may read is not for all while it is written
@@ -125,22 +133,22 @@ def _replaced(path):
         with open(temporary, "rb+") as stream:
             os.fsync(stream.fileno())
         if old is not None:
-            _keep_permissions(temporary, old)
+            with suppress(AttributeError, OSError):
+                os.chown(temporary, -1, old.st_gid)
+                os.chown(temporary, old.st_uid, -1)
+            with suppress(OSError):
+                os.chmod(temporary, stat.S_IMODE(old.st_mode))
         # atomic within a file system, hence the temporary file beside the final one
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        with suppress(OSError):
+            number = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def _keep_permissions(path, old):
-    # as far as the file system has them; to give a file away is for root only
-    with suppress(AttributeError, OSError):
-        os.chown(path, -1, old.st_gid)
-        os.chown(path, old.st_uid, -1)
-    with suppress(OSError):
-        os.chmod(path, stat.S_IMODE(old.st_mode))
 
 
 @contextmanager
@@ -221,29 +229,6 @@ def _hidden(path):
     room = _LONGEST_NAME - len(os.fsencode(suffix)) - 30
     stem = os.fsencode(path.stem[:100])[:room].decode(errors="ignore")
     return f".{stem}.", f".tmp{suffix}"
-
-
-def _remove_stale(path):
-    """Remove what runs that were killed long ago left of the same file."""
-    start, end = map(re.escape, _hidden(path))
-    ours = re.compile(rf"{start}\d+(-[0-9a-f]{{8}})?{end}")
-    limit = time.time() - _STALE_SECONDS
-    with suppress(OSError):
-        for other in os.scandir(path.parent):
-            # somebody else may have removed it meanwhile
-            with suppress(OSError):
-                if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
-                    os.unlink(other.path)
-
-
-def _sync_folder(folder):
-    """Make a new name last through a loss of power, where the system can."""
-    with suppress(OSError):
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 # ---- what is read ------------------------------------------------------------------

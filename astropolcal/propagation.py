@@ -149,7 +149,11 @@ class Propagator:
         self.leaves = leaves(chain)
         _check(self.leaves, positions, len(wavelength))
         self.wavelength = wavelength
-        self.shape = (len(wavelength), _column_count(positions))
+        counts = {name: np.shape(np.atleast_1d(angle))[-1] for name, angle in positions.items()}
+        several = {count for count in counts.values() if count != 1}
+        if len(several) > 1:
+            raise ChainError(f"the stages have different numbers of positions: {counts}")
+        self.shape = (len(wavelength), (several.pop() if several else 1))
         self.source = np.asarray(source, dtype=float).reshape(1, 1, 4)
         # of a single beam the arm is the last optic that is more than a turn of the frame
         acting = [i for i, leaf in enumerate(self.leaves) if not leaf.rotates_frame]
@@ -231,14 +235,6 @@ def _check(found, positions, n_wavelengths):
             )
         if len(shape) == 3 and not leaf.depends_on_beam and leaf.stage != "total_flux":
             raise ChainError(f"{label}, which differs between the beams, but the optic does not")
-
-
-def _column_count(positions):
-    counts = {name: np.shape(np.atleast_1d(angle))[-1] for name, angle in positions.items()}
-    several = {count for count in counts.values() if count != 1}
-    if len(several) > 1:
-        raise ChainError(f"the stages have different numbers of positions: {counts}")
-    return several.pop() if several else 1
 
 
 def _meeting(common, arms):
@@ -434,21 +430,16 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
             # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
             _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))
         if wanted and max(wanted) > 0:
-            _at_optic(step, wanted, adjoint, result)
+            derivatives = step.node.derivatives(step.values)
+            for parameter in wanted:
+                if parameter > 0:
+                    changed = act(derivatives[parameter - 1], step.light)
+                    # a product with ones sums the four of a column faster than sum or einsum
+                    slope = (adjoint * changed) @ np.ones(4)
+                    _add(result, (step.node.index, parameter), slope)
         behind = pair
         adjoint = turned(pair[0][0], inverse(step.phase))
     return adjoint, behind
-
-
-def _at_optic(step, wanted, adjoint, result):
-    """Add the derivatives to the wanted parameters of one optic other than ``theta``."""
-    derivatives = step.node.derivatives(step.values)
-    for parameter in wanted:
-        if parameter > 0:
-            changed = act(derivatives[parameter - 1], step.light)
-            # a product with ones sums the four of a column faster than sum or einsum
-            slope = (adjoint * changed) @ np.ones(4)
-            _add(result, (step.node.index, parameter), slope)
 
 
 def _add(result, key, value):

@@ -198,12 +198,6 @@ def aolp_interval(dolp, sigma, probability=0.6827):
     require((dolp > 0) | (sigma > 0), dolp, "dolp = sigma", "positive for an angle to exist")
     # half of the wedge in (q, u) is the angle there, which is twice that of polarization
     snr, probability = np.broadcast_arrays(_signal_to_noise(dolp, sigma), probability)
-    half = _bisect_half_angle(snr, probability) / 2
-    return np.rad2deg(np.where(sigma > 0, half, 0.0)) * u.deg
-
-
-def _bisect_half_angle(snr, probability):
-    """Return the half-angle of the wedge that holds the probability."""
     from scipy.special import ndtr, owens_t
 
     low = np.zeros(snr.shape)
@@ -215,7 +209,8 @@ def _bisect_half_angle(snr, probability):
         distance, slope = snr * np.sin(middle), np.cos(middle) / np.sin(middle)
         inside = 1 - 2 * owens_t(distance, slope) - ndtr(-distance) > probability
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    return (low + high) / 2
+    half = ((low + high) / 2) / 2
+    return np.rad2deg(np.where(sigma > 0, half, 0.0)) * u.deg
 
 
 # rounding allowed where a degree of polarization is compared with one

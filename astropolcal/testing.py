@@ -27,7 +27,7 @@ from astropolcal.chain import (
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import is_physical
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.grid import is_star
 from astropolcal.optics import (
     COORDINATES,
     LinearPolarizer,

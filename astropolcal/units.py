@@ -162,7 +162,21 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
         with warnings.catch_warnings():
             # leap seconds of years far off are not known, and do not matter here
             warnings.simplefilter("ignore", ErfaWarning)
-            return _iso_date(_date_text(value), months)
+            text = _date_text(value)
+            if _MJD.fullmatch(text):
+                return Time(float(text), format="mjd", scale="utc").isot.removesuffix(
+                    "T00:00:00.000"
+                )
+            found = _COMPACT_DATE.fullmatch(text) or _DATE.fullmatch(text)
+            year, month, day, clock = (*found.groups(), None)[:4] if found else [None] * 4
+            if month is None or (day is None and not months):
+                raise ValueError
+            hour, _, rest = (clock or "0:00").partition(":")
+            # astropy knows the calendar
+            whole = Time(
+                f"{year}-{int(month):02d}-{int(day or 1):02d}T{int(hour):02d}:{rest}", scale="utc"
+            )
+            return whole.isot[: 7 if day is None else 10 if clock is None else None]
     except Exception:  # astropy raises errors of many kinds
         month = "2025-10, " if months else ""
         raise error(
@@ -188,16 +202,3 @@ def _date_text(value):
     if isinstance(value, datetime.datetime) and value.tzinfo is not None:
         value = value.astimezone(datetime.UTC).replace(tzinfo=None)
     return value.isoformat() if isinstance(value, datetime.date) else str(value).strip()
-
-
-def _iso_date(text, months):
-    if _MJD.fullmatch(text):
-        return Time(float(text), format="mjd", scale="utc").isot.removesuffix("T00:00:00.000")
-    found = _COMPACT_DATE.fullmatch(text) or _DATE.fullmatch(text)
-    year, month, day, clock = (*found.groups(), None)[:4] if found else [None] * 4
-    if month is None or (day is None and not months):
-        raise ValueError
-    hour, _, rest = (clock or "0:00").partition(":")
-    # astropy knows the calendar
-    whole = Time(f"{year}-{int(month):02d}-{int(day or 1):02d}T{int(hour):02d}:{rest}", scale="utc")
-    return whole.isot[: 7 if day is None else 10 if clock is None else None]

@@ -19,7 +19,7 @@ from astropolcal.instruments import CHARIS, Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.grid import is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 N_BINS = 22

@@ -15,7 +15,7 @@ from astropolcal.calibration import calibrate
 from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
-from astropolcal.observations.pairing import pair_states
+from astropolcal.observations.observables import pair_states
 from astropolcal.observations.reading import filter_wavelength, stated_wavelength
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

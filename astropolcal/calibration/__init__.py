@@ -5,12 +5,11 @@ from astropolcal.calibration.fit.calibrate import calibrate
 from astropolcal.calibration.fit.runs import RunsCalibration, calibrate_runs
 from astropolcal.calibration.identifiability.analysis import examine
 from astropolcal.calibration.posterior.sampler import sample
-from astropolcal.calibration.result.calibration import Calibration
+from astropolcal.calibration.result.calibration import Calibration, with_validity
 from astropolcal.calibration.result.comparison import compare
-from astropolcal.calibration.result.validity import with_validity
 from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.calibration.uncertainty.refits import bootstrap, profile
-from astropolcal.calibration.validation.held_out import add_standard
+from astropolcal.calibration.validation.cross_validation import add_standard
 from astropolcal.calibration.validation.stars import fitted_stars, star_check
 from astropolcal.calibration.validation.targets import four_accuracies, target_accuracies
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from astropolcal.calibration import Calibration
 from astropolcal.calibration.identifiability.analysis import Identifiability
-from astropolcal.calibration.result.calibration import DatasetRecord
-from astropolcal.calibration.result.validity import validity_of
+from astropolcal.calibration.result.calibration import DatasetRecord, validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.converters.nodes import (
     check_posterior,
     checksum,
+    node_from_optic,
     node_from_posterior,
     node_from_priors,
     node_from_table,
@@ -31,13 +31,13 @@ from astropolcal.converters.nodes import (
     plain,
     posterior_from_node,
     restore_priors,
+    spelled_model,
     table_from_node,
     unit_from_text,
     unit_text,
     value_from_node,
     without_priors,
 )
-from astropolcal.converters.optics import node_from_optic, spelled_model
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table
@@ -77,9 +77,16 @@ def node_from_calibration(calibration):
     node |= {"priors": priors} if priors else {}
     node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
+    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
     return node | {
         "checksum": _checksum(node),
-        "validity": _validity(calibration),
+        "validity": {
+            **validity_of(calibration).to_dict(),
+            "dates": sorted(dates - {None}),
+            "optics_in_beam": [
+                [leaf.name for leaf in leaves(chain)] for chain in calibration.chains
+            ],
+        },
         "written_with": {"astropolcal": version} | versions,
     }
 
@@ -92,16 +99,6 @@ def _checksum(node):
 def _expanded(item):
     """Return what a checksum says of an optic, or of a model that a parameter follows."""
     return node_from_optic(item) if isinstance(item, Optic) else spelled_model(item)
-
-
-def _validity(calibration):
-    """Return what tells whether a frame may be reduced with the calibration."""
-    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
-    return {
-        **validity_of(calibration).to_dict(),
-        "dates": sorted(dates - {None}),
-        "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in calibration.chains],
-    }
 
 
 def _chain_node(chain):
@@ -304,7 +301,13 @@ def check_calibration(calibration):
         _check_laws(calibration.chains, wavelength.to_value("um"))
     _check_values(calibration.chains, free)
     _check_shared(calibration.chains, free)
-    _check_covariance(calibration.covariance, free)
+    _check_names("covariance", calibration.covariance.names, free.names)
+    # a parameter with one value per wavelength has as many rows of the covariance
+    for name, unit, expected in zip(
+        free.names, calibration.covariance.units, free.units, strict=True
+    ):
+        if unit != expected:
+            raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
     _check_identifiability(calibration.identifiability, free.names)
     _check_fit(calibration.fit)
     unknown = sorted(set(calibration.at_bound) - set(free.names))
@@ -354,14 +357,6 @@ def _check_shared(chains, free):
         first, *others = (parameter.value for parameter in table[name])
         if not all(np.array_equal(first, other) for other in others):
             raise CalibrationFileError(f"{name} has different values in different datasets")
-
-
-def _check_covariance(covariance, free):
-    _check_names("covariance", covariance.names, free.names)
-    # a parameter with one value per wavelength has as many rows of the covariance
-    for name, unit, expected in zip(free.names, covariance.units, free.units, strict=True):
-        if unit != expected:
-            raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
 
 
 def _check_names(what, names, expected):

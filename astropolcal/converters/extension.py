@@ -32,13 +32,13 @@ OPTIC_MODULES = {
     for module, names in {
         "mirrors": "KMirror MetalMirror ParityFlip PowerLawMirror",
         "modulated": "DriftRetarder DriftRotator FerroelectricLiquidCrystal FluxGain "
-        "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StrayLight",
+        "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StateAnalyser "
+        "StateRetarder StrayLight",
         "perturbations": "MuellerElement Perturbation",
         "polarizers": "BeamGain Depolarizer Diattenuator "
         "DiattenuatorRetarder LinearPolarizer VectorDiattenuator WollastonPrism",
         "retarders": "EllipticalRetarder LinearRetarder Rotator TwoLayerWaveplate",
         "sources": "PolarizedSource StarSource",
-        "states": "StateAnalyser StateRetarder",
     }.items()
     for name in names.split()
 }
@@ -81,12 +81,12 @@ class OpticConverter(Converter):
         self.types = [f"astropolcal.optics.{OPTIC_MODULES[name]}.{name}"]
 
     def to_yaml_tree(self, obj, tag, ctx):
-        from astropolcal.converters.optics import node_from_optic
+        from astropolcal.converters.nodes import node_from_optic
 
         return node_from_optic(obj)
 
     def from_yaml_tree(self, node, tag, ctx):
-        from astropolcal.converters.optics import optic_from_node
+        from astropolcal.converters.nodes import optic_from_node
 
         return optic_from_node(self.name, node)
 

@@ -62,7 +62,10 @@ def write_calibration(calibration, path, overwrite=False):
     """Write a calibration to an ASDF file, which appears complete or not at all."""
     path = check_new(path, overwrite, CalibrationFileError)
     with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
-        content = _to_bytes(calibration)
+        buffer = io.BytesIO()
+        with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+            file.write_to(buffer)
+        content = buffer.getvalue()
     with atomic_path(path, error=CalibrationFileError) as temporary:
         temporary.write_bytes(content)
 
@@ -77,32 +80,28 @@ def read_calibration(path):
             raise CalibrationFileError("not an ASDF file")
         if not content.endswith(_END):
             raise CalibrationFileError("truncated: the end of the file is missing")
-        _check_tree(content)
-        return _from_bytes(content)
+        end = re.search(YAML_END_MARKER_REGEX, content)
+        with _speaking_of("damaged", "its YAML", reads=False):
+            check_yaml(content[: end.end()], CalibrationFileError)
+        _check_blocks(content, end.end())
+        tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
+        if not isinstance(tree, dict) or _KEY not in tree:
+            raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
+        _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
+        _check_nodes(tree, len(content))
+        has_units = re.search(
+            rb"[/!](units?|transform)/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
+        )
+        with (
+            _strict_asdf(_ConfigWithUnits if has_units else _Config),
+            asdf.open(
+                io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
+            ) as file,
+        ):
+            return file[_KEY]
 
 
 # ---- to and from bytes -------------------------------------------------------------
-
-
-def _to_bytes(calibration):
-    buffer = io.BytesIO()
-    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
-        file.write_to(buffer)
-    return buffer.getvalue()
-
-
-def _from_bytes(content):
-    # the tags are in the text before the blocks of numbers
-    has_units = re.search(
-        rb"[/!](units?|transform)/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
-    )
-    with (
-        _strict_asdf(_ConfigWithUnits if has_units else _Config),
-        asdf.open(
-            io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
-        ) as file,
-    ):
-        return file[_KEY]
 
 
 class _Config(AsdfConfig):
@@ -163,19 +162,6 @@ def _strict_asdf(kind=_ConfigWithUnits):
 
 
 # ---- what is refused before ASDF opens the file ------------------------------------
-
-
-def _check_tree(content):
-    """Check text and tags before any object is made, so that nothing unknown is."""
-    end = re.search(YAML_END_MARKER_REGEX, content)
-    with _speaking_of("damaged", "its YAML", reads=False):
-        check_yaml(content[: end.end()], CalibrationFileError)
-    _check_blocks(content, end.end())
-    tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
-    if not isinstance(tree, dict) or _KEY not in tree:
-        raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
-    _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
-    _check_nodes(tree, len(content))
 
 
 def _check_blocks(content, start):

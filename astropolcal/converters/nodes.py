@@ -5,11 +5,16 @@ What nodes are made of: plain values, quantities, tables, priors, posteriors; a 
 A prior belongs to a parameter, in any chain in which its optic stands; so the file lists priors by
 the parameter's name, beside the chains. Of a posterior it keeps a part of the samples, and what the
 whole run says of its convergence, its quantiles among it.
+
+An optic is stored as its parameters, each with value, unit, fixed flag and both bounds written out,
+and the settings that rebuild it (name, mount, beam and what else its class has). The position of
+its stage belongs to a frame and is not stored.
 """
 
 import datetime
 import hashlib
 import json
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -17,9 +22,12 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.calibration.posterior.samples import Posterior
-from astropolcal.exceptions import AstropolcalError, CalibrationFileError
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ParameterError
 from astropolcal.files import one_line
-from astropolcal.measurement import parameter_table, priors
+from astropolcal.measurement.parameters import Normal, Uniform, parameter_table
+from astropolcal.optics import OPTICS
+from astropolcal.optics.core import with_value
+from astropolcal.optics.laws import law_of
 
 __all__ = []
 
@@ -93,10 +101,6 @@ def plain(value, where="value"):
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # a copy: views of one array would share a block
         return value.copy() if value.ndim or isinstance(value, u.Quantity) else value.item()
-    return _plain_scalar(value, where)
-
-
-def _plain_scalar(value, where):
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, (datetime.date, datetime.datetime)):
         return value.isoformat()
@@ -137,23 +141,22 @@ def _spelled(node, expand):
     if node is None or isinstance(node, (str, int)):
         return node
     if hasattr(node, "__array__"):
-        return _spelled_array(np.asarray(node))
+        array = np.asarray(node)
+        if array.dtype.kind == "f":
+            # YAML knows one not-a-number only, floats have many
+            array = np.where(np.isnan(array), np.nan, array)
+        # of the same bytes on machines of either order; a block in a file may have any
+        array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(
+            array.shape
+        )
+        return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
     return _spelled(expand(node), expand)
-
-
-def _spelled_array(array):
-    if array.dtype.kind == "f":
-        # YAML knows one not-a-number only, floats have many
-        array = np.where(np.isnan(array), np.nan, array)
-    # of the same bytes on machines of either order; a block in a file may have any
-    array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(array.shape)
-    return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
 
 
 # ---- priors in a calibration file ----
 
 
-_OURS = {"normal": ("mean", "std"), "uniform": ("low", "high")}
+_OURS = {"normal": (Normal, "mean", "std"), "uniform": (Uniform, "low", "high")}
 
 
 def node_from_priors(chains):
@@ -172,15 +175,9 @@ def node_from_priors(chains):
 
 def prior_node(prior, name):
     """Return the node of a prior."""
-    kind = type(prior).__name__.lower()
-    if type(prior).__module__ == "astropolcal.measurement.priors" and kind in _OURS:
-        values = {key: node_from_value(getattr(prior, key)) for key in _OURS[kind]}
-        return {"kind": kind} | values
-    return {"kind": "scipy"} | _frozen_node(prior, name)
-
-
-def _frozen_node(prior, name):
-
+    for kind, (cls, *keys) in _OURS.items():
+        if type(prior) is cls:
+            return {"kind": kind} | {key: node_from_value(getattr(prior, key)) for key in keys}
     node = {
         "distribution": getattr(getattr(prior, "dist", None), "name", None),
         "args": plain(list(getattr(prior, "args", ())), f"prior of {name}"),
@@ -193,7 +190,7 @@ def _frozen_node(prior, name):
             f"prior of {name} is a {type(prior).__name__}, which files cannot hold; allowed are "
             "Normal, Uniform and frozen continuous distributions of scipy.stats"
         ) from None
-    return node
+    return {"kind": "scipy"} | node
 
 
 def _frozen(node):
@@ -240,12 +237,13 @@ def prior_from_node(node, name):
     try:
         if node["kind"] == "scipy":
             return _frozen(plain(node))
-        values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
+        cls, *keys = _OURS[node["kind"]]
+        values = [value_from_node(node[key]) for key in keys]
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CalibrationFileError(f"prior of {name}: {one_line(error)}") from None
     # a number of its own type, as it was given
     values = [v if hasattr(v, "unit") else v.item() for v in values]
-    return getattr(priors, node["kind"].capitalize())(*values)
+    return cls(*values)
 
 
 # ---- samples of a posterior in a calibration file ----
@@ -307,3 +305,131 @@ def check_posterior(posterior, covariance):
     for what, values in (("samples", posterior.chain), ("log_prob", posterior.log_prob)):
         if not values.size or not np.isfinite(values).all():
             raise CalibrationFileError(f"posterior: {what} must be finite, and some")
+
+
+# ---- optics, written ---------------------------------------------------------------------
+
+
+def node_from_optic(optic):
+    """Return the node of an optic, of a class in `astropolcal.optics.OPTICS`."""
+    cls = type(optic)
+    # a class of the same name from elsewhere would be read back as ours
+    if OPTICS.get(cls.__name__) is not cls:
+        raise CalibrationFileError(
+            f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
+            f"which files cannot hold; allowed are {', '.join(OPTICS)}"
+        )
+    settings = {key: value for key, value in optic._settings().items() if value is not None}
+    return settings | {
+        "parameters": {key: _parameter_node(optic, key) for key in type(optic).param_names}
+    }
+
+
+def spelled_model(model):
+    """Return what a checksum says of a model that a parameter follows."""
+    if hasattr(model, "op"):
+        return {"op": model.op, "parts": [spelled_model(model.left), spelled_model(model.right)]}
+    values = {name: np.ravel(getattr(model, name).value) for name in model.param_names}
+    # what is not there, and what a file does not say, is not a number
+    domains = (getattr(model, key, None) for key in ("domain", "x_domain", "y_domain"))
+    limits = [np.array([np.nan] if x is None else x, dtype=float) for x in domains]
+    return {"model": type(model).__name__, "parameters": values, "domains": limits}
+
+
+def _parameter_node(optic, key):
+    parameter = getattr(optic, key)
+    label = f"{optic.name or type(optic).__name__}.{key}"
+    if parameter.tied:
+        raise CalibrationFileError(
+            f"{label} has a callable 'tied', which files cannot hold; use ties={{...: Tie(...)}} "
+            "of calibrate"
+        )
+    declared = optic._declared(key).unit
+    if parameter.unit != declared:
+        raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
+    # astropy gives the value of an array of one as a number
+    value = np.reshape(parameter.value, parameter.shape)
+    value = np.array(value, dtype=float)
+    if value.ndim > 1 or not np.isfinite(value).all():
+        raise CalibrationFileError(
+            f"{label} = {value} must be a finite number, or one per wavelength"
+        )
+    node = {"value": (value if value.ndim else float(value))}
+    if declared is not None:
+        node["unit"] = declared.to_string()
+    if parameter.grid is not None:
+        node["wavelength"] = np.array(parameter.grid)
+    node |= {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
+    known = {} if parameter.prior is None else {"prior": prior_node(parameter.prior, label)}
+    return node | known | _law_node(optic, key)
+
+
+def _law_node(optic, key):
+    law = optic._follows.get(key)
+    if law is None:
+        return {}
+    names = zip(law.model.param_names, law.names(key), strict=True)
+    node = {
+        "model": law.model,
+        "of": list(law.of),
+        "known": {name: list(map(float, ends)) for name, ends in law.known.items()},
+        "coefficients": {name: _parameter_node(optic, label) for name, label in names},
+    }
+    return {"law": node if law.since is None else node | {"since": law.since}}
+
+
+def _bounds(parameter):
+    return [None if bound is None else float(bound) for bound in parameter.bounds]
+
+
+# ---- optics, read ---------------------------------------------------------------------
+
+
+def optic_from_node(name, node):
+    """Return the optic of the class ``name`` that a node, which obeys the schema, stores."""
+    # an optic that is on no stage says so: the default of some is another
+    settings = {"mount": None} | {key: value for key, value in node.items() if key != "parameters"}
+    values = {key: _value(entry) for key, entry in node["parameters"].items()}
+    try:
+        optic = OPTICS[name](**values, **settings)
+    except ParameterError as error:
+        label = repr(node.get("name", "without a name"))
+        raise CalibrationFileError(f"optic {label}: {error}") from None
+    for key, entry in node["parameters"].items():
+        _restore(optic, key, entry)
+    return optic
+
+
+def _restore(optic, key, entry):
+    """Give a parameter what its node says of it beside the value."""
+    # not through the class: its defaults may fix or bound otherwise than the calibration did
+    parameter = getattr(optic, key)
+    parameter.fixed = entry["fixed"]
+    parameter.bounds = tuple(entry["bounds"])
+    if "wavelength" in entry:
+        parameter.wavelength = np.array(entry["wavelength"]) * u.um
+    if "prior" in entry:
+        parameter.prior = prior_from_node(entry["prior"], f"{optic.name}.{key}")
+    if "law" in entry:
+        _restore_law(optic, key, entry["law"])
+
+
+def _restore_law(optic, key, node):
+    label, own = f"{optic.name}.{key}", node["coefficients"]
+    try:
+        unit = optic._declared(key).unit
+        law, found = law_of(label, unit, node["model"], node["of"], node.get("since"))
+        if set(own) != set(found):
+            raise ParameterError(f"{label}: its law has {', '.join(found)}")
+        new = [with_value(found[name], _value(own[name])) for name in found]
+    except ParameterError as error:
+        raise CalibrationFileError(f"law of {error}") from None
+    known = {name: tuple(ends) for name, ends in node["known"].items()}
+    optic._follow(key, replace(law, known=known), new)
+    for name, place in zip(found, law.names(key), strict=True):
+        _restore(optic, place, own[name])
+
+
+def _value(entry):
+    value = np.array(entry["value"], dtype=float)
+    return value * u.Unit(entry["unit"]) if "unit" in entry else value

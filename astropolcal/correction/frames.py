@@ -13,7 +13,7 @@ from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations
-from astropolcal.observations.pairing import pair_frames
+from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.pipeline.headers import describe
 

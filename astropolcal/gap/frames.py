@@ -22,7 +22,7 @@ from astropolcal.gap._frame_looks import Frame, Group, Look, Trial, angle_stages
 from astropolcal.gap.channels import noise, settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
-from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
+from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
 
 __all__ = []
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.model import Linear
-from astropolcal.observations.quality import clusters, runs_of_frames
+from astropolcal.observations.grid import clusters, runs_of_frames
 
 __all__ = []
 

@@ -22,19 +22,19 @@ from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.telescope import _normal, as_exact, behind_telescope, star_options
+from astropolcal.observations.grid import (
+    is_star,
+    mask_incomplete_cycles,
+    mask_saturated,
+    mask_unstable_lamp,
+    plain_source,
+)
 from astropolcal.observations.pointings import (
     TRACKING,
     angle_change,
     location_of,
     sky_angles,
     sky_positions,
-)
-from astropolcal.observations.quality import (
-    is_star,
-    mask_incomplete_cycles,
-    mask_saturated,
-    mask_unstable_lamp,
-    plain_source,
 )
 from astropolcal.observations.reading import common_wavelengths
 from astropolcal.words import check_choice

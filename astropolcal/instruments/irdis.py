@@ -28,8 +28,8 @@ from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentErr
 from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import FileLayout, side_by_side
 from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
+from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
-from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date, plain_number
 from astropolcal.words import check_choice, counted

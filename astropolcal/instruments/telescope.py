@@ -19,7 +19,7 @@ from astropolcal.exceptions import (
     ChainError,
     InstrumentError,
 )
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.grid import is_star
 from astropolcal.units import to_unit
 
 __all__ = []

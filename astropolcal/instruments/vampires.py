@@ -25,7 +25,7 @@ from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
-from astropolcal.observations.quality import is_star, mask_saturated
+from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 from astropolcal.words import check_choice
 

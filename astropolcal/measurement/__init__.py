@@ -4,8 +4,7 @@ Chains and observations as one fittable model with an analytic Jacobian.
 """
 
 from astropolcal.measurement.model import Measurement
-from astropolcal.measurement.parameters import Tie, parameter_table
-from astropolcal.measurement.priors import Normal
+from astropolcal.measurement.parameters import Normal, Tie, parameter_table
 
 __all__ = [
     "Measurement",

@@ -47,14 +47,16 @@ class Dataset:
         self.n_free = free.size
         # indices of this dataset's wavelengths on the grid common to all, (n_wavelengths,)
         self.bins = bins_on_grid(observations, wavelength)
-        self.frames = self._frames_of_data()
+        self.frames = self.observations.groups(self.observable.frames_per_datum)
         columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)
         self._node_weights = _node_weights(given, observations)
         #: Position of each stage in the frames of each datum, radian,
         #: (frames_per_datum, n_groups); the mean over the nodes of an exposure.
         self.positions = {
-            stage: _mean_over_nodes(angle)[columns].reshape(self.frames.T.shape)
+            stage: (angle.mean(axis=0) if angle.ndim == 2 else angle)[columns].reshape(
+                self.frames.T.shape
+            )
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
@@ -93,10 +95,6 @@ class Dataset:
 
     # ---- data ----------------------------------------------------------------
 
-    def _frames_of_data(self):
-        """Return the frames of each datum, shape (n_groups, frames_per_datum)."""
-        return self.observations.groups(self.observable.frames_per_datum)
-
     def _observe(self, columns):
         obs = self.observations
         # the table is (n_frames, n_wavelengths), an observable wants the frames of a datum first
@@ -127,9 +125,6 @@ class Dataset:
         """Turn (n_wavelengths, columns) into (frames_per_datum, n_wavelengths, n_groups)."""
         shape = (array.shape[0], self.frames.shape[1], self.frames.shape[0])
         return array.reshape(shape).transpose(1, 0, 2)
-
-    def _flat(self, array):
-        return array.transpose(1, 0, 2).reshape(array.shape[1], -1)
 
     def _fluxes(self, sweep):
         """Return the fluxes of a sweep, averaged over the nodes, in groups."""
@@ -196,7 +191,7 @@ class Dataset:
         """Return the derivative of the data to the flat vector, (n_free, n_data)."""
         right, left = self._fluxes(sweep)
         derivative = self.observable.derivative(right, left)
-        weights = [self._to_nodes(self._flat(d)) for d in derivative]
+        weights = [self._to_nodes(d.transpose(1, 0, 2).reshape(d.shape[1], -1)) for d in derivative]
         # backward sweep: d(datum)/d(parameter) = sum over frames and beams of
         # d(datum)/d(flux) * d(flux)/d(parameter), without ever building the fluxes' own Jacobian
         slopes = sweep.derivatives([key for key, *_ in self._live], weights)
@@ -283,10 +278,6 @@ def _node_weights(positions, observations):
     _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
     # Gauss-Legendre weights on (-1, 1) sum to 2, the length of that interval
     return weights / 2
-
-
-def _mean_over_nodes(angle):
-    return angle.mean(axis=0) if angle.ndim == 2 else angle
 
 
 def _at_nodes(angle, columns, n_nodes):

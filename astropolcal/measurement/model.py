@@ -147,11 +147,6 @@ class Measurement(FittableModel):
         # vector and sweeps of the last prediction: fitters ask for
         # data and Jacobian at the same point
         self._last = (None, None)
-        self._add_parameters()
-        super().__init__(name=name)
-
-    def _add_parameters(self):
-        """Give this instance its own scalar parameters (astropy has them on the class)."""
         self._param_names = tuple(self.free.labels)
         #: Factor of each parameter from its unit to the canonical one.
         self._factors = self.free.factors()
@@ -165,6 +160,7 @@ class Measurement(FittableModel):
             parameter.model = self
             self.__dict__[label] = parameter
         self.stand_at(self.free.start())
+        super().__init__(name=name)
 
     def __setattr__(self, attr, value):
         # astropy's own way to set a parameter searches all names, for each of the 93

@@ -197,12 +197,20 @@ def sky_angles(observations, location=None):
     if "altitude" in there and "parallactic" in there:
         angles = observations.position("altitude"), observations.position("parallactic")
     else:
-        angles = _computed(observations, location)
-    _check_altitude(observations, angles[0])
-    return angles
-
-
-def _check_altitude(observations, altitude):
+        time, target = _times(observations), _target(observations)
+        needed = {
+            "a column time": time,
+            "right_ascension and declination": target,
+            "a site": location,
+        }
+        lacking = [words for words, thing in needed.items() if thing is None]
+        if lacking:
+            raise ObservationError(
+                f"{observations.name}: a star needs its pointing: columns altitude and "
+                f"parallactic, or all of {', '.join(needed)}; missing: {', '.join(lacking)}"
+            )
+        angles = tuple(angle.to_value(u.rad) for angle in pointing(target, time, location))
+    altitude = angles[0]
     low = altitude <= 0
     if low.any():
         frame = int(np.argmax(low))
@@ -210,18 +218,7 @@ def _check_altitude(observations, altitude):
             f"{observations.name}, frame {observations.frames['frame'][frame]}: altitude = "
             f"{np.rad2deg(altitude[frame]):.4g} deg; a star is above 0 deg"
         )
-
-
-def _computed(observations, location):
-    time, target = _times(observations), _target(observations)
-    needed = {"a column time": time, "right_ascension and declination": target, "a site": location}
-    lacking = [words for words, thing in needed.items() if thing is None]
-    if lacking:
-        raise ObservationError(
-            f"{observations.name}: a star needs its pointing: columns altitude and parallactic, "
-            f"or all of {', '.join(needed)}; missing: {', '.join(lacking)}"
-        )
-    return tuple(angle.to_value(u.rad) for angle in pointing(target, time, location))
+    return angles
 
 
 def _times(observations):

@@ -118,21 +118,18 @@ def check_table(table, label, required):
     if len(table) == 0:
         raise ObservationError(f"{label}: the table is empty, at least one row is needed")
     for name in table.colnames:
-        _check_plain(table[name], name, label)
+        column = table[name]
+        dtype = getattr(column, "dtype", None)
+        # objects and structures hold anything: there is no value that could be checked
+        if dtype is not None and dtype.kind in "OV":
+            raise ObservationError(
+                f"{label}: column {name} has type {dtype}; allowed are numbers, strings and times"
+            )
+        if getattr(column, "shape", (0,))[1:]:
+            raise ObservationError(
+                f"{label}: column {name} has shape {column.shape}, one value per row is allowed"
+            )
     return table if isinstance(table, QTable) else QTable(table, copy=False)
-
-
-def _check_plain(column, name, label):
-    dtype = getattr(column, "dtype", None)
-    # objects and structures hold anything: there is no value that could be checked
-    if dtype is not None and dtype.kind in "OV":
-        raise ObservationError(
-            f"{label}: column {name} has type {dtype}; allowed are numbers, strings and times"
-        )
-    if getattr(column, "shape", (0,))[1:]:
-        raise ObservationError(
-            f"{label}: column {name} has shape {column.shape}, one value per row is allowed"
-        )
 
 
 def stated_date(meta, label, error=ObservationError):

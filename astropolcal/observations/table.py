@@ -15,7 +15,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new, one_line
 from astropolcal.observations.grid import beam_variances, build_grid
-from astropolcal.observations.pairing import PAIRINGS, frame_groups
+from astropolcal.observations.observables import PAIRINGS, frame_groups
 from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
     complete_table,
@@ -92,9 +92,6 @@ class Observations:
         # found when they are first asked for, and kept
         self._groups, self._hash = {}, None
         self._mask = grid.reason > 0
-        self._freeze()
-
-    def _freeze(self):
         grid = self._grid
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
         # groups and hash are kept, so that what they were made of must not change

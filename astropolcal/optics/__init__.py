@@ -19,6 +19,8 @@ from astropolcal.optics.modulated import (
     HarmonicRetarder,
     HarmonicRotator,
     PolarizedBackground,
+    StateAnalyser,
+    StateRetarder,
     StrayLight,
 )
 from astropolcal.optics.perturbations import GENERATORS, MuellerElement, Perturbation
@@ -38,7 +40,6 @@ from astropolcal.optics.retarders import (
     TwoLayerWaveplate,
 )
 from astropolcal.optics.sources import Light, PolarizedSource, StarSource
-from astropolcal.optics.states import StateAnalyser, StateRetarder
 
 __all__ = [
     "COORDINATES",

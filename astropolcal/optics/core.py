@@ -487,10 +487,6 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             getattr(self, key).at(lam, value)
             for key, value in zip(self.param_names, values, strict=True)
         ]
-        self._check_grid(lam, values)
-        return values
-
-    def _check_grid(self, lam, values):
         for key, value in zip(self.param_names, values, strict=True):
             # wavelengths are the last axis; a single value holds at all of them
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
@@ -499,6 +495,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
+        return values
 
     def _oriented(self, dispersion, angle, values):
         matrix = self._matrix(dispersion, *values)

@@ -343,7 +343,7 @@ class LightCurve(Curve):
                     # T(-theta) M T(theta) by theta, and M by the other parameters
                     _turning(inward, entered) - _turning(row, left),
                     *(
-                        _product(row, _act(slope, entered))
+                        np.einsum("...i,...i", row, _act(slope, entered))
                         for slope in optic._derivatives(dispersion, *own)
                     ),
                 ]
@@ -429,7 +429,3 @@ def _act(matrix, light):
 def _turning(row, light):
     """Return row times the derivative of T(theta) to theta, at theta = 0, times light."""
     return 2 * (plane(row).conjugate() * plane(light)).imag
-
-
-def _product(row, light):
-    return np.einsum("...i,...i", row, light)

@@ -191,7 +191,15 @@ def law_of(label, unit, model, of, since=None):
         unit,
         None if since is None else float(mjd_of(since, "since")),
     )
-    _hold_constant(law, found)
+    inputs = [np.roll(_PROBES, i) for i in range(len(law.of))]
+    numbers = [np.ravel(p.value)[0] for p in found.values()]
+    for i, parameter in enumerate(found.values()):
+        with np.errstate(all="ignore"):
+            moved = [*numbers[:i], numbers[i] + 1.0, *numbers[i + 1 :]]
+            change = law.model.evaluate(*inputs, *moved) - law.model.evaluate(*inputs, *numbers)
+        change = np.broadcast_to(change, _PROBES.shape)
+        if np.all(change != 0) and np.ptp(change) < 1e-6 * np.abs(change).max():
+            parameter.fixed = True
     return law, found
 
 
@@ -214,16 +222,3 @@ def _coefficient(label, given, unit):
     )
     new.prior = given.prior
     return new
-
-
-def _hold_constant(law, found):
-    """Hold the coefficient that does the same everywhere: the parameter itself does that."""
-    inputs = [np.roll(_PROBES, i) for i in range(len(law.of))]
-    numbers = [np.ravel(p.value)[0] for p in found.values()]
-    for i, parameter in enumerate(found.values()):
-        with np.errstate(all="ignore"):
-            moved = [*numbers[:i], numbers[i] + 1.0, *numbers[i + 1 :]]
-            change = law.model.evaluate(*inputs, *moved) - law.model.evaluate(*inputs, *numbers)
-        change = np.broadcast_to(change, _PROBES.shape)
-        if np.all(change != 0) and np.ptp(change) < 1e-6 * np.abs(change).max():
-            parameter.fixed = True

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal import instruments
-from astropolcal.calibration.result.validity import (
+from astropolcal.calibration.result.calibration import (
     _dates,
     _moment,
     beam_words,

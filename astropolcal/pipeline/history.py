@@ -16,7 +16,7 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import calibrate
-from astropolcal.calibration.result.validity import instrument_of, validity_of
+from astropolcal.calibration.result.calibration import instrument_of, validity_of
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash

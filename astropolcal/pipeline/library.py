@@ -29,7 +29,7 @@ import numpy as np
 from astropy.table import Table
 
 from astropolcal import instruments
-from astropolcal.calibration.result.validity import (
+from astropolcal.calibration.result.calibration import (
     Validity,
     _moment,
     beam_words,

@@ -14,8 +14,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration.result.calibration import Calibration
-from astropolcal.calibration.result.validity import instrument_of, validity_of
+from astropolcal.calibration.result.calibration import Calibration, instrument_of, validity_of
 from astropolcal.calibration.system import (
     MuellerMatrices,
     at_wavelengths,

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.time import Time
 
 from astropolcal.calibration.fit.evidence import COURSES, moment_of
-from astropolcal.calibration.result.validity import instrument_of
+from astropolcal.calibration.result.calibration import instrument_of
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument

@@ -102,7 +102,7 @@ def courses(calibrations, parameters=None, *, events=()):
 
 
 def _dates(named):
-    from astropolcal.calibration.result.validity import validity_of
+    from astropolcal.calibration.result.calibration import validity_of
 
     told = [validity_of(calibration).valid_from for _, calibration in named]
     for (name, _), date in zip(named, told, strict=True):

@@ -64,7 +64,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     Notes
     -----
     Definitions as in `~astropolcal.calibration.validation.cross_validation.accuracy_table` and
-    `~astropolcal.calibration.validation.held_out.standard_accuracy`; ``s_mean`` is s_rel of
+    `~astropolcal.calibration.validation.cross_validation.standard_accuracy`; ``s_mean`` is s_rel of
     McIntosh et al. (2026, Sec. 2.3).
 
     Examples

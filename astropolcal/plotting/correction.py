@@ -174,7 +174,17 @@ def plot_spectrum(corrected, *, figure=None):
             _values(top, nm, corrected, name)
         top.axhline(0, color=st.GREY, linewidth=0.8)
         top.set_ylabel("fraction of I (%)")
-        _error_lines(middle, nm, corrected)
+        known = corrected.polarization()
+        errors = [100 * known[f"s_p_{kind}"] for kind in ("statistical", "systematic")]
+        for values, label, look in zip(errors, ("statistical", "systematic"), _LINES, strict=True):
+            if np.isfinite(values).any():
+                middle.plot(nm, values, look[0], color=look[1], label=f"$s_p$, {label}")
+        middle.set_ylabel("error of the degree (%)")
+        if middle.lines:
+            middle.set_yscale("log")
+            st.plain_numbers(middle)
+        else:
+            st.note(middle, "no errors are known")
         bottom.plot(nm, corrected.condition, "o-", color=st.PURPLE)
         bottom.set_ylabel("condition")
         if np.nanmax(corrected.condition) >= 1e3:
@@ -213,17 +223,3 @@ def _values(axes, nm, corrected, name):
     if (known := np.isfinite(systematic)).any():
         band = np.where(known, systematic, np.nan)
         st.draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")
-
-
-def _error_lines(axes, nm, corrected):
-    known = corrected.polarization()
-    errors = [100 * known[f"s_p_{kind}"] for kind in ("statistical", "systematic")]
-    for values, label, look in zip(errors, ("statistical", "systematic"), _LINES, strict=True):
-        if np.isfinite(values).any():
-            axes.plot(nm, values, look[0], color=look[1], label=f"$s_p$, {label}")
-    axes.set_ylabel("error of the degree (%)")
-    if axes.lines:
-        axes.set_yscale("log")
-        st.plain_numbers(axes)
-    else:
-        st.note(axes, "no errors are known")

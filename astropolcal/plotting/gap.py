@@ -382,7 +382,14 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     at the middle wavelength with its 68 % band, and the frames as marks. One panel for each
     parameter that changes with the wavelength; crosses mark where the data do not tell the size.
     """
-    sizes = _sizes_by_wavelength(diagnosis, effect)
+    names = [cause.name for cause in diagnosis.causes]
+    if effect not in names:
+        raise ParameterError(f"effect = {effect!r} is not a cause; these are: {', '.join(names)}")
+    if diagnosis.content is None:
+        sizes = Fitted(diagnosis.improved).sizes(effect)
+    else:
+        sizes = diagnosis.content["causes"][names.index(effect)]["size"]
+    sizes = {name: size for name, size in sizes.items() if _varies(size["value"])}
     panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
@@ -397,17 +404,6 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
             axes.set_ylabel(_label(diagnosis, effect, name, size["unit"]))
             st.wavelength_label(axes)
     return figure
-
-
-def _sizes_by_wavelength(diagnosis, effect):
-    names = [cause.name for cause in diagnosis.causes]
-    if effect not in names:
-        raise ParameterError(f"effect = {effect!r} is not a cause; these are: {', '.join(names)}")
-    if diagnosis.content is None:
-        sizes = Fitted(diagnosis.improved).sizes(effect)
-    else:
-        sizes = diagnosis.content["causes"][names.index(effect)]["size"]
-    return {name: size for name, size in sizes.items() if _varies(size["value"])}
 
 
 def _varies(value):
@@ -490,7 +486,16 @@ def _curve_panel(axes, diagnosis, effect):
         axes.plot(x, value, color=st.BLUE)
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
-    axes.set_xlabel(_driver_label(dependence))
+    stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
+    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    axes.set_xlabel(
+        {
+            "harmonic": f"angle of the {stage} (deg)",
+            "direction": f"last move of the {stage}",
+            "move": f"last move of the {stage} (deg)",
+        }.get(dependence.kind)
+        or _DRIVERS[dependence.driver]
+    )
     nm = 1000 * problem.wavelength[middle]
     axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
 
@@ -500,16 +505,6 @@ def _positions(dataset, driver):
     given = dataset._given.get(driver)
     given = dataset.observations.position(driver) if given is None else given
     return given.mean(axis=0) if given.ndim == 2 else given
-
-
-def _driver_label(dependence):
-    stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = {"hwp": "half-wave plate"}.get(stage, stage)
-    return {
-        "harmonic": f"angle of the {stage} (deg)",
-        "direction": f"last move of the {stage}",
-        "move": f"last move of the {stage} (deg)",
-    }.get(dependence.kind) or _DRIVERS[dependence.driver]
 
 
 def _size_panel(axes, nm, size, absent):

@@ -8,7 +8,7 @@ from itertools import pairwise
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.identifiability.ambiguities import _POOR, SETS, harmonic_conditions
+from astropolcal.calibration.identifiability.analysis import _POOR, SETS, harmonic_conditions
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
@@ -440,8 +440,13 @@ def plot_correlations(calibration, *, figure=None):
         if not groups:
             _say(axes, "no parameter has an error by itself")
             return figure
-        edges = _edges(groups)
-        image = _draw_matrix(axes, edges, matrix)
+        several = any(count > 1 for _, count in groups)
+        widths = [np.full(n, _WIDE if n == 1 and several else 1.0) for _, n in groups]
+        edges = np.concatenate([[0.0], np.cumsum(np.concatenate(widths))])
+        axes.grid(False)
+        look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
+        image = axes.pcolormesh(edges, edges, matrix, **look)
+        axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
         _name_groups(axes, edges, groups)
         middles = (edges[1:] + edges[:-1]) / 2
         for i, j in zip(*np.nonzero(np.isfinite(matrix)), strict=True):
@@ -459,21 +464,6 @@ def _by_stem(names, which):
 
 def _labels(groups):
     return [f"{stem} ({count})" if count > 1 else stem for stem, count in groups]
-
-
-def _edges(groups):
-    """Return the borders of all cells; a parameter that stands alone is wider."""
-    several = any(count > 1 for _, count in groups)
-    widths = [np.full(n, _WIDE if n == 1 and several else 1.0) for _, n in groups]
-    return np.concatenate([[0.0], np.cumsum(np.concatenate(widths))])
-
-
-def _draw_matrix(axes, edges, matrix):
-    axes.grid(False)
-    look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
-    image = axes.pcolormesh(edges, edges, matrix, **look)
-    axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
-    return image
 
 
 def _name_groups(axes, edges, groups):

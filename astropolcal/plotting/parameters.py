@@ -146,16 +146,6 @@ def _words(own):
             yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
 
 
-def _mark_half_wave(axes):
-    """Draw the line of a perfect half-wave plate where the data come near to it."""
-    # the limits of the data, not of the axes, which a line would widen
-    low, high = axes.dataLim.intervaly
-    for half in (180, -180):
-        if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
-            look = {"color": st.BLACK, "linestyle": "--", "linewidth": 1}
-            axes.axhline(half, label="half wave (±180°)", **look)
-
-
 # ---- legend -----------------------------------------------------------------------
 
 
@@ -261,7 +251,11 @@ def plot_retardances(calibration, *, figure=None):
             axes.set_title(f"{leaf.name}: {key}")
         else:
             _draw_law(axes, calibration, leaf, known, look)
-        _mark_half_wave(axes)
+        low, high = axes.dataLim.intervaly
+        for half in (180, -180):
+            if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
+                look = {"color": st.BLACK, "linestyle": "--", "linewidth": 1}
+                axes.axhline(half, label="half wave (±180°)", **look)
         axes.set_ylabel(f"{_RETARDANCES[key]} (°)")
 
     return _draw_all(figure, calibration, "Retardances", panels, draw)
@@ -480,7 +474,12 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
             lowest.tick_params(labelbottom=True)
             st.wavelength_label(lowest)
         st.heading(figure, calibration, "Mirrors")
-        _mirror_legend(figure, panels)
+        entries = st.legend_entries(panels.ravel())
+        # sorting is stable: what was calibrated stays in its order, the metals come last
+        for label in sorted(entries, key=lambda label: label in METALS):
+            handle = entries[label] = entries.pop(label)
+            handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
+        st.legend_outside(figure, list(entries.values()), columns=2)
     return figure
 
 
@@ -512,15 +511,6 @@ def _draw_mirror(axes, calibration, table, key, reference):
     line = "-" if known else (0, (5, 1))
     axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=st.BLUE)
     st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
-
-
-def _mirror_legend(figure, panels):
-    entries = st.legend_entries(panels.ravel())
-    # sorting is stable: what was calibrated stays in its order, the metals come last
-    for label in sorted(entries, key=lambda label: label in METALS):
-        handle = entries[label] = entries.pop(label)
-        handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
-    st.legend_outside(figure, list(entries.values()), columns=2)
 
 
 # ---- history --------------------------------------------------------------------------------

@@ -225,7 +225,21 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     with canvas(figure, 10, 1.6 + 1.7 * len(columns)) as figure:
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
-            _trace(trace, posterior, column)
+            chain, steps = posterior.chain[:, :, column], posterior.steps
+            # the larger of both strides keeps either limit
+            every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
+            trace.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
+            trace.plot(
+                steps[::every], np.median(chain[::every], axis=1), color=BLACK, linewidth=1.0
+            )
+            if posterior.burn_in:
+                # steps are counted before thinning
+                trace.axvspan(
+                    0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0
+                )
+            # the chain begins at the axis, so that a burn-in is seen as such
+            trace.margins(x=0)
+            trace.set_ylabel(_label(posterior, column), fontsize=9.5)
             beside(right, posterior, column)
         burn_in = "burn-in left out" if thinned else "grey: burn-in, left out"
         _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
@@ -244,20 +258,6 @@ def _join(panels, title, label):
     for axes in panels[:-1]:
         axes.sharex(panels[-1])
         axes.tick_params(labelbottom=False)
-
-
-def _trace(axes, posterior, column):
-    chain, steps = posterior.chain[:, :, column], posterior.steps
-    # the larger of both strides keeps either limit
-    every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
-    axes.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
-    axes.plot(steps[::every], np.median(chain[::every], axis=1), color=BLACK, linewidth=1.0)
-    if posterior.burn_in:
-        # steps are counted before thinning
-        axes.axvspan(0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0)
-    # the chain begins at the axis, so that a burn-in is seen as such
-    axes.margins(x=0)
-    axes.set_ylabel(_label(posterior, column), fontsize=9.5)
 
 
 def _histogram(axes, posterior, column):

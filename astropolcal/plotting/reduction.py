@@ -117,7 +117,14 @@ def _draw_frame(panel, index, reduction, k):
     if reduction.source == "star":
         _draw_circles(panel, frame.photometry, k, reduction.options.get("annulus", 5.0))
     else:
-        _draw_rectangles(panel, layout)
+        from matplotlib.patches import Rectangle
+
+        left, right, width, height, angle = layout.internal_apertures
+        for name, (x, y) in (("right", right), ("left", left)):
+            look = {"fill": False, "ec": _COLORS[name], "ls": _LINES[name], "lw": 1.6}
+            look |= {"angle": np.rad2deg(angle), "rotation_point": "center"}
+            # matplotlib counts from a corner, the layout from the centre
+            panel.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, **look))
     reason = frame.photometry.reasons[k]
     label = f"frame {index}: hwp {frame.values['hwp']:g}°, der. {frame.values['derotator']:.4g}°"
     panel.set_title(label + (f"\nMASKED: {reason}" if reason else ""), fontsize=9)
@@ -150,17 +157,6 @@ def _draw_circles(panel, photometry, k, annulus):
             look = {"fill": False, "ec": _COLORS[name]}
             panel.add_patch(Circle((x, y), r, ls=_LINES[name], lw=1.6, **look))
             panel.add_patch(Circle((x, y), r + annulus, ls=":", lw=1.2, **look))
-
-
-def _draw_rectangles(panel, layout):
-    from matplotlib.patches import Rectangle
-
-    left, right, width, height, angle = layout.internal_apertures
-    for name, (x, y) in (("right", right), ("left", left)):
-        look = {"fill": False, "ec": _COLORS[name], "ls": _LINES[name], "lw": 1.6}
-        look |= {"angle": np.rad2deg(angle), "rotation_point": "center"}
-        # matplotlib counts from a corner, the layout from the centre
-        panel.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, **look))
 
 
 def plot_run(reduction, *, wavelength=None, figure=None):

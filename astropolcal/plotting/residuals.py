@@ -8,7 +8,7 @@ import numpy as np
 
 from astropolcal.chain import stages, standing
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
-from astropolcal.observations.quality import clusters, is_star
+from astropolcal.observations.grid import clusters, is_star
 from astropolcal.plotting import _style as st
 from astropolcal.propagation import Propagator
 
@@ -238,7 +238,14 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
-            _draw_heading(pair, drawn.wavelength[row], spread[row])
+            wavelength = drawn.wavelength[row]
+            s_res = spread[row]
+            top, bottom = pair
+            bottom.axhline(0, color=st.GREY, linewidth=1)
+            known = np.isfinite(s_res)
+            top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
+            if known:
+                bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
             for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
                 _draw_series(pair, drawn, row, one, look)
                 if curve is not None:
@@ -271,15 +278,6 @@ def _looks(count):
         | {"markerfacecolor": "white" if again else color, "linestyle": "--" if again else "-"}
         for (color, marker), again in pairs
     ]
-
-
-def _draw_heading(pair, wavelength, s_res):
-    top, bottom = pair
-    bottom.axhline(0, color=st.GREY, linewidth=1)
-    known = np.isfinite(s_res)
-    top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
-    if known:
-        bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
 
 
 def _draw_series(pair, grid, row, one, look):

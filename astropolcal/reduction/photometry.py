@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.observations.quality import MAD_TO_SIGMA
+from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.words import check_choice
 
 __all__ = []

@@ -21,7 +21,7 @@ import numpy as np
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame

@@ -16,7 +16,7 @@ from numpy.polynomial.legendre import legvander
 from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.observations.quality import MAD_TO_SIGMA
+from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.reduction.finding import find_images, find_pair, fit_gaussians
 from astropolcal.reduction.photometry import Photometry, flux_variance, shared_pixels
 from astropolcal.reduction.wings import wing_shares

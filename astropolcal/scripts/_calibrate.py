@@ -85,7 +85,7 @@ files FILE * Input  observation tables (ECSV)
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
     from astropolcal.calibration.result.summary import to_dict
-    from astropolcal.calibration.validation.held_out import add_standard
+    from astropolcal.calibration.validation.cross_validation import add_standard
     from astropolcal.calibration.validation.stars import add_star_check
     from astropolcal.calibration.validation.targets import TARGETS
     from astropolcal.observations.observables import get_observable
@@ -157,7 +157,7 @@ def _tell(arguments, calibration, targets, written):
 def _is_known(observations):
     """Return whether a table is of a star whose polarization the catalogue knows."""
     from astropolcal import standards
-    from astropolcal.observations.quality import is_star
+    from astropolcal.observations.grid import is_star
 
     if not is_star(observations.source):
         return False

@@ -96,7 +96,7 @@ def _installation():
 
 def _calibration(path, arguments):
     from astropolcal.calibration import Calibration
-    from astropolcal.calibration.result.validity import validity_of
+    from astropolcal.calibration.result.calibration import validity_of
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines
     from astropolcal.converters.calibration import content_hash
     from astropolcal.scripts._ending import written_lines

@@ -10,8 +10,8 @@ well the polarization of a star is known. `SerkowskiLaw` is the wavelength
 dependence of interstellar polarization as an astropy model.
 """
 
-from astropolcal.standards.catalogues import StandardStar, catalogue, get, names
 from astropolcal.standards.law import SerkowskiLaw, whittet_width
+from astropolcal.standards.priors import StandardStar, catalogue, get, names
 from astropolcal.standards.visibility import (
     Observability,
     TelescopeInformation,

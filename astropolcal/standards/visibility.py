@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
-from astropolcal.standards.catalogues import StandardStar, check_kind, get, names
+from astropolcal.standards.priors import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
 from astropolcal.words import did_you_mean
 
@@ -61,7 +61,12 @@ def night_times(site, night, *, twilight, step):
     """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
     with offline():
         # from noon to noon, so that a night is never cut in two whatever the longitude
-        times = _evening_noon(site, night) + np.arange(0, 1, step.to_value(u.day)) * u.day
+        date = Time(date_of(night), scale="utc")
+        # a time of its own, which is printed to the second
+        noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
+        times = (noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day) + np.arange(
+            0, 1, step.to_value(u.day)
+        ) * u.day
         sun = get_sun(times).transform_to(AltAz(obstime=times, location=site)).alt
     dark = sun < twilight
     if not np.any(dark):
@@ -70,15 +75,6 @@ def night_times(site, night, *, twilight, step):
             f"at this site; it gets to {sun.min().to_value(u.deg):.1f} deg"
         )
     return times[dark]
-
-
-def _evening_noon(site, night):
-    """Return the local mean noon of the date on which the night begins."""
-    date = Time(date_of(night), scale="utc")
-    # a time of its own, which is printed to the second
-    noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
-    # local mean noon is 12 h UTC minus the east longitude
-    return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
 
 
 def date_of(night):
@@ -608,20 +604,16 @@ def _degree(star, band):
     if band is not None and band in table["band"]:
         table = table[table["band"] == band]
     elif star.law is not None and (band is not None or not len(table)):
-        return _from_law(star, band)
+        place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
+        wavelength = place.get(band, 0.55) * u.um
+        q, stokes_u, covariance = star.stokes(wavelength)
+        # the error of the degree is that along the direction of polarization in the (q, u) plane
+        along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
+        # where the angle alone is uncertain rounding may leave less than zero
+        error = np.sqrt(max(along @ covariance @ along, 0.0))
+        return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
     at = int(np.argmin(np.abs(table["wavelength"] - 0.55 * u.um)))
     return table["p"][at].to_value(u.percent), table["p_err"][at].to_value(u.percent)
-
-
-def _from_law(star, band):
-    place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
-    wavelength = place.get(band, 0.55) * u.um
-    q, stokes_u, covariance = star.stokes(wavelength)
-    # the error of the degree is that along the direction of polarization in the (q, u) plane
-    along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
-    # where the angle alone is uncertain rounding may leave less than zero
-    error = np.sqrt(max(along @ covariance @ along, 0.0))
-    return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
 
 
 def _observable(table, site, night, min_altitude):
@@ -639,12 +631,6 @@ def _observable(table, site, night, min_altitude):
         Observability(str(name), place, date_of(night), limit, night_table(times, a, p, limit))
         for name, a, p in zip(found["name"], altitude[up], parallactic[up], strict=True)
     ]
-    _add_night(found, seen)
-    found.sort(["m3_score", "name"])
-    return found
-
-
-def _add_night(found, seen):
     for name in ("altitude", "parallactic"):
         ranges = u.Quantity([getattr(s, name) for s in seen] or np.zeros((0, 2)), u.deg)
         found[f"{name}_min"], found[f"{name}_max"] = ranges[:, 0], ranges[:, 1]
@@ -657,3 +643,5 @@ def _add_night(found, seen):
     for name in found.colnames:
         if name in _FORMATS:
             found[name].info.format = _FORMATS[name]
+    found.sort(["m3_score", "name"])
+    return found

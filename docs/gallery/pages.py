@@ -15,7 +15,7 @@ from numpydoc.docscrape import NumpyDocString
 
 from astropolcal import optics
 from astropolcal.chain import leaves
-from astropolcal.converters.optics import node_from_optic
+from astropolcal.converters.nodes import node_from_optic
 from astropolcal.gap.effects import EFFECTS, Context, Effect
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import OPTICS

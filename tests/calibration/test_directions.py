@@ -23,8 +23,7 @@ from astropolcal.calibration.identifiability.linearized import (
     step_of,
 )
 from astropolcal.measurement import Normal
-from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.measurement.priors import Uniform
+from astropolcal.measurement.parameters import FreeParameters, Uniform
 
 N = 3
 NAMES = ["polarizer.theta", "hwp.w_sio2", *(f"retarder.retardance[{i}]" for i in range(N))]

@@ -20,7 +20,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.measurement import Normal, Tie
-from astropolcal.measurement.priors import Uniform
+from astropolcal.measurement.parameters import Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
@@ -467,7 +467,7 @@ def test_prior_of_an_unknown_kind_is_refused():
 
 def test_unreadable_date_of_an_older_file_is_refused(content, path, monkeypatch):
     """Such files could be written once; they would hold from any date on."""
-    from astropolcal.calibration.result.validity import validity_of
+    from astropolcal.calibration.result.calibration import validity_of
     from astropolcal.converters import calibration as converter
     from astropolcal.pipeline import Library
 

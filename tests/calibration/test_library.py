@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration.result.validity import Validity, validity_of, with_validity
+from astropolcal.calibration.result.calibration import Validity, validity_of, with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.pipeline import fetch, import_context

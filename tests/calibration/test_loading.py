@@ -13,7 +13,7 @@ from astropy.io import fits
 
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import propagate
-from astropolcal.calibration.result.validity import with_validity
+from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     join,
@@ -587,7 +587,7 @@ for module, owners in packages_distributions().items():
 assert {"matplotlib", "photutils", "specutils", "jinja2", "scipy"} <= set(blocked), blocked
 
 from astropolcal.pipeline.loading import load
-from astropolcal.calibration.result.validity import with_validity
+from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 header = {"INSTRUME": "CHARIS", "MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0,
           "FILTNAME": "broadband JHK"}

@@ -11,7 +11,7 @@ from astropy.time import Time
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import with_validity
-from astropolcal.calibration.result.validity import (
+from astropolcal.calibration.result.calibration import (
     Validity,
     beam_words,
     instrument_of,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.calibration import examine
-from astropolcal.calibration.identifiability.ambiguities import (
+from astropolcal.calibration.identifiability.analysis import (
     harmonic_conditions,
     harmonic_words,
     mirror_branches,

@@ -25,7 +25,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.measurement import Normal
-from astropolcal.measurement.priors import Uniform
+from astropolcal.measurement.parameters import Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NOISE = 0.01

@@ -10,7 +10,7 @@ from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.calibration import examine, target_accuracies
-from astropolcal.calibration.identifiability.ambiguities import (
+from astropolcal.calibration.identifiability.analysis import (
     _best_star,
     mirror_branches,
     star_words,

@@ -9,7 +9,7 @@ import pytest
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration.result.summary import summary, to_dict
-from astropolcal.calibration.validation.held_out import (
+from astropolcal.calibration.validation.cross_validation import (
     add_standard,
     refuse_fitted,
     standard_accuracy,

@@ -12,7 +12,7 @@ from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 from astropolcal import calibrate
 from astropolcal.calibration import fitted_stars, star_check
 from astropolcal.calibration.validation import paper_accuracies, star_accuracy, star_stokes
-from astropolcal.calibration.validation.held_out import standard_accuracy
+from astropolcal.calibration.validation.cross_validation import standard_accuracy
 from astropolcal.chain import leaves, replace_optic
 from astropolcal.exceptions import AstropolcalWarning, ChainError, FitError
 from astropolcal.instruments.telescope import published_mirror

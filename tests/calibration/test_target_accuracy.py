@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from astropolcal.calibration import Calibration, calibrate, four_accuracies
 from astropolcal.calibration.noise.scatter import GROUPS, groups_by, leave_out_groups
 from astropolcal.calibration.validation import paper_accuracies, target_accuracy
-from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
-from astropolcal.calibration.validation.held_out import add_standard
+from astropolcal.calibration.validation.cross_validation import (
+    add_standard,
+    cross_validated_residuals,
+)
 from astropolcal.calibration.validation.targets import absolute_accuracy, propagate_accuracy
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement

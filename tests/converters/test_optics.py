@@ -15,7 +15,7 @@ from scipy.stats import norm
 from astropolcal import optics
 from astropolcal.chain import at_positions, leaves
 from astropolcal.converters.extension import OPTIC_MODULES, OpticConverter, optic_tag
-from astropolcal.converters.optics import (
+from astropolcal.converters.nodes import (
     node_from_optic,
     optic_from_node,
 )

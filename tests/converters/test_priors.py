@@ -10,7 +10,7 @@ from astropolcal import optics
 from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.measurement import Normal
-from astropolcal.measurement.priors import Uniform
+from astropolcal.measurement.parameters import Uniform
 
 
 def chain(**priors):

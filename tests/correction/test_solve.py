@@ -20,7 +20,7 @@ def ideal(hwp, wavelengths=1):
 
 
 def pairs_of(hwp):
-    from astropolcal.observations.pairing import pair_frames
+    from astropolcal.observations.observables import pair_frames
 
     return pair_frames(hwp)
 

@@ -206,8 +206,7 @@ def _digest(cal):
 def _content(node):
     """Return what the node of a calibration says, whatever type its numbers have."""
     from astropolcal.converters.calibration import _DERIVED
-    from astropolcal.converters.nodes import _spelled
-    from astropolcal.converters.optics import node_from_optic
+    from astropolcal.converters.nodes import _spelled, node_from_optic
 
     def plain(value):
         if isinstance(value, dict) and set(value) == {"float"}:

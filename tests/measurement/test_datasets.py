@@ -9,8 +9,7 @@ from astropolcal import optics
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.measurement.datasets import as_pairs
-from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.measurement.priors import Uniform, bind_prior
+from astropolcal.measurement.parameters import FreeParameters, Uniform, bind_prior
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

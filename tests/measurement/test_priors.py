@@ -11,8 +11,7 @@ from scipy import stats
 from astropolcal import optics
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import Measurement, Normal
-from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.measurement.priors import Uniform, bind_prior
+from astropolcal.measurement.parameters import FreeParameters, Uniform, bind_prior
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 DISTRIBUTIONS = [

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pairing import pair_frames
+from astropolcal.observations.observables import pair_frames
 
 CYCLE = [0.0, 45.0, 22.5, 67.5]
 
@@ -199,7 +199,7 @@ def test_long_tables_are_paired_as_short_ones(monkeypatch):
     """Neighbours in time first: where cycles are complete nothing changes."""
     hwp, derotator = cycles(2400, np.random.default_rng(1))
     long = pair_frames(hwp * u.deg, derotator * u.deg)
-    monkeypatch.setattr("astropolcal.observations.pairing._SMALL", 10_000)
+    monkeypatch.setattr("astropolcal.observations.observables._SMALL", 10_000)
     whole = pair_frames(hwp * u.deg, derotator * u.deg)
     assert len(long) == 1200
     np.testing.assert_array_equal(long, whole)

@@ -10,7 +10,7 @@ import pytest
 from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations
-from astropolcal.observations.quality import (
+from astropolcal.observations.grid import (
     brightness,
     clusters,
     cycle_numbers,

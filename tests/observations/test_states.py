@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations, example_table
-from astropolcal.observations.pairing import pair_states, quadruples
+from astropolcal.observations.observables import pair_states, quadruples
 
 AB = [0, 1]
 

@@ -9,8 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import Calibration
-from astropolcal.calibration.identifiability.ambiguities import harmonic_conditions
-from astropolcal.calibration.identifiability.analysis import Identifiability
+from astropolcal.calibration.identifiability.analysis import Identifiability, harmonic_conditions
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.calibration.uncertainty.refits import Resampled
 from astropolcal.exceptions import ParameterError

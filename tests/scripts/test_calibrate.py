@@ -14,7 +14,7 @@ from star_data import observe_star, star_chain
 import astropolcal
 from astropolcal import Calibration, Observations, calibrate, instruments, standards
 from astropolcal.calibration.noise.scatter import GROUPS
-from astropolcal.calibration.validation.held_out import standard_accuracy
+from astropolcal.calibration.validation.cross_validation import standard_accuracy
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.scripts._calibrate import _target
 from astropolcal.scripts.main import build_parser, main

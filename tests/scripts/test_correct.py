@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration.result.validity import with_validity
+from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.correction import Corrected
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
@@ -175,7 +175,7 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
 @pytest.mark.slow
 def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
-    from astropolcal.calibration.result.validity import with_validity
+    from astropolcal.calibration.result.calibration import with_validity
 
     old = with_validity(Calibration.read(night / "charis.asdf"), valid_from="2026-01-01")
     old.write(tmp_path / "old.asdf")
@@ -576,7 +576,7 @@ def test_mode_that_is_stated_is_that_of_the_file(frames_with, tmp_path):
 
 
 def test_mode_is_not_compared_where_the_file_holds_for_any(frames_with, monkeypatch):
-    from astropolcal.calibration.result.validity import Validity
+    from astropolcal.calibration.result.calibration import Validity
     from astropolcal.pipeline import headers
 
     monkeypatch.setattr(headers, "validity_of", lambda _: Validity("charis"))

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 
 from astropolcal import Calibration, instruments, optics
-from astropolcal.calibration.result.validity import with_validity
+from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.observations import example_table

@@ -9,7 +9,7 @@ import pytest
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.standards.catalogues import _normal
+from astropolcal.standards.priors import _normal
 
 STARS, POLARIZATION = standards.catalogue()
 

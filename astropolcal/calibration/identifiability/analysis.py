@@ -5,18 +5,26 @@ What the data determine: rank, null directions in words, honest errors.
 A parameter is *identifiable* if no combination of parameters that leaves all data unchanged moves
 it. An error is given for identifiable parameters only: a pseudo-inverse would return a small and
 wrong number for the others.
+
+What other values give the same data, and what data would tell them apart.
+
+Discrete mirror solutions: each candidate is tried on the measurement and counts only if it predicts
+the same data and stays within the bounds. What the bounds, or the model of an optic, exclude may be
+the truth all the same: it is reported where it matters on sky.
+
+Harmonics of the half-wave plate: a perfect plate puts the polarization into harmonic 4 of its
+angle, an imperfect one also into 2, and a wedge or dust into 1. Angles from 0 to 78.75 deg cover
+one period of harmonic 4 only: there the others look alike.
 """
 
 import re
 from dataclasses import dataclass, field
+from functools import lru_cache
 
+import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.identifiability.ambiguities import (
-    harmonic_words,
-    mirror_branches,
-    star_words,
-)
+from astropolcal import standards
 from astropolcal.calibration.identifiability.linearized import (
     Whitened,
     first_of_each_kind,
@@ -28,11 +36,15 @@ from astropolcal.calibration.identifiability.linearized import (
 from astropolcal.calibration.identifiability.sky import (
     LEFT_OUT,
     consequences_along,
+    consequences_of,
+    matters,
     sky_words,
     view_of_measurement,
 )
-from astropolcal.chain import leaves
-from astropolcal.optics import Rotator
+from astropolcal.calibration.system import split_chain
+from astropolcal.chain import join, leaves, stages, standing, system_mueller
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.optics import EllipticalRetarder, LinearRetarder, MuellerElement, Rotator
 
 __all__ = ["Identifiability", "examine"]
 
@@ -268,3 +280,218 @@ def _mirrors(measurement):
             inner = train[stages.index("parallactic") + 1 : stages.index(last)]
             found |= {leaf.name for leaf in inner if not isinstance(leaf, Rotator)}
     return found
+
+
+# ---- ambiguities ---------------------------------------------------------------------------
+
+
+# a star that culminates lower has little range of parallactic angle, and much air in front
+_LOW = 45.0
+_EQUATOR = 60.0
+
+
+def star_words(site):
+    """Return a polarized standard star in words, with the name of the best one for a site."""
+    name, high = _best_star(None if site is None else site.to_geodetic().lat.deg)
+    reach = "" if high is None else f", which reaches {high:.0f} deg here"
+    return f"a polarized standard star over a range of parallactic angle (such as {name}{reach})"
+
+
+@lru_cache
+def _best_star(latitude):
+    """Return name and greatest altitude of the star whose angle frames tell best."""
+    stars, _ = standards.catalogue()
+    numbers = {key: np.array(stars[key].value, dtype=float) for key in ("p_max", "p_max_err", "V")}
+    high = 90 - np.abs(stars["dec"].to_value("deg") - (latitude or 0.0))
+    # photon noise of the angle; a law without errors does not tell what is known of the star
+    score = numbers["p_max"] * 10 ** (-0.2 * numbers["V"])
+    known = np.isfinite(score) & np.isfinite(numbers["p_max_err"])
+    # without a site one that most of them see, as it stands high over the equator
+    seen = known & (high >= (_LOW if latitude is not None else _EQUATOR))
+    best = int(np.argmax(np.where(seen if seen.any() else known, score, -np.inf)))
+    return str(stars["name"][best]), None if latitude is None else float(high[best])
+
+
+# ---- what a set of half-wave-plate angles can separate ----
+
+
+#: Sets of harmonics that a model may need to tell apart, with what brings the last one in.
+SETS = (
+    ((0, 4), "the polarization"),
+    ((0, 2, 4), "a half-wave plate that is not perfect"),
+    ((0, 1, 2, 4), "a wedge, dust or beam wander"),
+)
+# beyond this condition number errors grow too much to call the harmonics separate
+_POOR = 10.0
+
+
+def harmonic_conditions(angles):
+    """Return the condition number of each set of harmonics for plate angles in radian."""
+    return {
+        harmonics: _condition(np.asarray(angles, dtype=float), harmonics) for harmonics, _ in SETS
+    }
+
+
+def _condition(angles, harmonics):
+    columns = []
+    for k in harmonics:
+        # the frames' brightness or polarization as a Fourier series of the plate angle
+        columns += [np.cos(k * angles), np.sin(k * angles)] if k else [np.ones_like(angles)]
+    singular = np.linalg.svd(np.column_stack(columns), compute_uv=False)
+    if len(angles) < len(columns) or singular[-1] < 1e-12 * singular[0]:
+        return np.inf
+    return float(singular[0] / singular[-1])
+
+
+def harmonic_words(angles):
+    """Say which harmonics plate angles in radian cannot separate, and which angles to add."""
+    degrees = np.unique(np.round(np.rad2deg(angles), 3))
+    words = []
+    for harmonics, origin in SETS:
+        condition = _condition(np.deg2rad(degrees), harmonics)
+        if condition > _POOR:
+            span = f"{degrees[0]:g} to {degrees[-1]:g} deg"
+            new = ", ".join(str(k) for k in harmonics if k not in (0, 4)) or "4"
+            rest = ", ".join(str(k) for k in harmonics if str(k) not in new.split(", "))
+            size = f"{condition:.2g}" if np.isfinite(condition) else "infinite"
+            words.append(
+                f"half-wave-plate angles {span} separate harmonic {new} badly from {rest} "
+                f"(condition {size}, from {origin}): add {_missing(degrees, harmonics)}"
+            )
+    return words
+
+
+def _missing(degrees, harmonics):
+    """Return the angles, in even steps, that complete a period of the lowest harmonic."""
+    lowest = min(k for k in harmonics if k)
+    period = 360.0 / lowest
+    steps = np.diff(degrees)
+    step = float(np.median(steps)) if steps.size else 22.5
+    # a step that does not divide the period, or that is too coarse for harmonic 4
+    # Nyquist: two angles a period of the highest harmonic, and one more
+    count = max(round(period / step), 2 * max(harmonics) // lowest + 1, 4)
+    wanted = np.arange(count) * period / count + degrees[0]
+    new = [angle for angle in wanted if np.abs(degrees - angle).min() > 0.1]
+    if len(new) > 3 and np.allclose(np.diff(new), new[1] - new[0]):
+        return f"{new[0]:g} to {new[-1]:g} deg"
+    return ", ".join(f"{angle:g}" for angle in new) + " deg"
+
+
+# ---- discrete mirror solutions: other values that give exactly the same data ----
+
+
+# far below any noise, far above rounding: a mirror solution is exact or it is none
+_SAME = 1e-9
+# frames of a long table in which the light is looked at
+_FEW = 64
+_SAME_DATA = "all retardances with the other sign (circular ones keep theirs) give the same data"
+
+
+def mirror_branches(measurement, vector, view):
+    """Return the mirror solutions as dicts: ``words``, and ``sky`` as in `consequences_along`.
+
+    With them the other hand of the whole instrument, if only bounds or models exclude it and it
+    matters on sky.
+    """
+    retarders = _retarders(measurement)
+    candidates = [
+        (
+            f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
+            {name: _other_turn},
+        )
+        for name in retarders
+    ]
+    if retarders:
+        flip = dict.fromkeys(retarders, _other_hand)
+        candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", flip))
+    others = [(words, _mirrored(measurement, vector, edits)) for words, edits in candidates]
+    branches = [{"words": words, "vector": other} for words, other in others if other is not None]
+    for branch in branches:
+        other = branch.pop("vector")
+        chains = None if view is None else measurement.put_back(other)
+        branch["sky"] = view and consequences_of(view, view.with_optics_of(chains))
+    if not any(_SAME_DATA in branch["words"] for branch in branches):
+        branches += _other_instrument(measurement, vector, view)
+    for branch in branches:
+        if branch["sky"] is not None and matters(branch["sky"]):
+            branch["words"] += (
+                f"; WARNING: if the other one is true, {sky_words(branch['sky'])}; "
+                f"{star_words(view.site)} tells them apart"
+            )
+    return branches
+
+
+def _other_instrument(measurement, vector, view):
+    """Return the other handedness downstream of the telescope, if it matters and no datum tells."""
+    if view is None or view.telescope == LEFT_OUT or _knows_hand(measurement, vector):
+        return []
+    telescope, instrument = split_chain(view.chain)
+    # V -> -V in front of everything behind it: the fluxes are of I alone, and have no hand
+    turned = MuellerElement.from_matrix(np.diag([1.0, 1.0, 1.0, -1.0]), name="other_hand")
+    sky = consequences_of(view, join([*telescope, turned, *instrument]))
+    words = f"downstream of the telescope: {_SAME_DATA}, only bounds or models exclude them"
+    return [{"words": words, "sky": sky}] if matters(sky) else []
+
+
+def _knows_hand(measurement, vector):
+    """Return whether circularly polarized light enters the instrument in some dataset."""
+    lam = measurement.wavelength * u.um
+    for chain, dataset in zip(measurement.put_back(vector), measurement.datasets, strict=True):
+        front, _ = split_chain(without_nuisance(chain))
+        if not front:
+            continue
+        source = join(front)
+        step = max(1, dataset.frames.shape[0] // _FEW)
+        places = standing(source)
+        positions = places | {
+            stage: dataset.positions[stage][:, ::step].ravel() * u.rad
+            for stage in stages(source)
+            if stage not in places
+        }
+        light = system_mueller(source, lam, positions)[..., :, 0]
+        if np.abs(light[..., 3]).max() > _SAME * np.abs(light[..., 0]).max():
+            return True
+    return False
+
+
+def _retarders(measurement):
+    """Return the free retarders by name, with the slots of their retardances."""
+    found = {}
+    for chain in measurement.chains:
+        for leaf in leaves(chain):
+            if isinstance(leaf, (LinearRetarder, EllipticalRetarder)):
+                # with one component held the others cannot go to the mirror solution
+                slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
+                if all(slot is not None for slot in slots):
+                    found[leaf.name] = slots
+    return found
+
+
+def _mirrored(measurement, vector, edits):
+    """Return the values of a mirror solution, None if it is none."""
+    slots = _retarders(measurement)
+    other = np.array(vector, dtype=float)
+    for name, edit in edits.items():
+        changed = edit(np.array([vector[slot.slice] for slot in slots[name]]))
+        for slot, values in zip(slots[name], changed, strict=True):
+            other[slot.slice] = values
+    low, high = measurement.free.bounds()
+    inside = np.all((other >= low) & (other <= high))
+    moved = not np.allclose(other, vector)
+    same = np.abs(measurement.predict(other) - measurement.predict(vector)).max() < _SAME
+    return other if inside and moved and same else None
+
+
+def _other_turn(retardance):
+    """Turn the other way round the same axis; shape (1 or 3, n)."""
+    length = np.linalg.norm(retardance, axis=0)
+    # turning by d about an axis is turning by d - 360 deg about it
+    safe = np.where(length > 0, length, 1.0)
+    return retardance * np.where(length > 0, 1 - 2 * np.pi / safe, 1.0)
+
+
+def _other_hand(retardance):
+    """Change the sign of V before and after it."""
+    # V -> -V is a reflection of the Poincare sphere: it turns round rotations about axes in the
+    # equator (linear retardance), and leaves those about the axis of V
+    return retardance * np.array([-1.0, -1.0, 1.0])[: len(retardance), None]

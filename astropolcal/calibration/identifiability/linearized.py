@@ -349,7 +349,10 @@ def near_null_directions(free, whitened, level, sky_of):
     # each row is a principal direction, as long as its standard error at the noise of the fit
     singular, errors = found.singular[: found.rank], whitened.factor() * level
     condition = found.singular[:1] / singular
-    times_large = np.abs(errors) / _large(free)
+    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
+    times_large = np.abs(errors) / np.repeat(
+        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
+    )
     bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
     leads = np.array([ranked(row)[0] for row in times_large], dtype=int)
     # the sign of a singular vector is arbitrary: the worst parameter goes up
@@ -363,14 +366,6 @@ def near_null_directions(free, whitened, level, sky_of):
         _near_null(free, errors[i], times_large[i], condition[i], sky)
         for i, sky in zip(worst, skies, strict=True)
     ]
-
-
-def _large(free):
-    """Return `LARGE` of each element in steps, shape (n_free,)."""
-    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
-    return np.repeat(
-        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
-    )
 
 
 def _near_null(free, error, times_large, condition, sky):

@@ -16,9 +16,9 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
+from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
 
@@ -257,7 +257,14 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     group = np.empty(measurement.n_data, dtype=int)
     for part, where in zip(measurement.datasets, measurement.segments, strict=True):
         group[where] = _same_settings(part, limit)[part.group_of_datum]
-    squares, dof = _scatter(residuals, group, data_by_wavelength(measurement)[2])
+    rows = data_by_wavelength(measurement)[2]
+    squares, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=int)
+    for i, row in enumerate(rows):
+        if row.size:
+            _, label, counts = np.unique(group[row], return_inverse=True, return_counts=True)
+            mean = np.bincount(label, residuals[row]) / counts
+            squares[i] = np.sum((residuals[row] - mean[label]) ** 2)
+            dof[i] = row.size - counts.size
     if not dof.any():
         names = ", ".join(part.observations.name for part in measurement.datasets)
         raise FitError(
@@ -270,18 +277,6 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
         "stages; not what is the same in every repetition"
     )
     return noise_of_cells(measurement, sigma, dof, "replicates", words)
-
-
-def _scatter(values, group, rows):
-    """Return the sum of squares about the mean of each group, and its freedom, by cell."""
-    squares, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=int)
-    for i, row in enumerate(rows):
-        if row.size:
-            _, label, counts = np.unique(group[row], return_inverse=True, return_counts=True)
-            mean = np.bincount(label, values[row]) / counts
-            squares[i] = np.sum((values[row] - mean[label]) ** 2)
-            dof[i] = row.size - counts.size
-    return squares, dof
 
 
 def _same_settings(part, tolerance):

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations.grid import clusters, cycle_numbers, is_star, runs_of_frames
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.observations.quality import clusters, cycle_numbers, is_star, runs_of_frames
 from astropolcal.words import check_choice
 
 __all__ = []
@@ -48,21 +48,15 @@ def leave_out_groups(measurement):
     for dataset in measurement.datasets:
         turns = "derotator" in dataset.observations.frames.colnames
         if "parallactic" in dataset.positions or not turns:
-            group = _star_runs(dataset)
+            cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
+            rank = np.unique(cycle, return_inverse=True)[1]
+            count = int(rank.max()) + 1
+            group = runs_of_frames(count, min(_RUNS, count))[rank]
         else:
             group = clusters(dataset.observations.position("derotator")[dataset.frames[:, 0]])
         groups.append(first + group[dataset.group_of_datum])
         first += int(group.max()) + 1
     return np.concatenate(groups)
-
-
-def _star_runs(dataset):
-    """Return the run of consecutive cycles of each group of frames, shape (n_groups,)."""
-    cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
-    rank = np.unique(cycle, return_inverse=True)[1]
-    count = int(rank.max()) + 1
-    # equal runs of consecutive cycles; a derotator that follows the sky gives no angles to group by
-    return runs_of_frames(count, min(_RUNS, count))[rank]
 
 
 def groups_by(measurement, by="derotator"):
@@ -244,7 +238,8 @@ class Scatter:
         errors = _errors_at_settings(part, residuals[rows] / part.amplitude)
         if errors is not None:
             part.kernels += _found(errors)
-            part.patterns = part.patterns * _uneven(errors)
+            size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
+            part.patterns = part.patterns * np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
         return part
 
     def _shares(self, part, residuals):
@@ -316,12 +311,6 @@ def _errors_at_settings(part, scaled):
     size = np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
     # of one plate angle q or u may not show at all
     return np.divide(errors, size, out=np.zeros_like(errors), where=size > 0)
-
-
-def _uneven(errors):
-    """Return by how much the error of each setting is above the mean one, half believed."""
-    size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
-    return np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
 
 
 def _found(errors):

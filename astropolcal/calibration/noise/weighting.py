@@ -21,7 +21,7 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, triangle
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.observations.quality import MAD_TO_SIGMA, brightness
+from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]

@@ -49,12 +49,21 @@ def summary(calibration, targets=TARGETS, full=False):
     if not full:
         return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
     known, stars = calibration.parameter_values(), fitted_stars(calibration)
+    told = [*found.reasons, *found.cautions]
+    hidden = told and "; ".join(told) not in found.words[0]
+    gauge = calibration.settings.get("gauge")
+    lines = []
+    for name, copies in (calibration.settings.get("own") or {}).items():
+        evidence = _evidence(calibration, copies)
+        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
+        words = words if np.isfinite(evidence) else "is not determined"
+        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
     parts = [
-        [*found.words, *_more_reasons(found)],
+        [*found.words, *(list(_wrap(f"  - {words}" for words in told)) if hidden else [])],
         _heading(calibration),
         _global_lines(without_stars(known, stars)),
         _law_lines(calibration),
-        _own_lines(calibration),
+        (list(_wrap(["Parameters with values of their own", *lines])) if lines else []),
         _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -68,7 +77,7 @@ def summary(calibration, targets=TARGETS, full=False):
         mirror_lines(calibration),
         _goodness_lines(calibration),
         list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
-        _gauge_lines(calibration),
+        (list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []),
         _bound_lines(calibration, known),
         _posterior_lines(calibration),
     ]
@@ -79,13 +88,6 @@ def _stars(stars):
     """Say what was found of the standard stars, and how far it rests on the catalogue."""
     words = [f"  {' '.join(star.meta['words'].split())}" for star in stars]
     return ["Standard stars", *_wrap(words)] if words else []
-
-
-def _more_reasons(found):
-    """Return in full what the first line has no space for."""
-    told = [*found.reasons, *found.cautions]
-    hidden = told and "; ".join(told) not in found.words[0]
-    return list(_wrap(f"  - {words}" for words in told)) if hidden else []
 
 
 def _wrap(lines):
@@ -130,17 +132,6 @@ def _law_lines(calibration):
         for key, law in leaf._follows.items()
     ]
     return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
-
-
-def _own_lines(calibration):
-    """Say which parameters of their own in several nights differ, by the evidence for it."""
-    lines = []
-    for name, copies in (calibration.settings.get("own") or {}).items():
-        evidence = _evidence(calibration, copies)
-        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
-        words = words if np.isfinite(evidence) else "is not determined"
-        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
-    return list(_wrap(["Parameters with values of their own", *lines])) if lines else []
 
 
 def _evidence(calibration, names):
@@ -338,11 +329,6 @@ def _outlier_lines(outliers):
     ]
     more = len(outliers) - _MOST_OUTLIERS
     return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
-
-
-def _gauge_lines(calibration):
-    gauge = calibration.settings.get("gauge")
-    return list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []
 
 
 def _bound_lines(calibration, known):

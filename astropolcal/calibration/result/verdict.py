@@ -83,7 +83,17 @@ def verdict(calibration, targets=TARGETS):
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
     bright = target_accuracies(calibration, TARGETS[:1])
-    sky = _open_on_sky(calibration, free)
+    found = {}
+    for lead, sky in _open_leads(calibration, free).items():
+        for what in _seen(sky) if sky else ():
+            found.setdefault(what, []).append(lead)
+    # what leads at a single wavelength opens that one only
+    many = _MOST * len(calibration.wavelength)
+    sky = {
+        what: leads
+        for what, leads in found.items()
+        if any("[" not in lead for lead in leads) or len(leads) > many
+    }
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [
         _nothing(calibration),
@@ -248,21 +258,6 @@ def _seen(sky):
     """Return what of AoLP and DoLP changes by what shows."""
     kinds = (("aolp_deg", "AoLP"), ("dolp_percent", "DoLP"))
     return [what for key, what in kinds if max(map(abs, sky[key])) >= _SHOWS]
-
-
-def _open_on_sky(calibration, free):
-    """Return what of AoLP and DoLP is open on sky, at most wavelengths, and along which leads."""
-    found = {}
-    for lead, sky in _open_leads(calibration, free).items():
-        for what in _seen(sky) if sky else ():
-            found.setdefault(what, []).append(lead)
-    # what leads at a single wavelength opens that one only
-    many = _MOST * len(calibration.wavelength)
-    return {
-        what: leads
-        for what, leads in found.items()
-        if any("[" not in lead for lead in leads) or len(leads) > many
-    }
 
 
 def _open_words(sky):

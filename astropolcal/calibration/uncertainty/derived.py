@@ -598,7 +598,14 @@ def derived_sky(
     # derivative of the quotient n s / d s to the Stokes vector s: (n - x d) / (d s)
     rows = (numerator[""] - ratio[..., None] * denominator[""]) / total[..., None]
     # of q and u only, shape (n_wavelengths, 2, n_pairs): least squares where there are more pairs
-    inverse = _inverse(rows[..., 1:3])
+    stacked = np.moveaxis(rows[..., 1:3], 0, -2)
+    singular = np.linalg.svd(stacked, compute_uv=False)
+    if stacked.shape[-2] < 2 or np.any(singular[..., 1] < 1e-6 * singular[..., 0]):
+        raise ParameterError(
+            "the positions do not determine q and u: give pairs at two half-wave-plate angles, "
+            "such as 0 and 22.5 deg"
+        )
+    inverse = np.linalg.pinv(stacked)
     slopes = {}
     for name in numerator:
         if name:
@@ -632,18 +639,6 @@ def _double_difference_rows(chain, lam, positions, modulator):
                 numerator[name] = numerator.get(name, 0.0) + sign * half * row
                 denominator[name] = denominator.get(name, 0.0) + row
     return numerator, denominator
-
-
-def _inverse(rows):
-    """Return the least-squares inverse over the pairs, (n_wavelengths, 2, n_pairs)."""
-    stacked = np.moveaxis(rows, 0, -2)
-    singular = np.linalg.svd(stacked, compute_uv=False)
-    if stacked.shape[-2] < 2 or np.any(singular[..., 1] < 1e-6 * singular[..., 0]):
-        raise ParameterError(
-            "the positions do not determine q and u: give pairs at two half-wave-plate angles, "
-            "such as 0 and 22.5 deg"
-        )
-    return np.linalg.pinv(stacked)
 
 
 # ---- diattenuation and retardance of calibrated mirrors, beside those of bare metals ----

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
-from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted
+from astropolcal.calibration.validation.cross_validation import predicted_chain, refuse_fitted
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import (
@@ -17,7 +17,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement
-from astropolcal.observations.quality import cycle_numbers
+from astropolcal.observations.grid import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
@@ -78,7 +78,10 @@ def star_stokes(calibration, chain, observations, positions=None):
     >>> table["q"].round(1)
     <Quantity [2., 2., 2.] %>
     """
-    chain = _with_free_star(chain)
+    first, *rest = leaves(chain)
+    if not isinstance(first, PolarizedSource):
+        raise ChainError("the chain of a star begins with a PolarizedSource")
+    chain = join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
     predicted = predicted_chain(calibration, chain, observations)
     measurement = Measurement(
         predicted,
@@ -88,7 +91,10 @@ def star_stokes(calibration, chain, observations, positions=None):
     )
     vector, (part,) = measurement.vector(), measurement.datasets
     # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
-    residuals, slopes = measurement.residuals(vector), _star_slopes(measurement, vector)
+    name = leaves(measurement.chains[0])[0].name
+    jacobian = measurement.jacobian(vector)
+    residuals = measurement.residuals(vector)
+    slopes = np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
     cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
     labels = np.unique(cycle)
     found = np.full((2, len(part.bins), len(labels)), np.nan)
@@ -99,20 +105,6 @@ def star_stokes(calibration, chain, observations, positions=None):
     if np.isnan(found).all():
         raise ObservationError(f"{observations.name}: no cycle determines q and u")
     return _table(observations.wavelength, found)
-
-
-def _with_free_star(chain):
-    first, *rest = leaves(chain)
-    if not isinstance(first, PolarizedSource):
-        raise ChainError("the chain of a star begins with a PolarizedSource")
-    return join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
-
-
-def _star_slopes(measurement, vector):
-    """Return the derivatives of the data to q and u, (2, n_data)."""
-    name = leaves(measurement.chains[0])[0].name
-    jacobian = measurement.jacobian(vector)
-    return np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
 
 
 def _solved(slopes, residuals):
@@ -270,22 +262,17 @@ def _fitted_star(calibration, star, free):
             table[stem], table[f"{stem}_err"] = 100 * value * u.percent, 100 * std * u.percent
         share.append(1 - np.clip(error**2 / prior, 0, 1))
     table.meta |= {"name": star.name, "from_data": float(np.median(share))}
-    table.meta["words"] = _fitted_words(table)
-    return table
-
-
-def _fitted_words(table):
-    """Say q and u in the middle of the wavelengths, before and after the fit."""
     i = len(table) // 2
     parts = [
         f"{key} {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f}" for key in "qu"
     ]
     prior = max(table[f"{key}_prior_err"][i].value for key in "qu")
     nm = table["wavelength"][i].to_value(u.nm)
-    return (
+    table.meta["words"] = (
         f"{table.meta['name']:<27} {', '.join(parts)} % ({nm:.0f} nm; +- {prior:.2f} before; "
         f"{100 * table.meta['from_data']:.0f} % by the data)"
     )
+    return table
 
 
 # ---- check of a calibration with a star of known polarization that no fit has seen ----
@@ -368,7 +355,12 @@ def star_check(calibration, chain, observations, positions=None, star=None):
         table[key] = accuracy[key]
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
-    _add_claims(table, calibration, rows)
+    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
+    angles = np.nan_to_num(table["aolp_known"])
+    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
+    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
+        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
+        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
     table.meta["words"] = _words(table)
     return table
 
@@ -409,16 +401,6 @@ def _add_known(table, q, stokes_u, covariance):
     table["dolp_known_err"] = along * percent
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
-
-
-def _add_claims(table, calibration, rows):
-    """Add the errors that the calibration claims for light of the catalogue's polarization."""
-    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
-    angles = np.nan_to_num(table["aolp_known"])
-    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
-    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
-        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
-        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
 
 
 def _pull(table, key):

@@ -19,8 +19,8 @@ from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     cross_validated_residuals,
+    refuse_fitted,
 )
-from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import columns
@@ -56,7 +56,7 @@ class SkyErrors:
         """
         weights = _weights(dolp, double).reshape(-1, 9)
         variance, known, is_open, blind = (
-            _quadratic(matrix, weights)
+            np.sum((matrix @ weights.T) * weights.T, axis=-2)
             for matrix in (self._covariance, self._known, self._open, self._blind)
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
@@ -75,11 +75,6 @@ class SkyErrors:
 
 def _products(rows):
     return rows @ np.swapaxes(rows, -1, -2)
-
-
-def _quadratic(matrices, weights):
-    """Return w M w for each of the weights, (n_wavelengths, n_settings, n_weights)."""
-    return np.sum((matrices @ weights.T) * weights.T, axis=-2)
 
 
 def _weights(dolp, double):
@@ -552,23 +547,26 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         table = _cross_validated(calibration, dataset, groups)
     result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
     record = calibration.datasets[dataset]
-    result["s_standard"] = _remembered(record)
+    table = record.accuracy
+    unknown = np.full(len(table), np.nan) * u.percent
+    result["s_standard"] = table["s_standard"] if "s_standard" in table.colnames else unknown
     known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
     name = ", ".join(entry["name"] for entry in known) or None
     if standard is not None:
         measurement = _independent(calibration, standard, dataset)
         name = ", ".join(part.observations.name for part in measurement.datasets)
-        result["s_standard"] = _rms_at(measurement, result["wavelength"])
+        wavelength = result["wavelength"]
+        residuals = measurement.residuals()
+        own = measurement.wavelength[measurement.bins]
+        found = [
+            residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
+            for value in wavelength.to_value(u.um)
+        ]
+        rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
+        result["s_standard"] = 100 * np.array(rms) * u.percent
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
-
-
-def _remembered(record):
-    # files that were written before the column existed do not have it
-    table = record.accuracy
-    unknown = np.full(len(table), np.nan) * u.percent
-    return table["s_standard"] if "s_standard" in table.colnames else unknown
 
 
 def _cross_validated(calibration, dataset, groups):
@@ -590,15 +588,3 @@ def _independent(calibration, standard, dataset):
     for part in measurement.datasets:
         refuse_fitted(calibration, part.observations)
     return measurement
-
-
-def _rms_at(measurement, wavelength):
-    """Return the rms of the residuals at each wavelength, NaN where there are none."""
-    residuals = measurement.residuals()
-    own = measurement.wavelength[measurement.bins]
-    found = [
-        residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
-        for value in wavelength.to_value(u.um)
-    ]
-    rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
-    return 100 * np.array(rms) * u.percent
