@@ -12,7 +12,7 @@ const QUESTIONS = {
   "trust": ["parameters", "trust"],
   "which parameters can i trust": ["parameters", "faq"],
   "units": ["conventions", "faq"],
-  "correct science images": ["correction"],
+  "correct science images": ["correction", "commands/correct"],
   "install": ["installation"],
   "calibrate": ["first_calibration", "commands/calibrate"],
   "diagnose": ["diagnosis", "commands/diagnose"],
