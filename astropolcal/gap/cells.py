@@ -490,10 +490,20 @@ class Probes:
 
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
-        right, left = sweep.fluxes
-        fluxes = self.problem.fluxes[i]
-        if fluxes is None:
+        seen = self.problem.flickering[i], self.problem.fluxes[i]
+        if seen[1] is None:
             return
+        # differences see the flicker of the lamp, sums do not
+        by_channel = [list(self._detected(channel, sweep, fluxes)) for fluxes in seen]
+        weights = channel.slopes(sweep)
+        for (kind, first), (_, second) in zip(*by_channel, strict=True):
+            pairs = zip(weights, (first, second), strict=True)
+            yield kind, np.stack([a * one + b * other for (a, b), (one, other) in pairs])
+
+    @staticmethod
+    def _detected(channel, sweep, fluxes):
+        """Yield each kind, and what it adds to the fluxes of both beams."""
+        right, left = sweep.fluxes
         single = channel.groups is not None
         # half the usual flux of both beams, whether both have light or one
         usual = np.median(fluxes[0]) / 2 if single else np.median(fluxes)
@@ -515,8 +525,7 @@ class Probes:
         for kind, (one, other) in changes.items():
             if single and kind not in ("background", "nonlinearity"):
                 continue
-            slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
-            yield kind, np.stack(slopes)
+            yield kind, (one, other)
 
 
 def _frames_first(basis, shape):

@@ -322,10 +322,11 @@ def noise(channel, residual, angles):
 
 def expected_fluxes(channel, sweep):
     """
-    Return the fluxes of both beams as chain and lamp give them, shape (2, W, F).
+    Return the fluxes of both beams as chain and lamp give them, without and with flicker.
 
-    An effect that depends on the flux must not depend on the noise of the datum
-    that it is to explain.
+    Both have shape (2, W, F). An effect that depends on the flux must not depend on the noise of
+    the datum that it is to explain: sums of both beams do not see the flicker, which is their own,
+    and their differences do.
     """
     right, left = sweep.fluxes
     level = channel.observed[1] - np.log(right + left)
@@ -334,6 +335,6 @@ def expected_fluxes(channel, sweep):
     scale = (level * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
     certain = np.maximum(weight.sum(axis=0), 1e-300)
     shift = ((level - scale[:, None]) * weight).sum(axis=0) / certain
-    shift = channel.lamp.brightness(shift, certain)
-    lamp = np.exp(scale[:, None] + shift)
-    return np.stack([right * lamp, left * lamp])
+    beams = np.stack([right, left])
+    shifts = channel.lamp.brightness(shift, certain), shift
+    return tuple(beams * np.exp(scale[:, None] + one) for one in shifts)

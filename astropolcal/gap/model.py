@@ -100,7 +100,11 @@ class Model:
         """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
         noise = SimpleNamespace(
-            fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None, known=mine.known
+            fluxes=[mine.fluxes[i]],
+            flickering=[mine.flickering[i]],
+            channels=[mine.channels[i]],
+            waves=None,
+            known=mine.known,
         )
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))

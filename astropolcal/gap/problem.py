@@ -6,6 +6,7 @@ Parameters given per wavelength may follow a law in wavelength: a basis with
 one column a coefficient. What is fitted is the flat vector of coefficients.
 """
 
+from copy import copy as copied
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +18,7 @@ from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonorm
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
+from astropolcal.optics.core import FLUXES
 
 __all__ = []
 
@@ -95,7 +97,9 @@ class GapProblem:
         #: Angles of what is mounted with care, mean and standard deviation (radian): one datum
         #: each, also where an effect lets go of them.
         self.known = mounted if like is None else like.known
+        #: Expected fluxes of each dataset, (2, W, F), without and with the flicker of its lamp.
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
+        self.flickering = self.fluxes if like is None else like.flickering
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
         single = all(each.single_beam for each in observations)
@@ -110,6 +114,7 @@ class GapProblem:
             ],
         )
         self.datasets = self.measurement.datasets
+        self._flickering = [self._with_flicker(*each) for each in enumerate(chains)]
         self.free = self.measurement.free
         self.wavelength = self.measurement.wavelength
         self.channels = [Channels(d) for d in self.datasets] if like is None else like.channels
@@ -125,6 +130,16 @@ class GapProblem:
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
         self.centre = np.where(self.tight > 0, self.coefficients(self._absent()), 0.0)
+
+    def _with_flicker(self, i, chain):
+        """Return a dataset as its differences see it, None where that is no matter."""
+        dataset, fluxes = self.datasets[i], self.flickering[i]
+        if fluxes is None or not any(leaf.stage in FLUXES for leaf in leaves(chain)):
+            return None
+        new = copied(dataset)
+        new._given = _positions(chain, dataset.observations, fluxes)
+        new._place(chain, dataset.frames.T.ravel())
+        return new
 
     def _hold(self, mounted):
         """Note the rows of what is known of mountings: targets and derivatives."""
@@ -206,11 +221,14 @@ class GapProblem:
 
     def differences(self, coefficients):
         """Return observed minus predicted of each dataset, arrays (2, W, F)."""
-        vector = self.vector(coefficients)
-        return [
-            np.where(c.valid, c.observed - c.predicted(d.forward(vector)), 0.0)
-            for c, d in zip(self.channels, self.datasets, strict=True)
-        ]
+        vector, out = self.vector(coefficients), []
+        for channel, *pair in zip(self.channels, self.datasets, self._flickering, strict=True):
+            dataset, flickering = pair
+            predicted = channel.predicted(dataset.forward(vector))
+            if flickering is not None:
+                predicted[0] = channel.predicted(flickering.forward(vector))[0]
+            out.append(np.where(channel.valid, channel.observed - predicted, 0.0))
+        return out
 
     def residual(self, coefficients):
         """Return the whitened residuals, shape (n_rows,)."""
@@ -226,8 +244,8 @@ class GapProblem:
         """
         vector = self.vector(coefficients)
         out = np.empty((self.size, self.n_rows))
-        for channel, dataset, rows in zip(self.channels, self.datasets, self.segments, strict=True):
-            slopes = self._slopes(channel, dataset, vector)
+        for i, (channel, rows) in enumerate(zip(self.channels, self.segments, strict=True)):
+            slopes = self._slopes(channel, i, vector)
             slopes = channel.whiten(slopes) if whitened else slopes
             out[:, rows] = slopes.reshape(self.size, rows.stop - rows.start)
         seen = self.n_rows - len(self.known)
@@ -240,13 +258,15 @@ class GapProblem:
         kept = [np.broadcast_to(mask, channel.shape).ravel() for mask, channel in parts]
         return np.concatenate([*kept, np.ones(len(self.known), dtype=bool)])
 
-    def _slopes(self, channel, dataset, vector):
+    def _slopes(self, channel, number, vector):
         """Return the derivative of a dataset's channels, shape (n_coefficients, 2, W, F)."""
-        sweep = dataset.forward(vector)
+        dataset, flickering = self.datasets[number], self._flickering[number]
         keys = [key for key, *_ in dataset._live]
         out = np.zeros((self.size, *channel.shape))
-        for i, weights in enumerate(channel.slopes(sweep)):
-            slopes = sweep.derivatives(keys, weights)
+        sums = dataset.forward(vector)
+        sweeps = (sums if flickering is None else flickering.forward(vector), sums)
+        for i, sweep in enumerate(sweeps):
+            slopes = sweep.derivatives(keys, channel.slopes(sweep)[i])
             for key, where, factor, _ in dataset._live:
                 self._add(out[:, i], where, factor * slopes[key])
         return out * channel.valid
@@ -273,10 +293,11 @@ class GapProblem:
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
             channel.set_noise(noise(channel, residual, angles), residual, saturating)
-        self.fluxes = [
+        found = [
             expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)
         ]
+        self.fluxes, self.flickering = map(list, zip(*found, strict=True))
 
     # ---- fit -------------------------------------------------------------------------
 
