@@ -17,7 +17,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
 
-__all__ = ["elliptical_retarder", "is_physical", "linear_retarder", "rotate"]
+__all__ = ["elliptical_retarder", "linear_retarder", "rotate"]
 
 # sums of four factors, each known to a few 1e-16, lie on the limit to within this
 _ROUNDING = 1e-12

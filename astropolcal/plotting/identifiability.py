@@ -70,7 +70,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     ----------
     calibration : Calibration or Identifiability
         What was found. A calibration that was read from a file has no angles, and an
-        `~astropolcal.calibration.identifiability.analysis.Identifiability` alone has no
+        ``Identifiability`` alone has no
         errors: panels then show what there is.
     weakest : int
         How many of the determined directions to show, those with the largest errors; more

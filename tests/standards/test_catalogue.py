@@ -42,7 +42,7 @@ def test_numbers_are_possible():
         assert np.all(~np.isfinite(error) | (error > 0))
     theta = POLARIZATION["theta"].value
     assert np.all(np.isnan(theta) | ((theta >= 0) & (theta <= 180)))
-    assert set(STARS["kind"]) == set(standards.catalogues.KINDS)
+    assert set(STARS["kind"]) == set(standards.priors.KINDS)
 
 
 def test_bands_are_where_they_should_be():

@@ -22,7 +22,6 @@ from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.units import angle_to_rad
 
 __all__ = [
-    "NoiseEstimate",
     "noise_from_errors",
     "noise_from_null_channel",
     "noise_from_replicates",
@@ -133,7 +132,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         Infinite degrees of freedom: taken as known.
 
     Raises
@@ -228,7 +227,7 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         It includes all that differs between repeated data: photon and read noise,
         flicker, repeatability of the stages, drifts; but nothing that is the same
         in all of them.
@@ -345,7 +344,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         An upper limit: besides photon and read noise and flicker that changes
         the ratio of the beams it includes anything else makes the null change
         with the plate and is not in the chain, such as diattenuation. For strongly
@@ -488,7 +487,7 @@ def noise_from_roughness(measurement, vector=None):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         Besides photon and read noise it includes flicker that changes the ratio of the beams, and
         what optics do that is sharp in wavelength and no harmonic. Infinite degrees of freedom
         where the stated errors stand.

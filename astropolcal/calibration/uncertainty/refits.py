@@ -42,7 +42,7 @@ from astropolcal.progress import counting, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
 
-__all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
+__all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
 _FEWEST_BLOCKS = 3
 
@@ -78,7 +78,7 @@ class Profile:
 
     Examples
     --------
-    >>> from astropolcal.calibration.uncertainty import Profile
+    >>> from astropolcal.calibration.uncertainty.refits import Profile
     >>> import numpy as np
     >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
     ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
@@ -182,7 +182,7 @@ def profile(calibration, name, values=None, n=21):
 
     Returns
     -------
-    Profile
+    ``Profile``
 
     Raises
     ------

@@ -32,7 +32,7 @@ from astropolcal.optics import PolarizedSource
 from astropolcal.progress import steps
 from astropolcal.words import p_words
 
-__all__ = ["LackOfFit", "add_standard", "lack_of_fit"]
+__all__ = ["add_standard", "lack_of_fit"]
 
 # a datum that moves by less than this share of the largest slope does not move
 _STILL = 1e-6
@@ -235,7 +235,7 @@ class LackOfFit:
 
     Examples
     --------
-    >>> from astropolcal.calibration.validation import LackOfFit
+    >>> from astropolcal.calibration.validation.cross_validation import LackOfFit
     >>> from astropy.table import QTable
     >>> LackOfFit(QTable(), 12.0, 10.0, 0.285, "the residuals agree with the noise").p_value
     0.285
@@ -286,7 +286,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
 
     Returns
     -------
-    LackOfFit
+    ``LackOfFit``
         For all data and for each wavelength; NaN where the noise is unknown or no
         degree of freedom is left. With estimated noise the total is Fisher's
         combination of the probabilities of the wavelengths.
