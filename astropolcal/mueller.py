@@ -23,15 +23,15 @@ __all__ = ["elliptical_retarder", "linear_retarder", "rotate"]
 _ROUNDING = 1e-12
 
 
-def _mueller_array(matrix, name="matrix"):
+def _mueller_array(matrix):
     """Return finite floats of shape (..., 4, 4), or raise."""
-    matrix = to_unit(matrix, None, name)
+    matrix = to_unit(matrix, None, "matrix")
     if matrix.shape[-2:] != (4, 4):
-        raise ParameterError(f"{name} has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
+        raise ParameterError(f"matrix has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
     bad = np.argwhere(~np.isfinite(matrix)).tolist()
     if bad:
         where = tuple(bad[0])
-        raise ParameterError(f"{name} = {matrix[where]} at index {where} must be finite")
+        raise ParameterError(f"matrix = {matrix[where]} at index {where} must be finite")
     return matrix
 
 

@@ -98,6 +98,11 @@ def data_by_wavelength(measurement):
     return np.array(numbers), np.concatenate(wavelengths) * u.nm, rows
 
 
+def rms(values):
+    """Return the root mean square, NaN of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
 def noise_of_cells(measurement, sigma, dof, method, words):
     """Return an estimate with one noise for each cell of `data_by_wavelength`.
 
@@ -174,8 +179,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 def _of_data(measurement, sigma, dof, method, words):
     """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    rms = [np.sqrt(np.mean(sigma[row] ** 2)) if row.size else np.nan for row in rows]
-    percent, dof = 100 * np.array(rms) * u.percent, np.broadcast_to(dof, len(rows))
+    percent = 100 * np.array([rms(sigma[row]) for row in rows]) * u.percent
+    dof = np.broadcast_to(dof, len(rows))
     return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
 
 
