@@ -210,7 +210,8 @@ def profile(calibration, name, values=None, n=21):
     """
     covariance = calibration.covariance
     if name not in covariance.names:
-        raise ParameterError(f"no free parameter {name!r}; there are {_some(covariance.names)}")
+        known = ", ".join(covariance.names[:8]) + (", ..." if len(covariance.names) > 8 else "")
+        raise ParameterError(f"no free parameter {name!r}; there are {known}")
     if n < 3:
         raise FitError(f"n = {n}; a profile needs at least 3 values")
     index = covariance.names.index(name)
@@ -232,10 +233,6 @@ def profile(calibration, name, values=None, n=21):
     rise = (chi2 - chi2.min()) / residual_variance(calibration)
     quantity = 1 if unit is None else u.Unit(unit)
     return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
-
-
-def _some(names):
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
 def _grid(best, std, step, n):
