@@ -12,27 +12,26 @@ from astropolcal.version import version as __version__
 
 _WHERE = {
     "Calibration": "calibration",
+    "Corrected": "correction",
     "Diagnosis": "gap",
     "Library": "pipeline",
+    "Measurement": "measurement",
+    "Normal": "measurement",
     "Observations": "observations",
+    "ScienceFrames": "correction",
+    "Tie": "measurement",
     "calibrate": "calibration",
     "correct": "correction",
     "diagnose": "gap",
     "half_wave_plate_cycles": "simulation",
     "load": "pipeline",
     "reduce_cubes": "reduction",
+    "sample": "calibration",
     "simulate": "simulation",
 }
-_ROOMS = (
-    "chain",
-    "gap",
-    "instruments",
-    "materials",
-    "mueller",
-    "optics",
-    "plotting",
-    "standards",
-)
+_ROOMS = ("instruments", "optics", "plotting")
+# what only some need is found, and is not among the first names
+_MORE = ("chain", "gap", "materials", "mueller", "standards")
 
 __all__ = ["__version__", *_WHERE, *_ROOMS]
 
@@ -40,7 +39,7 @@ __all__ = ["__version__", *_WHERE, *_ROOMS]
 def __getattr__(name):
     from importlib import import_module
 
-    if name in _ROOMS:
+    if name in (*_ROOMS, *_MORE):
         return import_module(f"astropolcal.{name}")
     if name in _WHERE:
         return getattr(import_module(f"astropolcal.{_WHERE[name]}"), name)
@@ -49,4 +48,4 @@ def __getattr__(name):
 
 def __dir__():
     # a module that has been imported is among the globals, too
-    return sorted({*globals(), *_WHERE, *_ROOMS})
+    return sorted({*globals(), *_WHERE, *_ROOMS, *_MORE})

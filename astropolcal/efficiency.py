@@ -26,7 +26,7 @@ from astropolcal.optics import COORDINATES, Rotator
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import beams_of_frames, stage_positions
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um
-from astropolcal.words import counted
+from astropolcal.words import check_choice, counted
 
 __all__ = ["best_derotator", "best_modulation", "demodulation", "polarimetric_efficiency"]
 
@@ -470,8 +470,7 @@ def demodulation(chain, wavelength, frames, *, components="IQUV", variance=None)
     >>> demodulation(chain, [1.6] * u.um, cycle, components="IQU").efficiency.round(3).tolist()
     [[1.0, 0.707, 0.707]]
     """
-    if components not in _COMPONENTS:
-        raise ParameterError(f"components = {components!r}; allowed are {', '.join(_COMPONENTS)}")
+    check_choice("components", components, _COMPONENTS, ParameterError)
     found = _demodulated(_modulation(chain, wavelength, frames), components, variance)
     weak = ~(found.efficiency >= _LEAST)
     if weak.any():

@@ -71,11 +71,10 @@ def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):
             return io.BytesIO(unpacked.read(most))
 
 
-def primary_header(path):
+def primary_header(path, error=ObservationError):
     """Return the primary header of a FITS file."""
     from astropy.io import fits
 
-    error = ObservationError
     with readable_fits(path, error), open_fits(path, error, count=1) as stream:
         return fits.Header.fromfile(stream)
 

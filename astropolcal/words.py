@@ -4,6 +4,7 @@ Words that messages share: near matches of a name, numbers with their nouns, and
 """
 
 import difflib
+from collections.abc import Hashable
 from html import escape
 
 __all__ = []
@@ -25,6 +26,14 @@ def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
     near = difflib.get_close_matches(str(name), list(known), n=most, cutoff=cutoff)
     shown = list(dict.fromkeys(show(match) for match in near))
     return f"; did you mean {' or '.join(shown)}?" if shown else ""
+
+
+def check_choice(what, value, allowed, error):
+    """Raise an error unless a value is one of those allowed, which its message names."""
+    if not isinstance(value, Hashable) or value not in allowed:
+        known = [str(one) for one in allowed]
+        message = f"{what} = {value!r}; allowed are {', '.join(known) or 'none'}"
+        raise error(message + did_you_mean(value, known))
 
 
 def counted(number, noun, plural=None):

@@ -241,7 +241,7 @@ def test_the_table_survives_a_file(kind, tmp_path):
 @every
 def test_pulls_are_one(kind):
     pulls, truth = [], Measurement(kind.chain(), observed(kind)).vector()
-    for seed in range(20):
+    for seed in range(10):
         found = calibrate(
             kind.chain(), observed(kind, seed=seed), weights="errors", cross_validate=False
         )

@@ -77,6 +77,7 @@ def test_what_is_not_modulated_is_named():
         demodulation(plate(100), LAM, four, variance=[1, 1, 1])
 
 
+@pytest.mark.slow
 def test_a_search_finds_the_best_angles_and_retardances():
     frames = QTable({"plate": [1, 20, 90, 130] * u.deg})
     _, at, best = best_modulation(plate(132), LAM, frames, ["plate"])

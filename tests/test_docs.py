@@ -175,6 +175,7 @@ def test_every_effect_has_a_page_and_a_scene(gallery):
         assert max(np.abs(image).max() for image in images[0]) > 1e-4, name
 
 
+@pytest.mark.slow
 def test_a_new_optic_needs_no_more_than_its_class(gallery, monkeypatch):
     class Attenuator(Optic):
         """

@@ -3,7 +3,6 @@
 
 import json
 import runpy
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,6 @@ import pytest
 TUTORIALS = sorted((Path(__file__).resolve().parents[1] / "docs" / "tutorials").glob("plot_*.py"))
 # those that take longer than about five seconds
 LONG = ("plot_5_cubes", "plot_6_figures_of_the_paper")
-#: Seconds of a processor.
-LONGEST = 60
 
 
 @pytest.fixture
@@ -31,10 +28,7 @@ def _slow(path):
 
 
 def _run(path):
-    start = time.process_time()
-    found = runpy.run_path(str(path))
-    assert time.process_time() - start < LONGEST, f"{path.name} takes longer than a minute"
-    return found
+    return runpy.run_path(str(path))
 
 
 def _quartz(found, real):

@@ -400,8 +400,8 @@ def ends(kind, folder):
     """Yield words, status and complaint of each command, and whether the folder is as before."""
     names = {"old": folder / "old", "new": folder / "new", "folder": folder, "spare": "spare"}
     for command, options in COMMANDS.items():
-        # the limit is one of all files
-        for option in (o for o in options if kind != "limited" or "{spare}" not in o):
+        # everything where the disk is full; else the first output, as all are written in one way
+        for option in options if kind == "full" else options[:1]:
             old = re.search(r"\{(old)\}(\.\w+)?", option)
             with spoiled(kind, folder, old and f"old{old[2] or ''}"):
                 before, words = contents(folder), f"{command} -q {option.format(**names)}"

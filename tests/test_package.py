@@ -17,7 +17,7 @@ def test_name_is_there_and_listed():
 
 
 def test_no_more_names_than_a_user_keeps_in_mind():
-    assert len(astropolcal.__all__) <= 20
+    assert len(set(astropolcal.__all__) - {"__version__"}) <= 20
 
 
 def test_every_name_knows_where_it_comes_from():

@@ -54,6 +54,8 @@ def found(text, words):
 
 def test_retired_words_do_not_occur():
     words = list(retired(LIST.read_text(encoding="utf-8")))
+    # one look for all of them, as hardly a file has any
+    any_of_them = re.compile("|".join(f"(?:{pattern.pattern})" for pattern, _ in words), re.I)
     report = []
     for path in sorted({path for pattern in WHERE for path in ROOT.glob(pattern)}):
         if path.is_file() and path.suffix in {".md", ".rst", ".py", ".html", ".yaml", ".jinja"}:
@@ -64,7 +66,8 @@ def test_retired_words_do_not_occur():
             elif path.suffix == ".py":
                 text = prose(text)
             name = path.relative_to(ROOT)
-            report += [f"{name}:{line}: {what}" for line, what in found(text, words)]
+            if any_of_them.search(text):
+                report += [f"{name}:{line}: {what}" for line, what in found(text, words)]
     assert not report, "\n" + "\n".join(report)
 
 

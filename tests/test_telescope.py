@@ -138,6 +138,7 @@ def drawn(star, n=800):
     return np.array(light)
 
 
+@pytest.mark.slow
 def test_an_unpolarized_standard_is_zero_with_the_error_of_the_catalogue():
     """q and u have the catalogue's error at each wavelength, and hang together between them."""
     for target, error in (("HD 293396", 0.0018), (None, 0.001)):

@@ -156,7 +156,7 @@ def test_pairs_by_the_plate_on_request():
         [0, 3],
         [1, 2],
     ]
-    with pytest.raises(ObservationError, match="pairing = 'time' in the meta; allowed are hwp"):
+    with pytest.raises(ObservationError, match="pairing of the meta = 'time'; allowed are hwp"):
         read(differences()).paired_by("time")
 
 

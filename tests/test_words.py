@@ -3,10 +3,12 @@
 
 import difflib
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.words import counted, did_you_mean
+from astropolcal.exceptions import FitError
+from astropolcal.words import check_choice, counted, did_you_mean
 
 NAMES = ["hwp", "derotator", "wollaston", "dichroic"]
 texts = st.text("abcdehiloprtw_", min_size=1, max_size=12)
@@ -67,3 +69,14 @@ def test_one_is_singular():
 
 def test_irregular_plural():
     assert [counted(n, "half", "halves") for n in (1, 2)] == ["1 half", "2 halves"]
+
+
+def test_choices_are_named_with_what_may_have_been_meant():
+    for value, allowed, words in [
+        ("doublo", ("double", "single"), r"x = 'doublo'; allowed are double, single; did you mean"),
+        (["double"], ("double",), r"x = \['double'\]; allowed are double"),
+        (1, (), r"x = 1; allowed are none$"),
+    ]:
+        with pytest.raises(FitError, match=words):
+            check_choice("x", value, allowed, FitError)
+    assert check_choice("x", None, ("double", None), FitError) is None

@@ -22,6 +22,7 @@ from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
 from astropolcal.pipeline.tasks import cluster_client
 from astropolcal.progress import counting, shown
+from astropolcal.words import check_choice
 
 __all__ = ["correct"]
 
@@ -220,8 +221,7 @@ def _stokes(source, solution, by_variance, **division):
 
 def _check_choices(mode, weights):
     """Return whether the variances of the fluxes weight them; refuse what is not known."""
-    if mode not in MODES:
-        raise ParameterError(f"mode = {mode!r}; allowed are {', '.join(MODES)}")
+    check_choice("mode", mode, MODES, ParameterError)
     by_variance = isinstance(weights, str)
     if by_variance and weights != "variance":
         raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
@@ -255,8 +255,7 @@ def _observable(calibration, frames, observable):
 
 def _with_brightness(frames, rows, brightness, how):
     """Return the frames with measured brightness, unless another is wanted, and doubts in words."""
-    if brightness not in (None, "measured", "given"):
-        raise ParameterError(f"brightness = {brightness!r}; allowed are 'measured', 'given'")
+    check_choice("brightness", brightness, (None, "measured", "given"), ParameterError)
     if brightness == "given" or (brightness is None and frames.scale is not None):
         return frames, []
     try:

@@ -20,6 +20,7 @@ from astropolcal.stokes import (
     polarization_angle,
     transverse_error,
 )
+from astropolcal.words import check_choice
 
 __all__ = ["Corrected"]
 
@@ -149,8 +150,7 @@ class Corrected:
         `~numpy.ndarray`
             Shape (n_components, n_components, n_wavelengths, ...); NaN where not known.
         """
-        if kind not in _KINDS:
-            raise ParameterError(f"kind = {kind!r}; allowed are {', '.join(_KINDS)}")
+        check_choice("kind", kind, _KINDS, ParameterError)
         n = len(self.components)
         result = np.full((n, n, *self.stokes.shape[1:]), np.nan)
         if kind == "statistical" and self.covariance is not None:

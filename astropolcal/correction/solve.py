@@ -14,6 +14,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -35,8 +36,7 @@ class Channels:
     """
 
     def __init__(self, observable, n_frames, pairs=None):
-        if observable not in CHANNELS:
-            raise ParameterError(f"observable = {observable!r}; allowed are {', '.join(CHANNELS)}")
+        check_choice("observable", observable, CHANNELS, ParameterError)
         self.observable, self.n_frames = observable, n_frames
         self.pairs = None
         if observable == "double":
@@ -180,8 +180,7 @@ def estimator(
     """
     # rows are (2 beams, n_wavelengths, n_frames, 4)
     rows = np.asarray(rows, dtype=float)
-    if components not in COMPONENTS:
-        raise ParameterError(f"components = {components!r}; allowed are {', '.join(COMPONENTS)}")
+    check_choice("components", components, COMPONENTS, ParameterError)
     if not max_condition > 1:
         raise ParameterError(f"max_condition = {max_condition}; it must be above 1")
     shape = rows.shape[1:3]

@@ -8,6 +8,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap._bench import ACTIONS, DETECTOR
 from astropolcal.gap.effects import EFFECTS, Context, get_effect
 from astropolcal.units import canonical_factor
+from astropolcal.words import check_choice
 
 _FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
 _MECHANISMS = ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes")
@@ -29,8 +30,7 @@ class Fault:
         """Return what the key says, drawn where it says nothing."""
         among = list(among)
         value = self.told.setdefault(key, among[self.bench.rng.integers(len(among))])
-        if value not in among:
-            raise GapError(f"{key} = {value!r}; allowed are {', '.join(map(str, among))}")
+        check_choice(key, value, among, GapError)
         return value
 
     def _draw_law(self, rng, spread=1.0):

@@ -25,7 +25,7 @@ from astropolcal.gap._faults import Fault
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.progress import shown, steps
-from astropolcal.words import counted
+from astropolcal.words import check_choice, counted
 
 __all__ = ["ChallengeResult", "make_challenge", "run_challenge", "score_answer"]
 
@@ -100,8 +100,7 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
     >>> case["faults"][0]["cells"]["in:derotator/retardance_h/time"] > 0.98
     True
     """
-    if kind not in KINDS:
-        raise GapError(f"kind = {kind!r}; allowed are {', '.join(KINDS)}")
+    check_choice("kind", kind, KINDS, GapError)
     if not (np.isfinite(snr) and snr > 0):
         raise GapError(f"snr = {snr}; it must be finite and positive")
     setup = Setup() if setup is None else setup

@@ -37,15 +37,9 @@ from astropolcal.observations.pointings import (
     sky_positions,
 )
 from astropolcal.observations.reading import common_wavelengths
+from astropolcal.words import check_choice
 
 __all__ = ["Instrument", "SkyLaw", "add_nuisance"]
-
-
-def check_choice(what, value, allowed):
-    """Raise an InstrumentError if a value is not one of those allowed."""
-    if value not in allowed:
-        words = ", ".join(map(str, allowed)) or "none"
-        raise InstrumentError(f"{what} = {value!r}; allowed are {words}")
 
 
 # what keeps the pupil, or the image, still at a Nasmyth focus
@@ -129,18 +123,18 @@ class SkyLaw:
         The ``mode``, what the derotator stabilizes, is needed where the law depends on it.
         """
         if mode is not None and self.modes:
-            check_choice("mode", mode, self.modes)
+            check_choice("mode", mode, self.modes, InstrumentError)
         if mode in self.plate:
             return self.plate[mode]
         if self.plate_depends_on_mode:
-            check_choice("mode", mode, tuple(self.plate))
+            check_choice("mode", mode, tuple(self.plate), InstrumentError)
         return next(iter(self.plate.values()))
 
     def derotator_law(self, mode):
         """Return the factors of parallactic angle and altitude in the derotator's angle."""
         if not self.derotator:
             raise InstrumentError("there is no derotator that follows the sky")
-        check_choice("law", mode, tuple(self.derotator))
+        check_choice("law", mode, tuple(self.derotator), InstrumentError)
         return self.derotator[mode]
 
 
@@ -228,8 +222,7 @@ def without_nuisance(chain):
 
 
 def _check(kind, wanted, names):
-    if kind not in NUISANCES:
-        raise InstrumentError(f"nuisance {kind!r}; allowed are {', '.join(NUISANCES)}")
+    check_choice("nuisance", kind, NUISANCES, InstrumentError)
     if wanted and wanted not in names:
         raise InstrumentError(f"nuisance {kind}: no dataset {wanted!r}; there are {names}")
 
@@ -379,11 +372,11 @@ class Instrument(ABC):
         ``choices`` are other choices by name, each with its value and what is allowed; the message
         names the instrument, the value and what is allowed.
         """
-        check_choice(f"{self.name}: source", source, self.sources)
+        check_choice(f"{self.name}: source", source, self.sources, InstrumentError)
         for name in optics_in:
-            check_choice(f"{self.name}: optics_in", name, self.optional_optics)
+            check_choice(f"{self.name}: optics_in", name, self.optional_optics, InstrumentError)
         for what, (value, allowed) in choices.items():
-            check_choice(f"{self.name}: {what}", value, allowed)
+            check_choice(f"{self.name}: {what}", value, allowed, InstrumentError)
 
     def grid(self, wavelength=None):
         """Return the wavelengths of the parameters of a chain, by default the usual ones."""

@@ -25,14 +25,14 @@ from astropy.time import Time
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
-from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
+from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import FileLayout, side_by_side
 from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date, plain_number
-from astropolcal.words import counted
+from astropolcal.words import check_choice, counted
 
 __all__ = ["IRDIS"]
 
@@ -238,7 +238,7 @@ def stated_coating(observations):
     """Return the coating that the meta of a table tell."""
     stated = observations.meta.get("coating")
     if stated is not None:
-        check_choice(f"{observations.name}: coating", stated, COATINGS)
+        check_choice(f"{observations.name}: coating", stated, COATINGS, InstrumentError)
         return stated
     date = stated_date(observations.meta, observations.name, InstrumentError)
     if date is None:
@@ -252,7 +252,7 @@ def stated_coating(observations):
 def coating_of(coating, date):
     """Return the coating of a telescope that is put before a chain, by name or date."""
     if coating is not None:
-        check_choice("coating", coating, COATINGS)
+        check_choice("coating", coating, COATINGS, InstrumentError)
     if date is None:
         if coating is None:
             warnings.warn(
@@ -312,7 +312,7 @@ def calibration_polarizer():
 
 def telescope(index, coating):
     """Return the optics from the sky to the half-wave plate."""
-    check_choice("coating", coating, COATINGS)
+    check_choice("coating", coating, COATINGS, InstrumentError)
     return [
         optics.Rotator(mount="parallactic", name="parallactic"),
         _mirror("ut", coating, index),

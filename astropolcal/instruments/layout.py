@@ -17,6 +17,7 @@ from astropy.time import Time
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.observations.pointings import offline
 from astropolcal.units import iso_date, plain_number
+from astropolcal.words import check_choice
 
 __all__ = ["FileLayout", "ReadOut"]
 
@@ -233,10 +234,7 @@ class FileLayout:
             raise InstrumentError(
                 f"shape = {self.shape}; three positive numbers are needed (wavelength, y, x)"
             )
-        if self.weights not in _WEIGHTS:
-            raise InstrumentError(
-                f"weights = {self.weights!r}; allowed are {', '.join(map(repr, _WEIGHTS))}"
-            )
+        check_choice("weights", self.weights, _WEIGHTS, InstrumentError)
         if not self.beams or len({*self.beams}) < len(self.beams):
             raise InstrumentError(f"beams = {self.beams}; names that differ are needed, at least 1")
         if len(self.star_offsets) not in (0, len(self.beams)):

@@ -23,11 +23,11 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
-from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
+from astropolcal.words import check_choice
 
 __all__ = ["VAMPIRES"]
 
@@ -426,7 +426,9 @@ def _is_modulated(observations):
     # what the table says goes before what its columns suggest
     stated = observations.meta.get("flc")
     if stated is not None:
-        check_choice(f"{observations.name}: flc", str(stated).lower(), ("in", "out"))
+        check_choice(
+            f"{observations.name}: flc", str(stated).lower(), ("in", "out"), InstrumentError
+        )
         return str(stated).lower() == "in"
     # what a calibration remembers of a dataset has no columns, but the meta say how it is paired
     frames = getattr(observations, "frames", None)

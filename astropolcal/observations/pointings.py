@@ -31,6 +31,7 @@ from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import MOVES, PLACES
 from astropolcal.units import angle_to_rad, mjd_of, plain_number
+from astropolcal.words import check_choice
 
 __all__ = ["location_of", "pointing"]
 
@@ -296,8 +297,7 @@ def smeared(angle, change, nodes=3, when="middle"):
     ``change`` is that of `motion`, ``when`` the moment that the angle belongs to: start, middle or
     end. A measurement averages the fluxes of the nodes; three are exact to fifth degree in time.
     """
-    if when not in _WHEN:
-        raise ObservationError(f"when = {when!r}; allowed are {', '.join(_WHEN)}")
+    check_choice("when", when, _WHEN, ObservationError)
     if not 1 <= nodes <= _MOST_NODES:
         raise ObservationError(f"nodes = {nodes}; allowed are 1 to {_MOST_NODES}")
     # on [-1, 1]; the weights are those that a measurement applies
@@ -390,10 +390,7 @@ def frame_coordinate(observations, name):
     """
     if "=" in name:
         return in_state(observations.frames, name, observations.name)
-    if name not in COORDINATES:
-        raise ObservationError(
-            f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
-        )
+    check_choice(f"{observations.name}: coordinate", name, COORDINATES, ObservationError)
     if name == "flc_state":
         return modulator_states(observations.frames, observations.name)
     if name in PLACES:

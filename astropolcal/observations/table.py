@@ -25,7 +25,7 @@ from astropolcal.observations.reading import (
 )
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
-from astropolcal.words import counted, html
+from astropolcal.words import check_choice, counted, html
 
 __all__ = ["Observations", "example_table"]
 
@@ -394,10 +394,7 @@ class Observations:
         in a table of single differences with that column: the state of a modulator.
         """
         value = self.meta.get("pairing", PAIRINGS[0])
-        if value not in PAIRINGS:
-            raise ObservationError(
-                f"{self._label}: pairing = {value!r} in the meta; allowed are {', '.join(PAIRINGS)}"
-            )
+        check_choice(f"{self._label}: pairing of the meta", value, PAIRINGS, ObservationError)
         return value
 
     def paired_by(self, pairing):
@@ -822,7 +819,11 @@ def _canonical(column):
     if values.dtype.kind in "iuf":
         # adding zero turns -0 into 0
         # 12 digits: what conversions between units leave of a double
-        values = np.char.mod("%.11e", np.asarray(values, dtype=float) + 0.0)
+        numbers = (np.asarray(values, dtype=float) + 0.0).ravel().tolist()
+        text = ("%.11e\x1f" * len(numbers) % tuple(numbers))[:-1]
+        if not mask.any():
+            return unit, text
+        values = np.reshape(text.split("\x1f"), values.shape)
     elif values.dtype.kind in "US":
         # a file of text has no blanks about a word, and a word that is empty is masked in it
         values = np.char.strip(values.astype(str))

@@ -19,7 +19,7 @@ from astropolcal.mueller import blank
 from astropolcal.optics.core import Optic
 from astropolcal.optics.modulated import FrameOptic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice
 
 __all__ = ["GENERATORS", "MuellerElement", "Perturbation"]
 
@@ -196,11 +196,7 @@ class Perturbation(_BeamOptic, FrameOptic):
     quadrature = Parameter(default=0.0, bounds=(-4, 4), description="size of the second function")
 
     def __init__(self, *args, kind="retardance_h", dependence="constant", **kwargs):
-        if kind not in GENERATORS:
-            raise ParameterError(
-                f"Perturbation.kind = {kind!r}{did_you_mean(kind, GENERATORS)}; allowed are "
-                f"{', '.join(GENERATORS)}"
-            )
+        check_choice("Perturbation.kind", kind, GENERATORS, ParameterError)
         self._kind, self._dependence = kind, Dependence(dependence)
         kwargs.setdefault("mount", self._dependence.driver)
         super().__init__(*args, **kwargs)

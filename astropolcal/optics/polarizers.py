@@ -15,6 +15,7 @@ from astropolcal.mueller import (
 )
 from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
+from astropolcal.words import check_choice
 
 __all__ = [
     "BeamGain",
@@ -254,8 +255,7 @@ BEAMS = {"right": 1.0, "left": -1.0}
 
 
 def _beam(value, name):
-    if value not in BEAMS:
-        raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
+    check_choice("beam", value, BEAMS, ParameterError)
     return value
 
 

@@ -48,6 +48,7 @@ from astropolcal.pipeline.headers import (
     told_beam,
 )
 from astropolcal.pipeline.library import Entry, Library
+from astropolcal.words import check_choice
 
 __all__ = ["LoadedCalibration", "SystemMueller", "load"]
 
@@ -549,8 +550,7 @@ class LoadedCalibration:
 
     def _chain(self, light, headers):
         """Return the chain from where the light enters, and the optics that are assumed."""
-        if light not in ("sky", "internal"):
-            raise ParameterError(f"light = {light!r}; allowed are 'sky', 'internal'")
+        check_choice("light", light, ("sky", "internal"), ParameterError)
         beam = None
         if self.optics_in is None and self.instrument is not None:
             beam = told_beam(headers, self.instrument)
@@ -599,8 +599,7 @@ def _degrees(name, position):
 
 def _demodulation(hwp, state, difference):
     """Return by what the beams of each frame are multiplied for I, Q and U, (3, 2, n)."""
-    if difference not in ("right-left", "left-right"):
-        raise ParameterError(f"difference = {difference!r}; allowed are right-left, left-right")
+    check_choice("difference", difference, ("right-left", "left-right"), ParameterError)
     theta = 4 * np.atleast_1d(u.Quantity(hwp).to_value(u.rad))
     sign = np.where(np.asarray(state) > 0, -1.0, 1.0) * (1 if difference == "right-left" else -1)
     ideal = np.stack([np.cos(theta), np.sin(theta)], axis=1)

@@ -13,6 +13,7 @@ from astropolcal.gap.residuals import frame_blocks
 from astropolcal.optics import GENERATORS
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.plotting import _style as st
+from astropolcal.words import check_choice
 
 __all__ = ["plot_cause_map", "plot_gap_frames", "plot_gap_maps", "plot_gap_spectrum"]
 
@@ -205,8 +206,7 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     >>> plot_gap_maps(diagnosis).axes[0].get_ylabel()
     'wavelength (nm)'
     """
-    if channel not in _CHANNELS:
-        raise ParameterError(f"channel = {channel!r}; allowed are {', '.join(_CHANNELS)}")
+    check_choice("channel", channel, _CHANNELS, ParameterError)
     c, datasets = list(_CHANNELS).index(channel), _datasets(diagnosis)
     gaps = [(before[c], after[c]) for *_, before, after in datasets]
     sizes = np.concatenate([gap.ravel() for pair in gaps for gap in pair])

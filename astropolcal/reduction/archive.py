@@ -346,14 +346,21 @@ class Manifest:
         append_line(self.path, start + json.dumps(entry), AstropolcalError)
         self.entries[entry["name"]] = entry
 
-    def state(self, name, key):
-        """Return "done" or "failed" of a sequence of such files and settings, else ""."""
+    def state(self, name, key, source=None):
+        """
+        Return "done" or "failed" of a sequence of such files and settings, else "".
+
+        A product is "older" that was made when the ``source`` of calibrations was another one, and
+        what failed then is tried again.
+        """
         entry = self.entries.get(name)
         if entry is None or entry.get("key") != key:
             return ""
         if entry.get("state") != "done":
-            return "failed"
-        return "done" if _is_there(self.path.parent / str(entry.get("product")), entry) else ""
+            return "failed" if entry.get("source") == source else ""
+        if not _is_there(self.path.parent / str(entry.get("product")), entry):
+            return ""
+        return "done" if entry.get("source") == source else "older"
 
 
 def _is_there(path, entry):

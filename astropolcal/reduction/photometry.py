@@ -9,6 +9,7 @@ import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -240,8 +241,7 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The
     options are described in `reduce_run`.
     """
-    if background not in _BACKGROUNDS:
-        raise ParameterError(f"background = {background!r}; allowed are {', '.join(_BACKGROUNDS)}")
+    check_choice("background", background, _BACKGROUNDS, ParameterError)
     if not 0 <= max_masked < 1:
         raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
     result = Photometry.empty(len(cube), len(layout.beams))

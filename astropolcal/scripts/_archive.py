@@ -2,6 +2,7 @@
 """Whole archives: ``astropolcal correct`` and ``reduce`` with ``--archive``."""
 
 import copy
+import hashlib
 import io
 import json
 import os
@@ -29,6 +30,8 @@ _DRIVING = (
 )
 _ONLY = ("gap", "cycles", "target", "retry", "timeout")
 _DEFAULTS = {"gap": 30.0}
+# of an entry of the manifest, what does not tell how the product was made
+_OF_ENTRY = ("name", "key", "n_files", "first", "source", "state")
 # reasons in the summary for machines: all are in the manifest
 _MOST_LISTED, _MOST_DOUBTS = 1000, 20
 
@@ -64,7 +67,7 @@ def run_archive(command, arguments):
 
     folder = Path(arguments.archive)
     folder.mkdir(parents=True, exist_ok=True)
-    work = _Work(command, _settled(arguments), os.path.abspath(folder))
+    work = _Work(command, _settled(arguments), os.path.abspath(folder), _source(arguments))
     where = {"workers": arguments.workers, "cluster": arguments.cluster}
     with closing(Index(folder / "index.sqlite")) as index:
         manifest = Manifest(folder / "manifest.jsonl")
@@ -74,15 +77,20 @@ def run_archive(command, arguments):
             options = {"cycles": arguments.cycles, "target": arguments.target}
             for sequence in index.sequences(gap=60 * arguments.gap, **options):
                 key = sequence.key(work.settings)
-                yield sequence, key, manifest.state(sequence.name, key)
+                yield sequence, key, manifest.state(sequence.name, key, work.source)
 
         skipped = ("done",) if arguments.retry else ("done", "failed")
         before = Counter(state for *_, state in sequences())
         total, rest = before.total(), before.total() - sum(before[state] for state in skipped)
         if not total:
             raise AstropolcalError(f"{arguments.cubes[0]}: no sequence in it{_first(index)}")
-        todo = ((s.name, key, s.instrument, s.files) for s, key, state in sequences()
-                if state not in skipped)  # fmt: skip
+
+        def todo():
+            for s, key, state in sequences():
+                if state not in skipped:
+                    before = manifest.entries[s.name] if state == "older" else {}
+                    yield s.name, key, s.instrument, s.files, before
+
         preload = [f"astropolcal.scripts._{name}" for name in _SUFFIX]
         preload += [
             "astropolcal.correction",
@@ -90,10 +98,10 @@ def run_archive(command, arguments):
             "astropolcal.pipeline.library",
         ]
         limit = None if arguments.timeout is None else 60 * arguments.timeout
-        ended = ended_tasks(work, todo, timeout=limit, preload=preload, **where)
+        ended = ended_tasks(work, todo(), timeout=limit, preload=preload, **where)
         with closing(ended), counting(total, "sequences", total - rest) as add:
             for each in ended:
-                manifest.add(_entry(each))
+                manifest.add(_entry(each, work.source))
                 add()
         found = [manifest.entries[s.name] for s, *_ in sequences()]
         content = counts | _content(found, rest, index, folder, arguments)
@@ -109,6 +117,19 @@ def _settled(arguments):
         if value is not None:
             setattr(arguments, name, type(value)(os.path.abspath(value)))
     return arguments
+
+
+def _source(arguments):
+    """Return what tells the file or the library of calibrations from what it was, None without."""
+    from astropolcal.pipeline.library import Library
+
+    path = getattr(arguments, "calibration", None)
+    if path is None or not os.path.exists(path):
+        return None
+    library = Library(path)
+    held = [[e.content_hash, str(e.validity), sorted(e.supersedes)] for e in library.entries]
+    text = json.dumps([sorted(held), sorted(map(str, library.problems))])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _indexed(index, arguments, where):
@@ -137,6 +158,7 @@ class _Work:
     command: str
     arguments: object
     folder: str
+    source: str | None = None
 
     @property
     def settings(self):
@@ -148,7 +170,7 @@ class _Work:
         from astropolcal.reduction.archive import checksum
         from astropolcal.scripts.main import earth
 
-        name, _, instrument, files = task
+        name, _, instrument, files, before = task
         started, arguments = time.monotonic(), copy.copy(self.arguments)
         product = os.path.join(self.folder, f"{name}{_SUFFIX[self.command]}")
         arguments.cubes, arguments.output, arguments.archive = files, product, None
@@ -162,8 +184,13 @@ class _Work:
         with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             warnings.filterwarnings("ignore", message="ERFA function")
+            command = import_module(f"astropolcal.scripts._{self.command}")
             with earth(arguments):
-                import_module(f"astropolcal.scripts._{self.command}").run(arguments)
+                if before:
+                    *_, made = command.choose_calibration(arguments, files)
+                    if made["calibration_hash"] == before.get("calibration_hash"):
+                        return {k: v for k, v in before.items() if k not in _OF_ENTRY}
+                command.run(arguments)
         doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
         with open(arguments.json, encoding="utf-8") as stream:
             summary = json.load(stream)
@@ -190,9 +217,9 @@ def _megabytes():
         return None
 
 
-def _entry(ended):
-    name, key, _, files = ended.task
-    entry = {"name": name, "key": key, "n_files": len(files), "first": files[0]}
+def _entry(ended, source):
+    name, key, _, files, _ = ended.task
+    entry = {"name": name, "key": key, "n_files": len(files), "first": files[0], "source": source}
     if ended.reason is not None:
         return entry | {"state": "failed", "reason": ended.reason}
     return entry | {"state": "done"} | ended.result

@@ -302,6 +302,14 @@ def _read_once(path, state):
     return calibration, content_hash(calibration)
 
 
+@lru_cache(maxsize=1)
+def _library(path, changed):
+    """Return a library, which many sequences of an archive have in common."""
+    from astropolcal.pipeline.library import Library
+
+    return Library(path)
+
+
 def _check_validity(calibration, path, arguments, night):
     """Refuse frames for which the calibration does not hold, unless the user asks for it."""
     from astropolcal.pipeline.headers import check_frames
@@ -316,13 +324,11 @@ def _check_validity(calibration, path, arguments, night):
 
 def _of_library(path, arguments, night, beam, files):
     """Return the calibration that holds for the first and the last frame."""
-    from astropolcal.pipeline.library import Library
-
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
         raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
-    library, mode = Library(path), arguments.filter or night.mode
+    library, mode = _library(path, os.stat(path).st_mtime_ns), arguments.filter or night.mode
     wanted = {"mode": mode, "optics_in": arguments.optics_in, "beam": beam}
     try:
         found = [library.find(arguments.instrument, date=date, **wanted) for date in dates]

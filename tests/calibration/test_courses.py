@@ -79,6 +79,7 @@ def test_a_step_and_a_drift_are_found_and_dated(worn):
     assert found["calibration_polarizer"]["course"] == "constant"
 
 
+@pytest.mark.slow
 def test_what_differs_from_run_to_run_is_neither_a_drift_nor_a_single_step():
     (row,) = courses([run(i, slipping) for i in range(N)], ["hwp.theta"])
     assert row["constant"] < 1e-6
@@ -86,6 +87,7 @@ def test_what_differs_from_run_to_run_is_neither_a_drift_nor_a_single_step():
     assert row["scatter"] + row["walk"] > 0.5
 
 
+@pytest.mark.slow
 def test_an_event_makes_a_faint_change_more_probable():
     def faint(truth, i):
         truth["hwp"].theta = 0.12 * (i >= 4) * u.deg
@@ -157,6 +159,7 @@ def test_health_says_what_needs_care(folder):
             health(folder, events=events)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_and_numbers(folder, tmp_path, capsys):
     page, numbers = tmp_path / "health.html", tmp_path / "health.json"
     options = ["--html", str(page), "--json", str(numbers), "--date", "2024-01-01"]

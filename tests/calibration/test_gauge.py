@@ -267,7 +267,7 @@ def test_without_a_choice_there_is_no_gauge(observations):
 
 def test_nonsense_is_refused(observations):
     for options, error, complaint in [
-        ({"gauge": "landau"}, FitError, "'minimal' and None"),
+        ({"gauge": "landau"}, FitError, "allowed are minimal, None"),
         ({"fix": {"hwp.tilt": None}}, FitError, "no parameter 'hwp.tilt'"),
         ({"fix": {"hwp.theta": 1 * u.mm}}, ParameterError, "not convertible"),
         ({"fix": {"hwp.theta": 1}}, ParameterError, "needs a unit"),

@@ -127,7 +127,7 @@ def test_nights_are_groups():
 
 
 def test_an_unknown_way_lists_the_known_ones():
-    with pytest.raises(FitError, match="by 'moon'; allowed are derotator, cycle, dataset"):
+    with pytest.raises(FitError, match="= 'moon'; allowed are derotator, cycle, dataset"):
         groups_by(_measurement(_night()), "moon")
 
 

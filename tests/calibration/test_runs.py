@@ -90,7 +90,7 @@ def test_what_changed_is_named(course, angles):
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_deviations():
     pulls, wrong = [], 0
-    for seed in range(25):
+    for seed in range(12):
         step = 0.3 * (np.arange(6) > 2)
         found = calibrate_runs(make_chain(), make_runs(step, seed=100 * seed))
         wrong += {r["what"] for r in found.courses if r["course"] != "constant"} != {"hwp.theta"}
@@ -99,9 +99,9 @@ def test_errors_are_as_large_as_the_deviations():
         value, std = elements(found, "derotator.retardance")
         truth = make_chain()["derotator"].retardance.value
         pulls.append(((value - truth + 180) % 360 - 180) / std)
-    # 150 pulls, some of them correlated
-    assert np.std(pulls) == pytest.approx(1, abs=0.25)
-    assert wrong <= 3
+    # 72 pulls, some of them correlated
+    assert np.std(pulls) == pytest.approx(1, abs=0.3)
+    assert wrong <= 2
 
 
 def test_own_values_are_those_of_calibrate():

@@ -225,17 +225,17 @@ def test_weights_without_errors():
 
 @pytest.mark.slow
 def test_linear_normal_posterior(linear):
-    posterior = sample(linear, noise=NOISE, n_walkers=32, n_steps=2200, seed=1, progress=False)
+    posterior = sample(linear, noise=NOISE, n_walkers=32, n_steps=1200, seed=1, progress=False)
     assert_normal(posterior, *exact(linear, NOISE))
     correlation = posterior.covariance.correlation[0, 1]
-    assert abs(correlation) < 5 * (posterior.autocorrelation_times.max() / (32 * 2000)) ** 0.5
+    assert abs(correlation) < 5 * (posterior.autocorrelation_times.max() / (32 * 1100)) ** 0.5
 
 
 @pytest.mark.slow
 def test_linear_normal_posterior_with_a_prior():
     prior = (0.78, 0.005)
     cal = make_calibration(False, wollaston__efficiency=Normal(*prior))
-    posterior = sample(cal, noise=NOISE, n_walkers=32, n_steps=2200, seed=2, progress=False)
+    posterior = sample(cal, noise=NOISE, n_walkers=32, n_steps=1200, seed=2, progress=False)
     mean, std = exact(cal, NOISE, prior)
     assert abs(mean[1] - exact(cal, NOISE)[0][1]) > 5 * std[1]
     assert_normal(posterior, mean, std)
@@ -648,5 +648,5 @@ def test_thicknesses_of_dataset_3_are_degenerate(paper):
     correlation = paper.covariance.correlation
     assert correlation[0, 1] > 0.99
     assert correlation[2, 4] > 0.99
-    # the paper: 80 steps (10,000 are 125 times as long); ours in 10,000 steps: 64
-    assert 25 < paper.autocorrelation_times.max() < 120
+    # the paper, with stretch moves: 80 steps; steps around the fit: 10
+    assert paper.autocorrelation_times.max() < 20

@@ -308,6 +308,7 @@ def test_polish_with_priors_reaches_the_minimum_of_both(make):
         np.testing.assert_allclose(vector[element], best.x, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_thickness_off_by_little_ends_in_no_other_minimum():
     """A plate off by 0.3 %, and turned by a degree: the first valley may be a wrong one."""
     rng = np.random.default_rng(4)

@@ -393,7 +393,7 @@ def test_nights_predict_each_other(make, chain, measurement):
 def test_one_group_and_unknown_groups_are_refused(measurement):
     with pytest.raises(FitError, match="all data are in one group, dataset number 0"):
         groups_by(measurement, "dataset")
-    with pytest.raises(FitError, match="groups by 'moon'; allowed are derotator, cycle, dataset"):
+    with pytest.raises(FitError, match="groups = 'moon'; allowed are derotator, cycle, dataset"):
         groups_by(measurement, "moon")
 
 

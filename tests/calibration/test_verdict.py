@@ -123,7 +123,6 @@ def test_a_forgotten_mount_leaves_nothing_to_fit(example):
 def test_real_data_fit_a_terminal(shared_data):
     for name, patterns, first in (
         ("charis", ["charis/dataset3*", "charis/dataset4*", "charis/hd293396*"], "Usable: "),
-        ("vampires", ["vampires/*.ecsv"], "Usable: "),
         (
             "vampires",
             ["vampires/*internal_[67o]*"],

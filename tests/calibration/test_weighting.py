@@ -148,9 +148,9 @@ def test_levels_are_unbiased(truth, data):
 
 @pytest.mark.slow
 def test_errors_are_right_where_wavelengths_are_unequally_noisy(make, truth):
-    """40 runs of 11 parameters: the pulls have unit width, also where one level weighted all."""
+    """24 runs of 11 parameters: the pulls have unit width, also where one level weighted all."""
     pulls = {None: [], "wavelength": []}
-    for seed in range(40):
+    for seed in range(24):
         observed = unequal(make, truth, seed)
         for choice, found in pulls.items():
             cal = fit(truth, observed, choice)

@@ -22,7 +22,7 @@ from astropolcal.simulation import half_wave_plate_cycles, simulate
 LAM = np.geomspace(1200, 2200, 5) * u.nm
 X = np.log(LAM / np.sqrt(LAM[0] * LAM[-1])).value
 OPTICS = ["dichroic", "nbs"]
-N_CALIBRATIONS = 25
+N_CALIBRATIONS = 14
 # of what a frame, and all frames at a derotator angle, have wrong: of the lamp's polarization
 FRAME = SETTING = 0.002
 # and of weakly polarized light
@@ -148,7 +148,7 @@ def test_claims_on_sky_cover_what_is_wrong():
         pulls.append(pulls_on_sky(cal, sky, rng))
     pulls = np.array(pulls)
     inside = np.mean(np.abs(pulls) < 1, axis=(0, 2))
-    # 68 % within four, and what 25 calibrations scatter by
+    # 68 % within four, and what 14 calibrations scatter by
     assert inside.mean() == pytest.approx(0.70, abs=0.06)
     assert np.abs(inside - 0.70).max() < 0.15
     width = np.sqrt(np.mean(pulls**2, axis=(0, 2)))

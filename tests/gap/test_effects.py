@@ -362,6 +362,7 @@ def test_library_is_large_and_in_words(repository, shared_data):
     assert known <= set(EFFECTS)
 
 
+@pytest.mark.slow
 def test_checks_of_every_effect():
     """Identity at zero, names, derivatives of both channels against differences."""
     for name in CASES:
@@ -452,6 +453,7 @@ def seen(effect, chains, data, like, tangent, size=None):
     return slopes - tangent @ (tangent.T @ slopes)
 
 
+@pytest.mark.slow
 def test_every_effect_is_the_cells_that_it_says():
     for name in SMOOTH:
         effect, (chains, data) = EFFECTS[name], clean(name)
@@ -648,7 +650,7 @@ def refused():
     yield tinted(category="discrete"), "discrete and has parameters"
     yield tinted(when=lambda roles: False), "has no place"
     yield tinted(title=""), "lacks title"
-    yield tinted(category="magic"), "kind 'magic'; allowed are optic"
+    yield tinted(category="magic"), "kind = 'magic'; allowed are optic"
 
 
 def test_check_refuses():

@@ -51,6 +51,7 @@ def test_half_a_wave_that_is_one_is_no_cause():
     assert diagnose(plate_chain(free=True), data).causes == []
 
 
+@pytest.mark.slow
 def test_a_parameter_beyond_its_bound_is_named():
     true, narrow = chain(), chain()
     true["hwp"].theta = 2 * u.deg
@@ -104,6 +105,7 @@ def test_no_size_makes_more_polarization_than_there_is(place, kind, size, possib
     assert model.keeps_polarization(cell.name) is possible
 
 
+@pytest.mark.slow
 def test_a_held_source_is_looked_at_like_all_others():
     """VAMPIRES with a lamp of which the model says that it knows the polarization."""
     for q, u_ in [(0.87, 0.1), (0.9, 0.13)]:

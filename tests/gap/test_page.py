@@ -116,6 +116,7 @@ class Outline(HTMLParser):
 # ---- in a browser --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_browser_shows_all_of_it_without_a_complaint(browser, page, tmp_path):
     dom, complaints = rendered(browser, page, tmp_path / "profile")
     assert complaints == []

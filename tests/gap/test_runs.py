@@ -63,6 +63,7 @@ def changed_content():
 # ---- what changed ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_change_is_found_with_its_run_cell_and_size():
     content = changed_content()
     first, *others = content["changes"]
@@ -117,6 +118,7 @@ def test_nothing_changed_is_said_where_it_was_asked():
     assert "Nothing changed between" in summary(found)
 
 
+@pytest.mark.slow
 def test_one_of_three_runs_differs():
     runs = [*pair(names=("a", "b")), data.observed(with_cell(BEHIND), seed=9, name="c")]
     content = to_dict(diagnose(data.chain(), runs, changes=True))
@@ -133,6 +135,7 @@ def test_one_of_three_runs_differs():
     )
 
 
+@pytest.mark.slow
 def test_a_gain_of_one_run_that_drifts():
     drift = ("detector", "gain", "harmonic:derotator:1", 0.01)
     found = diagnose(data.chain(), pair([], [drift]), changes=True)
@@ -144,6 +147,7 @@ def test_a_gain_of_one_run_that_drifts():
     assert found.remainder_p_value > 1e-4
 
 
+@pytest.mark.slow
 def test_what_an_optic_of_one_run_brought():
     parts = list(leaves(data.chain()))
     dichroic = LinearRetarder(name="dichroic", fixed={"retardance": True})
@@ -294,6 +298,7 @@ def tables(tmp_path):
     return found
 
 
+@pytest.mark.slow
 def test_changes_on_the_command_line(tables, tmp_path, capsys):
     out = tmp_path / "out.json"
     options = ["--derotator", "linear", "--changes", "-q", "--json", str(out)]

@@ -12,7 +12,6 @@ from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import Instrument, SkyLaw, add_nuisance
-from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.telescope import fold_mirror, misaligned, polarizer
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -97,11 +96,6 @@ def test_choice_that_is_not_known():
 
 def test_choices_that_are_known_pass():
     assert BENCH.check_choices("star", ("window",), m3=("free", ("free",))) is None
-
-
-def test_nothing_is_allowed_where_there_is_no_choice():
-    with pytest.raises(InstrumentError, match=r"x = 1; allowed are none$"):
-        check_choice("x", 1, ())
 
 
 # --- wavelengths -----------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def test_a_mean_of_exposures_has_the_electrons_of_all():
 
 
 def test_weights_are_one_of_two():
-    with pytest.raises(InstrumentError, match="weights = 'sigma'; allowed are 'inverse variance'"):
+    with pytest.raises(InstrumentError, match="weights = 'sigma'; allowed are inverse variance"):
         layout(weights="sigma")
 
 

@@ -234,7 +234,7 @@ def test_reciprocal_weighs_what_the_frame_before_leaves_behind():
 
 
 def test_unknown_coordinate():
-    with pytest.raises(ObservationError, match="night: no coordinate 'fluxes'; allowed are sequen"):
+    with pytest.raises(ObservationError, match="night: coordinate = 'fluxes'; allowed are sequen"):
         frame_coordinate(make(), "fluxes")
 
 

@@ -163,7 +163,7 @@ def test_a_table_without_any_pair_is_an_error(n_frames, words):
 
 def test_unknown_pairing_is_refused():
     obs = modulated((0, 0, 45, 45), "ABAB")
-    words = "night: pairing = 'time' in the meta; allowed are hwp, flc_state"
+    words = "night: pairing of the meta = 'time'; allowed are hwp, flc_state"
     with pytest.raises(ObservationError, match=words):
         obs.paired_by("time")
     obs.meta["pairing"] = "time"

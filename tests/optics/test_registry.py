@@ -674,6 +674,7 @@ def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=6)
@@ -688,6 +689,7 @@ def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=6)
@@ -718,6 +720,7 @@ def test_position_adds_to_theta(label, data, theta, position):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=6)
@@ -745,6 +748,7 @@ def test_without_amplitude_a_frame_optic_is_the_identity(label, data, theta):
     np.testing.assert_allclose(optic.mueller(), np.eye(4), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=6)
@@ -785,6 +789,7 @@ def differences(optic, key, position=None):
     return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=3)

@@ -275,6 +275,34 @@ def test_the_calibration_of_each_sequence_comes_from_a_library(lab, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_newer_calibration_makes_its_products_again(lab, tmp_path):
+    folder, out = tmp_path / "library", tmp_path / "out"
+    folder.mkdir()
+    first = Library(folder).add(Calibration.read(lab / "charis.asdf"), valid_until="2040-01-01")
+    words = ["correct", lab / "tree", "--archive", out, "--calibration", folder, "-q"]
+    words = list(map(str, [*words, *OPTIONS[1:]]))
+    assert main(words) == 0
+    made = {path: path.stat().st_mtime_ns for path in out.glob("*.fits")}
+    assert len(made) == N
+    # one of other years concerns none of them: they are looked at, and stay
+    other = Calibration.read(lab / "charis.asdf")
+    Library(folder).add(other, "other.asdf", valid_from="2040-01-01")
+    assert main(words) == 0
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    assert len(entries(out)) == 2 * N
+    assert main(words) == 0
+    assert len(entries(out)) == 2 * N
+    # one in place of the first concerns all
+    newer = Calibration.read(lab / "charis.asdf")
+    newer.chain["hwp"].theta = newer.chain["hwp"].theta.quantity + 1 * u.deg
+    added = Library(folder).add(newer, "newer.asdf", supersedes=[first.name])
+    digest = next(e.content_hash for e in Library(folder).entries if e.name == added.name)
+    assert main(words) == 0
+    assert {e["calibration_hash"] for e in entries(out)[2 * N :]} == {digest}
+    assert all(path.stat().st_mtime_ns > before for path, before in made.items())
+
+
+@pytest.mark.slow
 def test_an_archive_is_reduced(lab, tmp_path):
     charis = instruments.get("charis")
     (tmp_path / "tree").mkdir()
@@ -321,15 +349,15 @@ def test_bad_input(lab, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_loses_nothing(tmp_path):
-    """Twenty sequences: what a cluster gives is to the last bit what one process gives."""
+    """Eight sequences: what a cluster gives is to the last bit what one process gives."""
     pytest.importorskip("distributed", reason="distributed is not installed")
     calibration = tmp_path / "charis.asdf"
-    bench.write_sequences(tmp_path / "tree", bench.write_calibration(calibration), range(20))
+    bench.write_sequences(tmp_path / "tree", bench.write_calibration(calibration), range(8))
     serial, _ = bench.correct(tmp_path / "tree", calibration, tmp_path / "one", "--workers", 1)
-    with bench.LossyCluster(tmp_path / "two", [5]) as cluster:
+    with bench.LossyCluster(tmp_path / "two", [3]) as cluster:
         options = ("--cluster", cluster.address)
         parallel, _ = bench.correct(tmp_path / "tree", calibration, tmp_path / "two", *options)
     assert len(cluster.killed) == 1
-    assert serial["n_done"] == parallel["n_done"] == 20
-    assert len(list((tmp_path / "two").glob("*.fits"))) == 20
+    assert serial["n_done"] == parallel["n_done"] == 8
+    assert len(list((tmp_path / "two").glob("*.fits"))) == 8
     assert bench.differing(tmp_path / "one", tmp_path / "two") == []

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""docs/command_line.rst against the parsers: every command and option, and nothing else."""
+"""docs/commands against the parsers: every command and option, and nothing else."""
 
 import argparse
 import re
@@ -23,10 +23,9 @@ def options(parser):
 
 @pytest.fixture(scope="module")
 def sections(repository):
-    """Text of the page by command."""
-    text = (repository / "docs" / "command_line.rst").read_text(encoding="utf-8")
-    parts = re.split(r"^([a-z]+)\n-{4,}\n", text, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
+    """Text of the pages by command."""
+    pages = (repository / "docs" / "commands").glob("*.rst")
+    return {page.stem: page.read_text(encoding="utf-8") for page in pages}
 
 
 def table_of(section):
@@ -35,17 +34,17 @@ def table_of(section):
     return "\n".join(line[:25] for line in tables[1].splitlines()) if len(tables) > 1 else ""
 
 
-def test_every_command_has_a_section(sections):
+def test_every_command_has_a_page(sections, repository):
     assert set(sections) == set(COMMANDS)
+    overview = (repository / "docs" / "command_line.rst").read_text(encoding="utf-8")
+    assert set(re.findall(r":doc:`commands/(\w+)`", overview)) == set(COMMANDS)
 
 
-def test_every_option_is_in_its_section(sections):
+def test_every_option_is_on_its_page(sections):
     for command in COMMANDS:
         named = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", sections[command]))
         missing = options(COMMANDS[command]) - named
-        assert not missing, (
-            f"docs/command_line.rst, {command}: describe {', '.join(sorted(missing))}"
-        )
+        assert not missing, f"docs/commands/{command}.rst: describe {', '.join(sorted(missing))}"
 
 
 def test_the_table_has_no_option_that_is_gone(sections):
@@ -53,9 +52,7 @@ def test_the_table_has_no_option_that_is_gone(sections):
         named = set(re.findall(r"--[a-z][a-z0-9-]*", table_of(sections[command])))
         assert named, command
         unknown = named - options(COMMANDS[command]) - {"--quiet"}
-        assert not unknown, (
-            f"docs/command_line.rst, {command}: {', '.join(sorted(unknown))} is gone"
-        )
+        assert not unknown, f"docs/commands/{command}.rst: {', '.join(sorted(unknown))} is gone"
 
 
 def test_stated_defaults_are_those_of_the_parser(sections):

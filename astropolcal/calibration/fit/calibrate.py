@@ -44,6 +44,7 @@ from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
     ROUNDS,
+    TALL,
     Problem,
     Weighting,
     describe,
@@ -68,6 +69,7 @@ from astropolcal.measurement.parameters import ROUNDING, with_own
 from astropolcal.progress import stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
+from astropolcal.words import check_choice
 
 __all__ = ["calibrate"]
 
@@ -249,8 +251,7 @@ def calibrate(
 def _check_choices(*values):
     choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
     for (name, allowed), value in zip(choices.items(), values, strict=True):
-        if value not in allowed:
-            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+        check_choice(name, value, allowed, FitError)
 
 
 def _fixed(chain, fix):
@@ -333,6 +334,15 @@ def _run(measurement, weighting, fitter):
 def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     stage(f"fitting {measurement.free.size} parameters")
+    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL:
+        # the same steps by triangular factors, for which the fitter has no place
+        vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
+        measurement.stand_at(vector)
+        return {
+            "converged": found.success,
+            "message": found.message,
+            "evaluations": int(found.nfev),
+        }
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:

@@ -25,6 +25,7 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
 from astropolcal.exceptions import ParameterError
 from astropolcal.progress import stage
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -265,8 +266,7 @@ class Model:
         }
         _check_known(vary, known, "vary")
         for what, course in vary.items():
-            if course not in COURSES:
-                raise ParameterError(f"vary: {what} = {course!r}; allowed are {', '.join(COURSES)}")
+            check_choice(f"vary: {what}", course, COURSES, ParameterError)
             names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
             if course in ("walk", "scatter"):
                 best = self._weighed(names, self._parts()).best([course])

@@ -45,7 +45,7 @@ from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import stated_date
 from astropolcal.progress import stage, steps
-from astropolcal.words import counted
+from astropolcal.words import check_choice, counted
 
 __all__ = ["RunsCalibration", "calibrate_runs"]
 
@@ -131,8 +131,7 @@ def calibrate_runs(
     >>> [str(varies[key][0]) for key in ("what", "course", "when")]
     ['hwp.theta', 'steps', '2022-03-01 to 2023-03-01']
     """
-    if errors not in ERRORS:
-        raise FitError(f"errors = {errors!r}; allowed are {', '.join(ERRORS)}")
+    check_choice("errors", errors, ERRORS, FitError)
     parts = _parts(chains, runs)
     dates = _dates(parts, needed=bool(vary))
     kept = _Checkpoint(checkpoint, [_fingerprint(*part, observable) for part in parts])

@@ -29,6 +29,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.progress import steps
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -506,8 +507,7 @@ def describe_gauge(gauge, chosen, free, held):
 
     ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
     """
-    if gauge not in GAUGES:
-        raise FitError(f"gauge = {gauge!r}; allowed are 'minimal' and None")
+    check_choice("gauge", gauge, GAUGES, FitError)
     parts = [f"held: {', '.join(held)}"] if held else []
     if free.priors:
         parts.append(f"prior on {', '.join(slot.name for slot, _ in free.priors)}")

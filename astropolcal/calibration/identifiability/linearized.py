@@ -18,6 +18,8 @@ __all__ = []
 RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
+# rows of a block of a triangular factorization
+_BLOCK = 4096
 # a parameter that moves by less than this share along an open direction is static
 STILL = 1e-5
 
@@ -65,6 +67,16 @@ def decompose(rows):
     return Directions(singular, right, int(np.sum(singular > threshold)))
 
 
+def triangle(rows):
+    """Return the triangular factor of rows, or the rows themselves where there are few."""
+    if len(rows) <= rows.shape[1]:
+        return rows
+    # factors of blocks that fit into the cache, and their factor
+    step = max(_BLOCK, 4 * rows.shape[1])
+    parts = [np.linalg.qr(rows[i : i + step], mode="r") for i in range(0, len(rows), step)]
+    return parts[0] if len(parts) == 1 else triangle(np.concatenate(parts))
+
+
 def orthonormal(columns, keep=RANK):
     """
     Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
@@ -99,8 +111,7 @@ class Whitened:
     @cached_property
     def _square(self):
         """The triangular factor: as good as all rows, and much shorter."""
-        rows = self.rows
-        return np.linalg.qr(rows, mode="r") if len(rows) > rows.shape[1] else rows
+        return triangle(self.rows)
 
     @cached_property
     def data(self):

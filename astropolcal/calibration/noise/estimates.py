@@ -20,6 +20,7 @@ from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.units import angle_to_rad
+from astropolcal.words import check_choice
 
 __all__ = [
     "noise_from_errors",
@@ -375,8 +376,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     >>> int(noise.dof[0]), noise.method
     (8, 'null channel')
     """
-    if null_model not in _NULL_MODELS:
-        raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
+    check_choice("null_model", null_model, _NULL_MODELS, FitError)
     _need_two_beams(measurement, "the null channel")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]

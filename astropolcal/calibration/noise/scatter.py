@@ -24,6 +24,7 @@ import numpy as np
 from astropolcal.exceptions import FitError
 from astropolcal.observations.grid import clusters, cycle_numbers, is_star, runs_of_frames
 from astropolcal.observations.pointings import angle_or_zero
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -65,8 +66,7 @@ def groups_by(measurement, by="derotator"):
     plate angle (of one state of a modulator) comes again or the derotator moves. The plus frame of
     a datum counts.
     """
-    if by not in GROUPS:
-        raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
+    check_choice("groups", by, GROUPS, FitError)
     groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
     names = _members(measurement, groups, by)
     if len(names) < 2:
@@ -134,6 +134,8 @@ _CHANCE = 2.0
 _INDEPENDENT = 0.05
 # and principal components of the errors at settings below so many times what they have by chance
 _MORE = 1.5
+# columns of derivatives that are worked on at once
+_COLUMNS = 16
 # a part of which the fit leaves less than this share is not seen in the residuals
 _LEFT = 0.05
 
@@ -249,11 +251,17 @@ class Scatter:
         # what a component of the scatter (columns) adds to a product of residuals (rows):
         # tr(A M B M) with M = 1 - U U^T, the residuals of a fit
         full = part.overlaps()
-        before = [matrix / part.amplitude[:, None] for matrix in part.applied(down)]
-        behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up)]
-        inner = [(slopes.T @ a, slopes.T @ b) for a, b in zip(before, behind, strict=True)]
-        seen = full - 2 * np.array([[np.sum(a * b) for b in behind] for a in before])
-        seen += np.array([[np.sum(a * b.T) for _, b in inner] for a, _ in inner])
+        n, rank = len(full), slopes.shape[1]
+        seen, inner = full.copy(), np.empty((rank, 2 * n, rank))
+        for i in range(0, rank, _COLUMNS):
+            # a few columns at a time: all components of all of them need not be held at once
+            some = slice(i, i + _COLUMNS)
+            before = [matrix / part.amplitude[:, None] for matrix in part.applied(down[:, some])]
+            behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up[:, some])]
+            seen -= 2 * np.array([[np.vdot(a, b) for b in behind] for a in before])
+            product = slopes.T @ np.concatenate([*before, *behind], axis=1)
+            inner[:, :, some] = product.reshape(rank, 2 * n, -1)
+        seen += np.einsum("iaj,jbi->ab", inner[:, :n], inner[:, n:], optimize=True)
         size = np.diag(full)
         told = np.diag(seen) > _LEFT * size
         if not np.isfinite(seen).all():
@@ -397,8 +405,7 @@ BLOCKS = ("derotator", "pair")
 
 def labels_of(measurement, block):
     """Return the number of the block of each datum; datasets have their own blocks."""
-    if block not in BLOCKS:
-        raise FitError(f"block = {block!r}; allowed are {', '.join(BLOCKS)}")
+    check_choice("block", block, BLOCKS, FitError)
     if block == "derotator":
         return leave_out_groups(measurement)
     sizes = [len(dataset.frames) for dataset in measurement.datasets]

@@ -18,15 +18,18 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
-from astropolcal.calibration.identifiability.linearized import Whitened
+from astropolcal.calibration.identifiability.linearized import Whitened, triangle
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]
 
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
+# more data than these are fitted by their triangular factor
+TALL = 20_000
 # smallest weight, so that no datum is lost altogether
 _LEAST = 1e-4
 
@@ -43,8 +46,7 @@ LOSSES = {
 
 def robust_sigma(measurement, loss):
     """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
-    if loss not in LOSSES:
-        raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
+    check_choice("loss", loss, LOSSES, FitError)
     residuals = measurement.residuals()
     scale = _scales(measurement, residuals)
     # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
@@ -256,7 +258,7 @@ class Problem:
         return Whitened(rows[:, :n], physical_scale(free), rows[:, n:], free.at_bounds(vector))
 
     def fit(self, start, counts=None, held=()):
-        """Return the vector, chi-square, and whether the fit arrived.
+        """Return the vector, chi-square, and what scipy says of the fit.
 
         ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
         """
@@ -274,16 +276,42 @@ class Problem:
 
         # a radian, a micrometre and a 1 move the data by very different amounts
         size = np.linalg.norm(self.jacobian(start, weights), axis=0)[live]
+
+        def residuals(part):
+            return self.residuals(place(part), weights)
+
+        def slopes(part):
+            return self.jacobian(place(part), weights)[:, live]
+
+        if self.measurement.n_data > TALL:
+            residuals, slopes = _short(residuals, slopes)
         found = least_squares(
-            lambda part: self.residuals(place(part), weights),
+            residuals,
             # least_squares refuses a start outside of the bounds by a rounding error
             np.clip(start[live], self._low[live], self._high[live]),
-            jac=lambda part: self.jacobian(place(part), weights)[:, live],
+            jac=slopes,
             bounds=(self._low[live], self._high[live]),
             x_scale=1 / np.where(size > 0, size, 1.0),
             max_nfev=_MAX_EVALUATIONS,
         )
-        return place(found.x).copy(), 2 * found.cost, found.status > 0
+        return place(found.x).copy(), 2 * found.cost, found
+
+
+def _short(residuals, slopes):
+    """
+    Return residuals and their derivatives, turned so that all but a few rows are zero.
+
+    The triangular factor of both has the same sums of squares and products as they have: a fitter
+    takes the same steps, and decomposes a small matrix in place of a tall one.
+    """
+    seen = [None, None]
+
+    def turned(part):
+        if seen[0] is None or (seen[0] != part).any():
+            seen[:] = part.copy(), triangle(np.column_stack([slopes(part), residuals(part)]))
+        return seen[1]
+
+    return lambda part: turned(part)[:, -1], lambda part: turned(part)[:, :-1]
 
 
 # ---- the choices ------------------------------------------------------------------------
@@ -300,8 +328,10 @@ def first_weighting(measurement, weights):
     if weights == GIVEN:
         raise FitError("weights='given': this measurement was not fitted with a noise given to it")
     if weights not in CHOICES:
+        hint = did_you_mean(weights, CHOICES[1:])
         raise FitError(
             f"weights = {weights!r}; allowed are None, 'wavelength', 'errors', or the noise itself"
+            f"{hint}"
         )
     if weights != "errors":
         return Weighting(weights, np.full(measurement.n_data, np.nan))

@@ -205,8 +205,6 @@ _WIDEST, _START = 5.0, 0.3
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
 _MAX_DRAWS, _MAX_HALVINGS = 50, 60
-# up to so many parameters the stretch move is as good as any
-_FEW = 10
 # least part of a walker's place that a step around the fit draws anew
 _LEAST_ANEW = 0.1
 # emcee up to this version accepts snooker steps with a wrong probability (its pull request 531):
@@ -294,12 +292,9 @@ def _inward(log_posterior):
 def default_moves(emcee, laplace):
     """Return what moves the walkers, with the share of each.
 
-    For few parameters the stretch move. For more, steps around the fit, as good in a hundred
-    parameters as in one; steps of what sits at a bound alone; and differential evolution, which
-    needs no fit.
+    Steps around the fit, as good in a hundred parameters as in one; steps of what sits at a bound
+    alone; and differential evolution, which needs no fit.
     """
-    if laplace.centre.size <= _FEW:
-        return [(emcee.moves.StretchMove(), 1.0)]
     moves = [(emcee.moves.DEMove(), 0.3)]
     if laplace.determined.any():
         moves.append((_crank_nicolson(emcee, laplace), 0.5))
@@ -425,10 +420,9 @@ def sample(
     progress : bool
         Whether to show how far it is; on a terminal only.
     moves : object or list, optional
-        Moves of emcee. By default its stretch move for up to 10 parameters;
-        for more a mixture of preconditioned Crank-Nicolson steps around the
-        fit, which are large where the posterior is nearly normal, and of
-        differential evolution.
+        Moves of emcee. By default a mixture of preconditioned Crank-Nicolson
+        steps around the fit, which are large where the posterior is nearly
+        normal, and of differential evolution.
 
     Returns
     -------

@@ -41,6 +41,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.progress import counting, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
+from astropolcal.words import check_choice
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
@@ -456,8 +457,8 @@ def _resample(refit, counts, wanted):
     """Return the fit to a resample; None if it determines less than all data, or fails."""
     if np.any(_singular_values(refit, np.sqrt(counts))[: wanted.size] < _LOST * wanted):
         return None
-    vector, _, arrived = refit.fit(refit.solution, counts)
-    return vector if arrived else None
+    vector, _, found = refit.fit(refit.solution, counts)
+    return vector if found.success else None
 
 
 def _singular_values(refit, scale):
@@ -552,8 +553,7 @@ def standard_errors(calibration, method=None, groups=None):
     ['calibration_polarizer.theta', 'hwp.theta']
     """
     method = ("covariance" if groups is None else "robust") if method is None else method
-    if method not in METHODS:
-        raise FitError(f"method = {method!r}; allowed are {', '.join(METHODS)}")
+    check_choice("method", method, METHODS, FitError)
     if groups is not None and method != "robust":
         raise FitError(f"method = {method!r} knows no groups; 'robust' does")
     covariance = calibration.covariance
@@ -648,8 +648,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     >>> bool(0.5 < robust.std("hwp.w_sio2") / cal.covariance.std("hwp.w_sio2") < 2)
     True
     """
-    if correction not in CORRECTIONS:
-        raise FitError(f"correction = {correction!r}; allowed are {', '.join(CORRECTIONS)}")
+    check_choice("correction", correction, CORRECTIONS, FitError)
     problem = problem_of(calibration)
     measurement, whitened = problem.measurement, problem.around()
     labels = _labels(measurement, groups)

@@ -28,6 +28,7 @@ from astropolcal.files import columns
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
+from astropolcal.words import check_choice
 
 __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
 
@@ -160,10 +161,7 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
     >>> bool((table["s_chi"] < 0.05 * u.deg).all())
     True
     """
-    if open_directions not in _OPEN:
-        raise ParameterError(
-            f"open_directions = {open_directions!r}; allowed are {', '.join(_OPEN)}"
-        )
+    check_choice("open_directions", open_directions, _OPEN, ParameterError)
     wanted = [_target(dolp, aolp) for dolp, aolp in targets]
     view, ignore = view_of_calibration(calibration), open_directions == "ignore"
     return _accuracies(calibration, targets, wanted, view, ignore)

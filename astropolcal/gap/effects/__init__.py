@@ -14,7 +14,7 @@ from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.where import Roles, adapted
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = [
     "EFFECTS",
@@ -170,10 +170,7 @@ def _check_declared(effect):
     lacking = [key for key in _NEEDED if not getattr(effect, key)]
     if lacking:
         raise GapError(f"effect {effect.name or type(effect).__name__} lacks {', '.join(lacking)}")
-    if effect.kind not in KINDS:
-        raise GapError(
-            f"effect {effect.name}: kind {effect.kind!r}; allowed are {', '.join(KINDS)}"
-        )
+    check_choice(f"effect {effect.name}: kind", effect.kind, KINDS, GapError)
 
 
 def _check_against(effect, chains, observations):
