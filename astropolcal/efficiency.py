@@ -28,14 +28,7 @@ from astropolcal.simulation import beams_of_frames, stage_positions
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um
 from astropolcal.words import check_choice, counted
 
-__all__ = [
-    "BestDerotator",
-    "Demodulation",
-    "best_derotator",
-    "best_modulation",
-    "demodulation",
-    "polarimetric_efficiency",
-]
+__all__ = ["best_derotator", "best_modulation", "demodulation", "polarimetric_efficiency"]
 
 # plus and minus angles of the half-wave plate, and where a modulator has exchanged the beams
 _CYCLE = [0, 45, 22.5, 67.5] * u.deg
@@ -334,7 +327,7 @@ def best_derotator(
 
     Returns
     -------
-    BestDerotator
+    ``BestDerotator``
 
     Raises
     ------
@@ -457,7 +450,7 @@ def demodulation(chain, wavelength, frames, *, components="IQUV", variance=None)
 
     Returns
     -------
-    Demodulation
+    ``Demodulation``
 
     Raises
     ------
@@ -549,7 +542,7 @@ def best_modulation(chain, wavelength, frames, free, *, components="IQUV", seed=
         A copy with the parameters found.
     frames : `~astropy.table.QTable`
         A copy with the angles found, 0 to 180 deg.
-    best : Demodulation
+    best : ``Demodulation``
 
     Raises
     ------

@@ -17,21 +17,21 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
 
-__all__ = ["elliptical_retarder", "is_physical", "linear_retarder", "rotate"]
+__all__ = ["elliptical_retarder", "linear_retarder", "rotate"]
 
 # sums of four factors, each known to a few 1e-16, lie on the limit to within this
 _ROUNDING = 1e-12
 
 
-def _mueller_array(matrix, name="matrix"):
+def _mueller_array(matrix):
     """Return finite floats of shape (..., 4, 4), or raise."""
-    matrix = to_unit(matrix, None, name)
+    matrix = to_unit(matrix, None, "matrix")
     if matrix.shape[-2:] != (4, 4):
-        raise ParameterError(f"{name} has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
+        raise ParameterError(f"matrix has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
     bad = np.argwhere(~np.isfinite(matrix)).tolist()
     if bad:
         where = tuple(bad[0])
-        raise ParameterError(f"{name} = {matrix[where]} at index {where} must be finite")
+        raise ParameterError(f"matrix = {matrix[where]} at index {where} must be finite")
     return matrix
 
 

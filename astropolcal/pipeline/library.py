@@ -69,7 +69,7 @@ class Entry:
         The file.
     calibration : Calibration or None
         What it holds; None to read it when it is asked for.
-    validity : Validity
+    validity : ``Validity``
         For what it holds.
     content_hash : str
         SHA-256 of all that the file keeps.
@@ -79,7 +79,7 @@ class Entry:
     Examples
     --------
     >>> from astropolcal.pipeline import Entry
-    >>> from astropolcal.calibration.result import Validity
+    >>> from astropolcal.calibration.result.calibration import Validity
     >>> Entry("cal.asdf", None, Validity("lab"), "00").validity.instrument
     'lab'
     """

@@ -301,7 +301,7 @@ class LoadedCalibration:
     calibration : Calibration
         All that the file holds.
     path : `~pathlib.Path`
-    validity : Validity
+    validity : ``Validity``
     content_hash : str
         Of the file's content, for the provenance of products.
 

@@ -74,7 +74,7 @@ def plot_polarimetric_efficiency(
 
 def plot_derotator_offsets(best, *, title=None, figure=None):
     """
-    Draw mean and least efficiency of an observation, a `BestDerotator`, against the offset.
+    Draw mean and least efficiency of an observation, a ``BestDerotator``, against the offset.
 
     Over its times, wavelengths and angles of polarization; the best offset is marked.
     """
@@ -100,7 +100,7 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
 
 
 def plot_efficiencies(found, wavelength, *, title=None, figure=None):
-    """Draw the efficiency of each Stokes parameter, of a `Demodulation`, against the wavelength."""
+    """Draw the efficiency of each Stokes parameter of a ``Demodulation`` by wavelength."""
     lam = st.nanometres(wavelength)
     with st.canvas(figure, 5.5, 4.5) as fig:
         ax = fig.subplots()

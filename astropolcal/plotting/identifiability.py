@@ -70,7 +70,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     ----------
     calibration : Calibration or Identifiability
         What was found. A calibration that was read from a file has no angles, and an
-        `~astropolcal.calibration.identifiability.analysis.Identifiability` alone has no
+        ``Identifiability`` alone has no
         errors: panels then show what there is.
     weakest : int
         How many of the determined directions to show, those with the largest errors; more
@@ -293,7 +293,9 @@ def _draw_loadings(figure, axes, finding, rows):
         _say(axes, "no open direction; errors are not known")
         return
     places = element_places(finding.names)
-    table = np.array([[_loading(row.loadings[at]) for at in places.values()] for row in rows])
+    # signed of a single parameter, the norm of one given per wavelength
+    parts = [[row.loadings[at] for at in places.values()] for row in rows]
+    table = np.array([[p[0] if len(p) == 1 else np.linalg.norm(p) for p in row] for row in parts])
     image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.grid(False)
     labels = [f"{n} ({len(at)})" if len(at) > 1 else n for n, at in places.items()]
@@ -315,11 +317,6 @@ def _write(axes, x, y, value, sign="-"):
     color = "white" if abs(value) > _PALE else "black"
     text = f"{value:{sign}.2f}".replace("-", MINUS)
     axes.text(x, y, text, color=color, ha="center", va="center")
-
-
-def _loading(part):
-    """Return the signed component of a single parameter, the norm of one given per wavelength."""
-    return part[0] if len(part) == 1 else np.linalg.norm(part)
 
 
 def _wrapped(rows):

@@ -13,18 +13,14 @@ dependence of interstellar polarization as an astropy model.
 from astropolcal.standards.law import SerkowskiLaw, whittet_width
 from astropolcal.standards.priors import StandardStar, catalogue, get, names
 from astropolcal.standards.visibility import (
-    Observability,
-    TelescopeInformation,
     observability,
     search,
     telescope_information,
 )
 
 __all__ = [
-    "Observability",
     "SerkowskiLaw",
     "StandardStar",
-    "TelescopeInformation",
     "catalogue",
     "get",
     "names",

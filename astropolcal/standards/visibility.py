@@ -18,13 +18,7 @@ from astropolcal.standards.priors import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
 from astropolcal.words import did_you_mean
 
-__all__ = [
-    "Observability",
-    "TelescopeInformation",
-    "observability",
-    "search",
-    "telescope_information",
-]
+__all__ = ["observability", "search", "telescope_information"]
 
 LIMIT = 30 * u.deg
 # end of nautical twilight: standards are bright, the sky need not be quite dark
@@ -202,7 +196,7 @@ def telescope_information(
 
     Returns
     -------
-    TelescopeInformation
+    ``TelescopeInformation``
 
     Raises
     ------
@@ -356,7 +350,7 @@ class Observability:
 
         Returns
         -------
-        TelescopeInformation
+        ``TelescopeInformation``
 
         Raises
         ------
@@ -401,7 +395,7 @@ def observability(
 
     Returns
     -------
-    Observability
+    ``Observability``
 
     Raises
     ------

@@ -10,9 +10,9 @@ from astropy.time import Time
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.standards import Observability, SerkowskiLaw, StandardStar, telescope_information
+from astropolcal.standards import SerkowskiLaw, StandardStar, telescope_information
 from astropolcal.standards.priors import _law, _normal
-from astropolcal.standards.visibility import _degree, _in_band, _spread
+from astropolcal.standards.visibility import Observability, _degree, _in_band, _spread
 
 BANDS = {"U": 0.36, "V": 0.55, "H": 1.65}
 

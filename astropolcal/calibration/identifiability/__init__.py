@@ -1,8 +1,4 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What data determine: rank, null directions, mirror solutions, and their effect on the sky."""
 
-from astropolcal.calibration.identifiability.analysis import Identifiability
-
-__all__ = [
-    "Identifiability",
-]
+__all__ = []

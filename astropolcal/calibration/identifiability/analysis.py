@@ -46,7 +46,7 @@ from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import EllipticalRetarder, LinearRetarder, MuellerElement, Rotator
 
-__all__ = ["Identifiability", "examine"]
+__all__ = ["examine"]
 
 # a direction that is a parameter of its own is that parameter by all but this
 _OWN = 1e-9
@@ -91,7 +91,7 @@ class Identifiability:
 
     Examples
     --------
-    >>> from astropolcal.calibration.identifiability import Identifiability
+    >>> from astropolcal.calibration.identifiability.analysis import Identifiability
     >>> import numpy as np
     >>> Identifiability(["a.theta"], 1, np.ones(1), np.zeros((0, 1)), np.ones(1, bool)).n_free
     1
@@ -157,7 +157,7 @@ def examine(measurement, weights=None):
 
     Returns
     -------
-    Identifiability
+    ``Identifiability``
         As in the result of a fit.
 
     Examples

@@ -2,7 +2,6 @@
 """Noise of the data, its weights, and how residuals scatter in groups."""
 
 from astropolcal.calibration.noise.estimates import (
-    NoiseEstimate,
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
@@ -11,7 +10,6 @@ from astropolcal.calibration.noise.estimates import (
 from astropolcal.calibration.noise.weighting import outlying_data
 
 __all__ = [
-    "NoiseEstimate",
     "noise_from_errors",
     "noise_from_null_channel",
     "noise_from_replicates",

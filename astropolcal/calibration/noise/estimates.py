@@ -23,7 +23,6 @@ from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
 
 __all__ = [
-    "NoiseEstimate",
     "noise_from_errors",
     "noise_from_null_channel",
     "noise_from_replicates",
@@ -100,6 +99,11 @@ def data_by_wavelength(measurement):
     return np.array(numbers), np.concatenate(wavelengths) * u.nm, rows
 
 
+def rms(values):
+    """Return the root mean square, NaN of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
 def noise_of_cells(measurement, sigma, dof, method, words):
     """Return an estimate with one noise for each cell of `data_by_wavelength`.
 
@@ -134,7 +138,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         Infinite degrees of freedom: taken as known.
 
     Raises
@@ -176,8 +180,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 def _of_data(measurement, sigma, dof, method, words):
     """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    rms = [np.sqrt(np.mean(sigma[row] ** 2)) if row.size else np.nan for row in rows]
-    percent, dof = 100 * np.array(rms) * u.percent, np.broadcast_to(dof, len(rows))
+    percent = 100 * np.array([rms(sigma[row]) for row in rows]) * u.percent
+    dof = np.broadcast_to(dof, len(rows))
     return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
 
 
@@ -229,7 +233,7 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         It includes all that differs between repeated data: photon and read noise,
         flicker, repeatability of the stages, drifts; but nothing that is the same
         in all of them.
@@ -346,7 +350,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         An upper limit: besides photon and read noise and flicker that changes
         the ratio of the beams it includes anything else makes the null change
         with the plate and is not in the chain, such as diattenuation. For strongly
@@ -488,7 +492,7 @@ def noise_from_roughness(measurement, vector=None):
 
     Returns
     -------
-    NoiseEstimate
+    ``NoiseEstimate``
         Besides photon and read noise it includes flicker that changes the ratio of the beams, and
         what optics do that is sharp in wavelength and no harmonic. Infinite degrees of freedom
         where the stated errors stand.

@@ -19,7 +19,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, triangle
-from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
+from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
 from astropolcal.words import check_choice, did_you_mean
@@ -403,10 +403,10 @@ def _from_settings(measurement, settings):
 def _told(measurement, weighting):
     """Refuse residuals that leave no degree of freedom, or nothing at all."""
     if not (weighting.is_known and weighting.sigma.min() > 0):
-        rms = _rms(measurement.residuals())
         raise FitError(
             f"{measurement.n_data} data, {measurement.free.size} free parameters and an rms "
-            f"residual of {rms:.3g} tell no noise; give noise= or other weights"
+            f"residual of {rms(measurement.residuals()):.3g} tell no noise; give noise= or other "
+            "weights"
         )
     return weighting
 
@@ -414,20 +414,16 @@ def _told(measurement, weighting):
 def describe(measurement, weighting):
     """Return the noise of each dataset and wavelength as plain lists, for the settings."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    rms = [_rms(weighting.sigma[row]) for row in rows]
+    sizes = [rms(weighting.sigma[row]) for row in rows]
     nm = wavelength.to_value(u.nm)
     return [
         {
             "dataset": part.observations.name,
             "wavelength_nm": [float(w) for w in nm[numbers == i]],
-            "sigma_percent": [100 * rms[j] for j in np.flatnonzero(numbers == i)],
+            "sigma_percent": [100 * sizes[j] for j in np.flatnonzero(numbers == i)],
         }
         for i, part in enumerate(measurement.datasets)
     ]
-
-
-def _rms(values):
-    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
 # ---- from residuals ---------------------------------------------------------------------

@@ -1,10 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The calibration as an object: values, validity, verdict, summary, comparison."""
 
-from astropolcal.calibration.result.calibration import Validity
 from astropolcal.calibration.result.verdict import Verdict
 
-__all__ = [
-    "Validity",
-    "Verdict",
-]
+__all__ = ["Verdict"]

@@ -37,7 +37,7 @@ from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date
 from astropolcal.words import html
 
-__all__ = ["Calibration", "Validity", "with_validity"]
+__all__ = ["Calibration", "with_validity"]
 
 # what is known of each element of a parameter, and what is said of those without an error
 _OF_ELEMENTS = (
@@ -93,7 +93,7 @@ class Calibration:
         Grid of the parameters given per wavelength.
     covariance : Covariance
         Of the free parameters, with names and units.
-    identifiability : Identifiability
+    identifiability : ``Identifiability``
         Rank and null directions.
     at_bound : list of str
         Free parameters that ended at a bound.
@@ -405,7 +405,7 @@ class Calibration:
 
     @property
     def validity(self):
-        """For what it holds, a `~astropolcal.calibration.result.Validity`."""
+        """For what it holds, a ``Validity``."""
         return validity_of(self)
 
     def system_mueller(self, header=None, **options):
@@ -638,7 +638,7 @@ class Validity:
 
     Examples
     --------
-    >>> from astropolcal.calibration.result import Validity
+    >>> from astropolcal.calibration.result.calibration import Validity
     >>> validity = Validity("charis", valid_from="2025-10-01", optics_in=["nbs"])
     >>> validity.holds("2025-10-05T09:30"), validity.holds("2025-09-30")
     (True, False)

@@ -40,6 +40,7 @@ _SAID = {"open": "open", "at bound": "bound", "badly determined": "no error"}
 _ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
 # pairs of frames at odds with the fit that a summary names
 _MOST_OUTLIERS = 5
+_AFTER_LEAD = re.compile(" cannot be distinguished| changes no datum| at the noise of this fit")
 _ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
@@ -51,7 +52,9 @@ def summary(calibration, targets=TARGETS, full=False):
     known, stars = calibration.parameter_values(), fitted_stars(calibration)
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
-    gauge = calibration.settings.get("gauge")
+    gauge, posterior = calibration.settings.get("gauge"), []
+    if calibration.posterior is not None:
+        posterior = calibration.posterior.words().split("\n")
     lines = []
     for name, copies in (calibration.settings.get("own") or {}).items():
         evidence = _evidence(calibration, copies)
@@ -79,7 +82,7 @@ def summary(calibration, targets=TARGETS, full=False):
         list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
         (list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []),
         _bound_lines(calibration, known),
-        _posterior_lines(calibration),
+        ["Posterior", *_wrap(f"  {line}" for line in posterior)] if posterior else [],
     ]
     return "\n\n".join("\n".join(part) for part in parts if part)
 
@@ -347,11 +350,12 @@ def _bound_lines(calibration, known):
             by = str(np.ravel(entry["conditional_on"])[i])
             times = (np.ravel(entry["std_released"]) / np.ravel(entry["std"]))[i]
             hanging.setdefault((by, name), []).append(times)
-    lines += [
-        f"  - the error of {name}{_of_several(times)} is conditional on {by} at its bound; without "
-        f"it {_times(times)} times as large"
-        for (by, name), times in hanging.items()
-    ]
+    for (by, name), times in hanging.items():
+        several = f" at {len(times)} wavelengths" if len(times) > 1 else ""
+        lines.append(
+            f"  - the error of {name}{several} is conditional on {by} at its bound; without it "
+            f"{_times(times)} times as large"
+        )
     lines = [_with_wavelengths(line, calibration) for line in lines]
     return list(_wrap(["At a bound", *lines])) if lines else []
 
@@ -361,21 +365,9 @@ def _places(calibration, entry, where):
     return [f" ({nm[i]:.1f} nm)" if entry["value"].ndim else "" for i in where]
 
 
-def _of_several(times):
-    return f" at {len(times)} wavelengths" if len(times) > 1 else ""
-
-
 def _times(times):
     low, high = min(times), max(times)
     return f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
-
-
-def _posterior_lines(calibration):
-    if calibration.posterior is None:
-        return []
-    return list(
-        _wrap(["Posterior", *(f"  {s}" for s in calibration.posterior.words().split("\n"))])
-    )
 
 
 # ---- for machines ------------------------------------------------------------------
@@ -410,10 +402,15 @@ def to_dict(calibration, targets=TARGETS):
             {key: table.meta[key] for key in ("name", "from_data")} | columns(table)
             for table in fitted_stars(calibration)
         ],
-        "standards": [_standard(entry) for entry in fit.get("standards", [])],
+        "standards": [
+            # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
+            entry | {"s_res_percent": entry["s_standard_percent"]}
+            for entry in fit.get("standards", [])
+        ],
         "targets": [target_entry(table) for table in target_accuracies(calibration, targets)],
         "parameters": {
-            name: _parameter(entry) for name, entry in calibration.parameter_values().items()
+            name: entry | {"unit": str(entry["unit"] or "")}
+            for name, entry in calibration.parameter_values().items()
         },
         "open_on_sky": open_on_sky(calibration),
         "null_directions": calibration.identifiability.directions,
@@ -442,15 +439,6 @@ def _dataset(record):
         "k": table["k"],
         **{f"{key}_percent": _percent(table, key) for key in _ACCURACIES},
     }
-
-
-def _standard(entry):
-    # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
-    return entry | {"s_res_percent": entry["s_standard_percent"]}
-
-
-def _parameter(entry):
-    return entry | {"unit": "" if entry["unit"] is None else str(entry["unit"])}
 
 
 # ---- mirrors, stars that no fit saw, and what is left open on sky ----
@@ -554,10 +542,10 @@ def open_on_sky(calibration):
     """
     finding = calibration.identifiability
     return [
-        {"kind": kind, "words": words(direction)} | direction["sky"]
-        for kind, words, directions in (
-            ("open", _open_words, finding.directions),
-            ("badly determined", _near_words, finding.near_null),
+        {"kind": kind, "words": _words(direction)} | direction["sky"]
+        for kind, directions in (
+            ("open", finding.directions),
+            ("badly determined", finding.near_null),
         )
         for direction in sorted(directions, key=_turn, reverse=True)
         if direction.get("sky") and shows_on_sky(direction["sky"])
@@ -587,12 +575,6 @@ def _turn(direction):
     return max(map(abs, (direction.get("sky") or {}).get("aolp_deg", [0.0])))
 
 
-def _open_words(direction):
-    lead = direction["words"].partition(" cannot be distinguished")[0]
-    lead = lead.partition(" changes no datum")[0]
-    return f"{lead}: {sky_words(direction['sky'])}"
-
-
-def _near_words(direction):
-    lead = direction["words"].partition(" at the noise of this fit")[0]
+def _words(direction):
+    lead = _AFTER_LEAD.split(direction["words"])[0]
     return f"{lead}: {sky_words(direction['sky'])}"

@@ -11,7 +11,6 @@ from astropolcal.calibration.uncertainty.derived import (
     derived_sky,
 )
 from astropolcal.calibration.uncertainty.refits import (
-    Profile,
     Resampled,
     robust_covariance,
     standard_errors,
@@ -20,7 +19,6 @@ from astropolcal.calibration.uncertainty.refits import (
 __all__ = [
     "Covariance",
     "Derived",
-    "Profile",
     "Resampled",
     "derived_data",
     "derived_efficiency",

@@ -43,7 +43,7 @@ from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
-__all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
+__all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
 _FEWEST_BLOCKS = 3
 
@@ -79,7 +79,7 @@ class Profile:
 
     Examples
     --------
-    >>> from astropolcal.calibration.uncertainty import Profile
+    >>> from astropolcal.calibration.uncertainty.refits import Profile
     >>> import numpy as np
     >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
     ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
@@ -183,7 +183,7 @@ def profile(calibration, name, values=None, n=21):
 
     Returns
     -------
-    Profile
+    ``Profile``
 
     Raises
     ------
@@ -211,7 +211,8 @@ def profile(calibration, name, values=None, n=21):
     """
     covariance = calibration.covariance
     if name not in covariance.names:
-        raise ParameterError(f"no free parameter {name!r}; there are {_some(covariance.names)}")
+        known = ", ".join(covariance.names[:8]) + (", ..." if len(covariance.names) > 8 else "")
+        raise ParameterError(f"no free parameter {name!r}; there are {known}")
     if n < 3:
         raise FitError(f"n = {n}; a profile needs at least 3 values")
     index = covariance.names.index(name)
@@ -233,10 +234,6 @@ def profile(calibration, name, values=None, n=21):
     rise = (chi2 - chi2.min()) / residual_variance(calibration)
     quantity = 1 if unit is None else u.Unit(unit)
     return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
-
-
-def _some(names):
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
 def _grid(best, std, step, n):

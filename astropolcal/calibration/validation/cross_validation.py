@@ -20,7 +20,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
-from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors
+from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
 from astropolcal.calibration.noise.scatter import leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.chain import join, leaves
@@ -32,7 +32,7 @@ from astropolcal.optics import PolarizedSource
 from astropolcal.progress import steps
 from astropolcal.words import p_words
 
-__all__ = ["LackOfFit", "add_standard", "lack_of_fit"]
+__all__ = ["add_standard", "lack_of_fit"]
 
 # a datum that moves by less than this share of the largest slope does not move
 _STILL = 1e-6
@@ -64,7 +64,10 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
         # also one common to all wavelengths, as in the paper
         s_res = np.where(n > k, np.sqrt(squares / np.where(n > k, n - k, 1)), np.nan)
         s_mean = s_res / np.sqrt(n)
-    s_cv = [np.nan if held_out is None else _rms(held_out[row]) for row in rows]
+    s_cv = [
+        np.nan if held_out is None else rms(held_out[row][np.isfinite(held_out[row])])
+        for row in rows
+    ]
     return QTable(
         {
             "wavelength": part.observations.wavelength,
@@ -76,11 +79,6 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
             "s_standard": np.full(len(n), np.nan) * u.percent,
         }
     )
-
-
-def _rms(values):
-    known = values[np.isfinite(values)]
-    return np.sqrt(np.mean(known**2)) if known.size else np.nan
 
 
 def cross_validated_residuals(measurement, vector, weights=None, groups=None):
@@ -235,7 +233,7 @@ class LackOfFit:
 
     Examples
     --------
-    >>> from astropolcal.calibration.validation import LackOfFit
+    >>> from astropolcal.calibration.validation.cross_validation import LackOfFit
     >>> from astropy.table import QTable
     >>> LackOfFit(QTable(), 12.0, 10.0, 0.285, "the residuals agree with the noise").p_value
     0.285
@@ -286,7 +284,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
 
     Returns
     -------
-    LackOfFit
+    ``LackOfFit``
         For all data and for each wavelength; NaN where the noise is unknown or no
         degree of freedom is left. With estimated noise the total is Fisher's
         combination of the probabilities of the wavelengths.
@@ -604,7 +602,7 @@ def _errors(measurement):
     groups = [residuals[part.bin_of_datum == b] for b in part.bins]
     nan = np.nan
     columns = {
-        "s_standard": [np.sqrt(np.mean(r**2)) if r.size else nan for r in groups],
+        "s_standard": [rms(r) for r in groups],
         "bias": [r.mean() if r.size else nan for r in groups],
         "scatter": [r.std(ddof=1) if r.size > 1 else nan for r in groups],
     }

@@ -13,6 +13,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
+from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.scatter import groups_by
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
@@ -562,8 +563,7 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
             residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
             for value in wavelength.to_value(u.um)
         ]
-        rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
-        result["s_standard"] = 100 * np.array(rms) * u.percent
+        result["s_standard"] = 100 * np.array([rms(r) for r in found]) * u.percent
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
