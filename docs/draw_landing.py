@@ -5,6 +5,7 @@ The figure of the first page and of the README: ``python docs/draw_landing.py`` 
 The packaged example is calibrated, and diagnosed with a derotator that is too simple for it.
 """
 
+import json
 from importlib.resources import files
 from pathlib import Path
 
@@ -91,5 +92,18 @@ def draw():
     return figure
 
 
+def content(figure):
+    """Return the words of a figure and the numbers of its lines: what makes an older one stale."""
+    lines = [line.get_xydata() for axes in figure.axes for line in axes.lines]
+    words = [axes.get_title(loc="left") for axes in figure.axes]
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        words += [axes.get_xlabel(), axes.get_ylabel(), *(text.get_text() for text in axes.texts)]
+        words += [legend.get_title().get_text()] if legend else []
+        words += [text.get_text() for text in legend.get_texts()] if legend else []
+    return {"words": words, "lines": [np.round(line, 6).tolist() for line in lines]}
+
+
 if __name__ == "__main__":
-    draw().savefig(FIGURE, dpi=160)
+    drawn = draw()
+    drawn.savefig(FIGURE, dpi=160, metadata={"Comment": json.dumps(content(drawn))})

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What the gallery of models writes and draws is what the registries and the optics say."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -285,3 +286,27 @@ def test_drawing_of_double_differences_has_the_numbers_of_the_page(drawings, pyp
     for (a, b), drawn_single, drawn_double in zip(printed, single[:, 0], double[:, 0], strict=True):
         assert f"{drawn_single:6.3f}".strip().startswith(a)
         assert f"{drawn_double:6.3f}".strip().startswith(b)
+
+
+# ---- the figure of the first page ------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_figure_of_the_first_page_is_what_its_script_draws():
+    """Its file holds the words and the lines that were drawn, so that a stale one is found."""
+    image = pytest.importorskip("PIL.Image")
+    import draw_landing
+
+    kept = json.loads(image.open(draw_landing.FIGURE).text["Comment"])
+    drawn = draw_landing.content(draw_landing.draw())
+    stale = "docs/images/landing.png is stale: run python docs/draw_landing.py"
+    number = re.compile(r"\d+")
+    kept_words, words = ([number.sub("", w) for w in one["words"]] for one in (kept, drawn))
+    assert kept_words == words, stale
+    for one, other in zip(kept["words"], drawn["words"], strict=True):
+        # a probability may be rounded differently on another processor
+        pairs = zip(map(int, number.findall(one)), map(int, number.findall(other)), strict=True)
+        assert all(abs(a - b) <= 1 for a, b in pairs), stale
+    assert len(kept["lines"]) == len(drawn["lines"]) > 8
+    for one, other in zip(kept["lines"], drawn["lines"], strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.02, atol=0.003, err_msg=stale)
