@@ -499,14 +499,14 @@ def test_remains_of_a_process_of_the_same_number_do_not_disturb(writer, tmp_path
 
 
 def write_calibrations(path):
-    cal = calibration()
+    cal = calibration()  # made before the fork: each of its own would have another date
     while True:
         cal.write(path, overwrite=True)
 
 
 @pytest.mark.slow
 def test_killed_calibrate_leaves_a_calibration_or_nothing(tmp_path):
-    path, digest = tmp_path / "cal.asdf", None
+    path, digest, _ = tmp_path / "cal.asdf", None, calibration()
     rng = np.random.default_rng(5)
     for _ in range(4):
         killed(write_calibrations, path, after=rng.uniform(0.1, 0.5))

@@ -78,9 +78,9 @@ def test_fluxes_are_unbiased_with_honest_errors():
     """The error of the correction is common to a frame, so frames are what counts."""
     # of noise-free images those without a halo are better, as the test above shows
     for profile in (name for name in PROFILES if "halo" in name):
-        pulls, bias = pulls_of(profile, range(1000, 1024))
+        pulls, bias = pulls_of(profile, range(1000, 1030))
         means, squares = pulls.mean(axis=(1, 2)), (pulls**2).mean(axis=(1, 2))
-        # what may be wrong with the errors, and twice what 24 frames scatter by
+        # what may be wrong with the errors, and twice what 30 frames scatter by
         assert abs(means.mean()) < 0.1 + 2 * means.std() / np.sqrt(len(means)), profile
         assert abs(squares.mean() - 1) < 0.15 + 2 * squares.std() / np.sqrt(len(squares)), profile
         assert abs(bias.mean()) < 1e-3, profile
