@@ -21,10 +21,8 @@ from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
-from astropolcal.reduction.headers import check_sequence, configured, raw_frames
-from astropolcal.reduction.masters import Masters
-from astropolcal.reduction.sorting import sort_beams
+from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
+from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]

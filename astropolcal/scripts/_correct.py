@@ -212,7 +212,7 @@ def run(arguments):
 
 def _sorted(files, instrument):
     """Return one file per frame, and the instrument that knows those of the left beams."""
-    from astropolcal.reduction.sorting import sort_beams
+    from astropolcal.reduction.headers import sort_beams
 
     files, layout, lost = sort_beams(files, instrument.files)
     for path, why in lost.items():
