@@ -124,6 +124,31 @@ class Rows:
         return np.einsum("...nf,n->...f", array, self._nodes)
 
 
+def inverse_rows(rows, weights=None, max_condition=1e6):
+    """
+    Return what turns fluxes into Stokes parameters, and how well it is determined.
+
+    ``rows`` are (..., n_data, n), ``weights`` (..., n_data) inverse variances, equal by default.
+    Returns the gain of least squares, (..., n, n_data), the singular values, (..., n), largest
+    first, their right vectors, rows of (..., n, n), and which of them are determined, (..., n):
+    their values are not smaller than the largest by ``max_condition``. The gain leaves out others.
+    """
+    count, n = rows.shape[-2:]
+    root = np.ones(rows.shape[:-1]) if weights is None else np.sqrt(weights)
+    # weights of 1e-300 or 1e300 must not under- or overflow in the singular values
+    root = root / np.maximum(root.max(axis=-1, keepdims=True), np.finfo(float).tiny)
+    scaled = rows * root[..., None]
+    if count < n:
+        # rows of zeros, so that there is a singular value for each component
+        scaled = np.concatenate([scaled, np.zeros((*rows.shape[:-2], n - count, n))], axis=-2)
+    left, values, right = np.linalg.svd(scaled, full_matrices=False)
+    # the largest always counts, unless all rows are zero
+    good = (values * max_condition > values[..., :1]) & (values > 0)
+    inverse = good / np.where(good, values, 1.0)
+    gain = (right * inverse[..., None]).swapaxes(-1, -2) @ left[..., :count, :].swapaxes(-1, -2)
+    return gain * root[..., None, :], values, right, good
+
+
 def model_error(fit, lam, n=3):
     """Return what the model lacks, as directions (n_directions, n_wavelengths, n, n) of Stokes.
 

@@ -2,9 +2,9 @@
 """From science frames to corrected Stokes parameters."""
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
-from uuid import uuid4
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from astropolcal.correction.rows import RowModel, ideal_chain
 from astropolcal.correction.solve import covariance_index, estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
-    AstropolcalError,
     AstropolcalWarning,
     ObservationError,
     ParameterError,
@@ -117,7 +116,7 @@ def correct(
     seed : int, optional
         Of the samples.
     workers : int, optional
-        Threads of dask among which the wavelengths are divided; by default dask is not used.
+        Threads among which the wavelengths are divided.
     cluster : str, optional
         Address of a ``dask.distributed`` scheduler, which divides them among its processes.
     chunk : int
@@ -470,7 +469,7 @@ def run_blocks(block, shape, *, chunk=1, workers=None, cluster=None, progress=Fa
     Call a function with start and stop of ranges of ``chunk`` wavelengths.
 
     Return its results, (n, stop - start, ...), put together in ``shape``. With ``workers`` by
-    threads of dask, with ``cluster`` (the address of a scheduler) by its processes.
+    threads, with ``cluster`` (the address of a scheduler) by its processes.
     """
     for name, value in (("chunk", chunk), ("workers", workers)):
         if value is not None and not value >= 1:
@@ -483,64 +482,29 @@ def run_blocks(block, shape, *, chunk=1, workers=None, cluster=None, progress=Fa
             out[:, limits[0] : limits[1]] = result
             add(limits[1] - limits[0])
 
-        if workers is None and cluster is None:
+        def work(limits):
+            keep(limits, block(*limits))
+
+        if cluster is not None:
+            _on_cluster(block, ranges, cluster, keep)
+        elif workers is None:
             for limits in ranges:
-                keep(limits, block(*limits))
-        elif cluster is None:
-            _with_threads(partial(_planned, block, ranges, shape), ranges, workers, keep)
+                work(limits)
         else:
-            _with_cluster(partial(_planned, block, ranges, shape), ranges, cluster, keep)
+            with ThreadPoolExecutor(workers) as pool:
+                # an error comes out here, and ends what has not begun
+                list(pool.map(work, ranges))
     return out
 
 
-def _planned(block, ranges, shape):
-    """Return one delayed result a range, of dask's map_blocks."""
-    import dask.array as da
-
-    # the array of dask holds the numbers of the wavelengths only; the block reads its fluxes itself
-    numbers = da.arange(shape[1], chunks=(tuple(b - a for a, b in ranges),))
-    new_axes = [0, *range(2, len(shape))]
-    chunks = ((shape[0],), numbers.chunks[0], *((size,) for size in shape[2:]))
-    planned = numbers.map_blocks(
-        partial(_of_numbers, block),
-        new_axis=new_axes,
-        chunks=chunks,
-        # without a name and a kind dask would look through all of the data, and call the block
-        name=f"correct-{uuid4().hex}",
-        meta=np.empty((0,) * len(shape)),
-    )
-    return list(planned.to_delayed().ravel())
-
-
-def _of_numbers(block, numbers):
-    return block(int(numbers[0]), int(numbers[-1]) + 1)
-
-
-def _need_dask():
-    try:
-        import dask.array  # noqa: F401
-    except ImportError:
-        raise AstropolcalError(
-            'workers and cluster need dask, which is not installed: pip install "astropolcal[dask]"'
-        ) from None
-
-
-def _with_threads(plan, ranges, workers, keep):
-    _need_dask()
-    import dask
-
-    tasks = [dask.delayed(keep)(limits, part) for limits, part in zip(ranges, plan(), strict=True)]
-    dask.compute(*tasks, scheduler="threads", num_workers=workers)
-
-
-def _with_cluster(plan, ranges, cluster, keep):
+def _on_cluster(block, ranges, cluster, keep):
     client = cluster_client(cluster)
     from distributed import as_completed
 
     with client:
-        futures = client.compute(plan())
-        places = dict(zip((future.key for future in futures), ranges, strict=True))
+        futures = client.map(block, *zip(*ranges, strict=True), pure=False)
+        places = dict(zip(futures, ranges, strict=True))
         for future, result in as_completed(futures, with_results=True):
-            keep(places[future.key], result)
+            keep(places[future], result)
             # results of many images must not stay in the memory of the cluster
             future.release()

@@ -13,6 +13,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.system import inverse_rows
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.words import check_choice
 
@@ -224,33 +225,17 @@ def estimator(
 def _solve(rows, weights, components, max_condition):
     """Return gain, condition, what is determined, and in words what is not."""
     n = len(components)
-    gain, values, weak = _pseudo_inverse(rows[:, :n], weights, max_condition)
-    condition = values[0] / values[-1] if values[-1] > 0 else np.inf
+    gain, values, right, good = inverse_rows(rows[:, :n], weights, max_condition)
+    condition, weak = values[0] / values[-1] if values[-1] > 0 else np.inf, right[~good]
     words = "; ".join(_in_words(direction, components) for direction in _led(weak))
     determined = _determined(weak, n)
     if len(weak) and n == 4 and not determined[3]:
         # V is what most often is open: the others are solved as without it
         gain = np.zeros((n, len(rows)))
-        gain[:3], _, weak = _pseudo_inverse(rows[:, :3], weights, max_condition)
-        determined = np.append(_determined(weak, 3), False)
+        gain[:3], _, right, good = inverse_rows(rows[:, :3], weights, max_condition)
+        determined = np.append(_determined(right[~good], 3), False)
     gain[~determined] = np.nan
     return gain, condition, determined, words
-
-
-def _pseudo_inverse(rows, weights, max_condition):
-    """Return the truncated inverse, the singular values and the directions left out."""
-    root = np.sqrt(weights)
-    # weights of 1e-300 or 1e300 must not under- or overflow in the singular values
-    size = max(root.max(), np.finfo(float).tiny)
-    count, n = rows.shape
-    # rows of zeros, so that there is a singular value for each component
-    scaled = np.zeros((max(count, n), n))
-    scaled[:count] = rows * (root / size)[:, None]
-    left, values, right = np.linalg.svd(scaled, full_matrices=False)
-    # the largest always counts, unless all rows are zero
-    good = (values * max_condition > values[0]) & (values > 0)
-    gain = (right[good].T / values[good]) @ left[:count, good].T * (root / size)
-    return gain, values, right[~good]
 
 
 def _determined(weak, n):

@@ -2,8 +2,8 @@
 """
 Instruments, found by name.
 
-An instrument is one file with a subclass of `Instrument`. Other packages add
-theirs through the entry-point group ``astropolcal.instruments``.
+An instrument is a subclass of `Instrument`. Other packages add theirs
+through the entry-point group ``astropolcal.instruments``.
 """
 
 from importlib.metadata import entry_points
@@ -12,19 +12,15 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
 from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
-from astropolcal.instruments.fastpdi import FastPDI
-from astropolcal.instruments.fors2 import FORS2
 from astropolcal.instruments.gpi import GPI
-from astropolcal.instruments.hiciao import HiCIAO
-from astropolcal.instruments.ircs import IRCS
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.magaox import MagAOX
-from astropolcal.instruments.naco import NaCo
 from astropolcal.instruments.nirc2 import NIRC2
-from astropolcal.instruments.reach import REACH
 from astropolcal.instruments.roman import RomanCoronagraph
+from astropolcal.instruments.subaru import IRCS, REACH, FastPDI, HiCIAO
 from astropolcal.instruments.vampires import VAMPIRES
+from astropolcal.instruments.vlt import FORS2, NaCo
 from astropolcal.words import did_you_mean
 
 __all__ = [

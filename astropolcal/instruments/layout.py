@@ -453,7 +453,10 @@ def frame_time(header, layout):
 
     A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
     """
-    return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
+    mjd = look_up([header], "mjd", layout)[1]
+    if mjd is not None:
+        return time_of(mjd)
+    return time_of(None, *(look_up([header], key, layout)[1] for key in ("date", "time")))
 
 
 # a header is asked for its time by several who want to know it

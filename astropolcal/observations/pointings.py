@@ -10,6 +10,7 @@ a frame is then the mean over a few nodes of Gauss and Legendre.
 
 import warnings
 from contextlib import contextmanager
+from functools import lru_cache
 
 import astropy.units as u
 import numpy as np
@@ -113,8 +114,13 @@ def sky_angle(name, value):
     try:
         return plain_number(value)
     except (TypeError, ValueError):
-        unit = u.hourangle if name == "right_ascension" else u.deg
-        return float(Angle(str(value), unit=unit).to_value(u.deg))
+        return _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
+
+
+# the frames of a target have the same text
+@lru_cache(maxsize=1024)
+def _sexagesimal(text, unit):
+    return float(Angle(text, unit=unit).to_value(u.deg))
 
 
 def pointing(coord, time, location):

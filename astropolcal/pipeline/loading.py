@@ -414,11 +414,10 @@ class LoadedCalibration:
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
         headers, single = _headers(header)
-        if header is not None:
-            self._check(self._frames(headers), light)
-        elif "date" in self._stated:
-            self._check(self._stated_frame(), light)
-        chain, assumed = self._chain(light, headers)
+        frames = self._stated_frame() if header is None else self._frames(headers)
+        if header is not None or "date" in self._stated:
+            self._check(frames, light)
+        chain, assumed = self._chain(light, headers, frames)
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             # the same reader as for tables of observations, so that tracking laws and offsets agree
@@ -548,7 +547,7 @@ class LoadedCalibration:
 
     # ---- the chain ---------------------------------------------------------------------
 
-    def _chain(self, light, headers):
+    def _chain(self, light, headers, frames):
         """Return the chain from where the light enters, and the optics that are assumed."""
         check_choice("light", light, ("sky", "internal"), ParameterError)
         beam = None
@@ -560,7 +559,6 @@ class LoadedCalibration:
         outer = telescope_optics(self.calibration)
         if outer is not None:
             return join([*outer, *inner]), ()
-        frames = self._frames(headers) if headers else self._stated_frame()
         return self._published(inner, [date for _, date, _ in frames if date is not None])
 
     def _published(self, inner, dates):

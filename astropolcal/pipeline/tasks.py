@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import connection, get_all_start_methods, get_context
@@ -126,9 +126,35 @@ def process_context(preload):
     """Return how processes are started: from one that has the modules ``preload`` in memory."""
     if "forkserver" not in get_all_start_methods():
         return get_context("spawn")
+    from multiprocessing import forkserver, resource_tracker
+
     context = get_context("forkserver")
     context.set_forkserver_preload(preload)
+    # first: its start unblocks the signal
+    resource_tracker.ensure_running()
+    # no interruption ever reaches what the processes are forked from
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
+
+
+@contextmanager
+def _interrupted_later():
+    """Put off an interruption from the keyboard: processes that are half started complain."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came = []
+    before = signal.signal(signal.SIGINT, lambda *_: came.append(True)) or signal.SIG_DFL
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _on_processes(function, tasks, workers, timeout, preload):
@@ -137,9 +163,9 @@ def _on_processes(function, tasks, workers, timeout, preload):
     try:
         while True:
             while len(busy) < workers and (given := again.pop() if again else next(fresh, None)):
-                worker = idle.pop() if idle else _Worker(context, function)
-                busy.append(worker)
-                worker.give(*given)
+                with _interrupted_later():
+                    busy.append(idle.pop() if idle else _Worker(context, function))
+                busy[-1].give(*given)
             if not busy:
                 return
             places = [place for w in busy for place in (w.pipe, w.process.sentinel)]

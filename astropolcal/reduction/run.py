@@ -5,15 +5,11 @@ import hashlib
 import json
 import os
 import re
-import signal
-import threading
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import cycle
-from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +19,10 @@ from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date
+from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
-from astropolcal.reduction.headers import check_sequence, configured, raw_frames
-from astropolcal.reduction.masters import Masters
-from astropolcal.reduction.sorting import sort_beams
+from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
+from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -401,69 +396,22 @@ def _results(files, task, workers):
     if workers == 1:
         yield from (reduce_frame(path, **task) for path in files)
         return
-    lost = []
-    with _pool(workers) as pool:
-        try:
-            with _interrupted_later():
-                futures = {pool.submit(reduce_frame, path, **task): path for path in files}
-            # in the order in which they end
-            for future in as_completed(futures):
-                try:
-                    yield future.result()
-                except BrokenProcessPool:
-                    lost.append(futures[future])
-        finally:
-            # who is interrupted does not wait for the files that nobody has begun
-            pool.shutdown(cancel_futures=True)
-    # whichever file kills its process must not take the others with it
-    for path in lost:
-        with _pool(1) as pool:
-            try:
-                yield pool.submit(reduce_frame, path, **task).result()
-            except BrokenProcessPool:
-                yield Frame(path, errors=["the process that measured it died"])
+    # imported once, not by each process
+    preload = ["astropolcal.reduction.frames", "photutils.aperture"]
+    measure = partial(_measured, reduce_frame, task)
+    with closing(ended_tasks(measure, files, workers=workers, preload=preload)) as ended:
+        for each in ended:
+            if isinstance(each.result, Exception):
+                raise each.result
+            yield each.result or Frame(each.task, errors=[each.reason])
 
 
-def _pool(workers):
-    if "forkserver" in get_all_start_methods():
-        context = get_context("forkserver")
-        # imported once, not by each process
-        context.set_forkserver_preload(["astropolcal.reduction.frames", "photutils.aperture"])
-        _start_server()
-    else:
-        context = get_context("spawn")
-    # an interruption from the keyboard goes to all processes; this one ends the others
-    ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-    return ProcessPoolExecutor(workers, mp_context=context, **ignored)
-
-
-@contextmanager
-def _interrupted_later():
-    """Put off an interruption from the keyboard: processes that are half started complain."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came = []
-    before = signal.signal(signal.SIGINT, lambda *_: came.append(True)) or signal.SIG_DFL
+def _measured(measure, task, path):
+    """Return the frame of a file, or what ends the run, such as a wrong option."""
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
-        signal.raise_signal(signal.SIGINT)
-
-
-def _start_server():
-    """Start what the processes are forked from, so that no interruption ever reaches it."""
-    from multiprocessing import forkserver, resource_tracker
-
-    # first: its start unblocks the signal
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return measure(path, **task)
+    except Exception as problem:
+        return problem
 
 
 # --- what is said of the run -------------------------------------------------------

@@ -85,7 +85,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --spectrum OUT.ecsv Output  table of the star in an aperture
 --radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
 --plot FILE Output  figure of the result
---workers N int  threads of dask; with --archive: processes (default: one per processor)
+--workers N int  threads; with --archive: processes (default: one per processor)
 --cluster ADDRESS  scheduler of dask.distributed, in place of these
 @ full json online quiet
 [whole archives]
@@ -212,7 +212,7 @@ def run(arguments):
 
 def _sorted(files, instrument):
     """Return one file per frame, and the instrument that knows those of the left beams."""
-    from astropolcal.reduction.sorting import sort_beams
+    from astropolcal.reduction.headers import sort_beams
 
     files, layout, lost = sort_beams(files, instrument.files)
     for path, why in lost.items():

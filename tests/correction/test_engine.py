@@ -61,25 +61,7 @@ def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
         correct(sky, frames, cluster="tcp://127.0.0.1:1")
 
 
-def test_without_dask(monkeypatch):
-    import builtins
-
-    real = builtins.__import__
-
-    def refuse(name, *args, **kwargs):
-        if name.split(".")[0] == "dask":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(AstropolcalError, match="need dask"):
-        run_blocks(lambda a, b: np.ones((1, b - a)), (1, 4), workers=2)
-    assert run_blocks(lambda a, b: np.ones((1, b - a)), (1, 4)).sum() == 4
-
-
 def test_an_error_in_a_block_comes_out():
-    pytest.importorskip("dask", reason="dask is not installed")
-
     def fail(start, stop):
         raise ObservationError(f"slice {start}")
 
@@ -90,7 +72,6 @@ def test_an_error_in_a_block_comes_out():
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_frames(sky, charis, track, tmp_path):
-    pytest.importorskip("dask", reason="dask is not installed")
     peaks = []
     for cycles in (2, 12):
         _, positions = track(cycles)

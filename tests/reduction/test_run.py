@@ -436,7 +436,8 @@ def test_file_that_kills_its_process_does_not_take_the_others_with_it(tmp_path, 
     monkeypatch.setattr("astropolcal.reduction.run.reduce_frame", reduce_frame_or_die)
     reduction = reduce_run(paths, small, source="star", workers=2)
     assert len(reduction.frames) == 3
-    assert reduction.problems == {str(paths[1]): ["the process that measured it died"]}
+    died = "the process that worked on it died 3 times (exit status 9)"
+    assert reduction.problems == {str(paths[1]): [died]}
 
 
 # --- pyPolCal --------------------------------------------------------------------

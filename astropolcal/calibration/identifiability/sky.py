@@ -18,7 +18,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration.system import Rows, free_of, from_first_stage
+from astropolcal.calibration.system import Rows, free_of, from_first_stage, inverse_rows
 from astropolcal.chain import join, leaves, stages, standing
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw
@@ -258,10 +258,9 @@ def _solve(rows, paired):
         combine = np.concatenate([np.hstack([minus, -minus]), np.hstack([plus, plus])]) / 2
     beams = np.moveaxis(rows, 0, 2)
     channels = combine @ beams.reshape(*beams.shape[:2], -1, 3)
-    singular = np.linalg.svd(channels, compute_uv=False)
-    good = singular[..., -1] * _MAX_CONDITION > singular[..., 0]
-    gain = np.linalg.pinv(channels) @ combine
-    return gain.reshape(*gain.shape[:3], 2, n_frames), good
+    gain, _, _, good = inverse_rows(channels, max_condition=_MAX_CONDITION)
+    gain = gain @ combine
+    return gain.reshape(*gain.shape[:3], 2, n_frames), good.all(axis=-1)
 
 
 # ---- what an open direction, or a mirror branch, does to the polarization measured on sky ----

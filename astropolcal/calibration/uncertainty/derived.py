@@ -18,6 +18,7 @@ from astropolcal.calibration.system import (
     between,
     free_of,
     from_first_stage,
+    inverse_rows,
     per_canonical,
     spread_out,
 )
@@ -599,13 +600,12 @@ def derived_sky(
     rows = (numerator[""] - ratio[..., None] * denominator[""]) / total[..., None]
     # of q and u only, shape (n_wavelengths, 2, n_pairs): least squares where there are more pairs
     stacked = np.moveaxis(rows[..., 1:3], 0, -2)
-    singular = np.linalg.svd(stacked, compute_uv=False)
-    if stacked.shape[-2] < 2 or np.any(singular[..., 1] < 1e-6 * singular[..., 0]):
+    inverse, _, _, good = inverse_rows(stacked)
+    if not good.all():
         raise ParameterError(
             "the positions do not determine q and u: give pairs at two half-wave-plate angles, "
             "such as 0 and 22.5 deg"
         )
-    inverse = np.linalg.pinv(stacked)
     slopes = {}
     for name in numerator:
         if name:

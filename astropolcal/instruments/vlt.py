@@ -1,5 +1,27 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
+Dual-beam polarimeters of the VLT with a half-wave plate and a Wollaston prism.
+
+VLT/FORS2, linear imaging and spectropolarimetry in the visible.
+
+FORS2 stands at the Cassegrain focus. Its adapter turns with the sky, so that the sky turns
+upstream of the instrument by the position angle of the instrument; the stage ``parallactic`` of
+the chain has this angle, and there is no derotator. Downstream of the collimator are a half-wave
+plate and a Wollaston prism.
+
+Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1.5 % at the edges
+of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
+Gonzalez-Gaitan et al. 2020 (imaging in four filters).
+
+ESO's manual (Sec. 4.6.2, as the public code https://github.com/gongsale/FORS2-INSTPOL reads it)
+has angles of polarization too large by 1.54, 1.80, -1.19 and -2.89 deg in the four filters here,
+because the zero of the plate depends on the wavelength: it starts at half of that with the other
+sign, and is free.
+
+Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99,
+and what is polarized on the axis starts at 0. The sign of ``ESO ADA POSANG`` is taken as that of a
+position angle from north to east.
+
 VLT/NaCo, near-infrared dual-beam polarimetry at a Nasmyth focus, decommissioned.
 
 The adapter turns the whole instrument downstream of the tertiary mirror M3, so that there is no
@@ -33,7 +55,56 @@ from astropolcal.instruments.telescope import PARANAL, STARS
 
 __all__ = []
 
+# of the plate of NaCo: one of 4096 (deg)
 _STEP = 360 / 4096
+# of that of FORS2 in b_HIGH, v_HIGH, R_SPECIAL and I_BESS (deg)
+_ZERO = (-0.77, -0.90, 0.595, 1.445)
+
+
+class FORS2(Polarimeter):
+    """
+    VLT/FORS2 with its half-wave plate at any angles, and its Wollaston prism.
+
+    Its polarized source is a polarizer upstream of the instrument, such as the prism with which
+    ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
+    and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
+    hides.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> fors2 = instruments.get("fors2")
+    >>> [optic.name for optic in fors2.chain("star")]
+    ['star', 'parallactic', 'collimator', 'hwp', 'wollaston']
+    """
+
+    name = "fors2"
+    aliases = ("VLT/FORS2",)
+    # nominal centres of b_HIGH, v_HIGH, R_SPECIAL and I_BESS
+    wavelength = [440, 557, 655, 768] * u.nm
+    keywords = {
+        "hwp": "ESO INS RETA2 POSANG",
+        "parallactic": "ESO ADA POSANG",
+        "altitude": "ESO TEL ALT",
+    }
+    references = (
+        "Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581",
+        "Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545",
+        "Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379",
+        "FORS2-INSTPOL, https://github.com/gongsale/FORS2-INSTPOL",
+    )
+    entrance = "collimator"
+    # M1 and M2 do not polarize on the axis
+    site, focus = PARANAL, "cassegrain"
+
+    def inner(self, source, optics_in, grid):
+        """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
+        zero = np.zeros(grid.size)
+        collimator = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="collimator")
+        collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
+        theta = np.interp(grid.to_value(u.nm), self.wavelength.value, _ZERO)
+        plate = turning_retarder("hwp", 178, grid, most=15, theta=theta * u.deg)
+        return [collimator, plate, wollaston(grid)]
 
 
 class NaCo(Polarimeter):
