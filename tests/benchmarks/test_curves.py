@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Fittable1DModel, Parameter
 from astropy.modeling.fitting import TRFLSQFitter
-from timing import fastest, report
+from timing import fastest
 
 from astropolcal import optics
 from astropolcal.materials import get_material
@@ -54,7 +54,7 @@ class Element(Fittable1DModel):
         return [to_theta, -np.deg2rad(1) * np.sin(angle) ** 2 * np.sin(delta)]
 
 
-def test_a_fit_through_a_curve_costs_what_a_model_by_hand_does(capsys):
+def test_a_fit_through_a_curve_costs_what_a_model_by_hand_does(measured):
     rng = np.random.default_rng(1)
     wavelength, angle = np.linspace(1.1, 2.3, 50) * u.um, np.linspace(0, 180, 50) * u.deg
     plate = optics.TwoLayerWaveplate().curve("retardance")
@@ -65,9 +65,9 @@ def test_a_fit_through_a_curve_costs_what_a_model_by_hand_does(capsys):
     element = retarder.curve("mueller", (1, 1), against="stage")
     flux = Element().evaluate(angle.value, 7, 165) + rng.normal(0, 0.01, 50)
     fit = TRFLSQFitter()
-    for ours, theirs, x, y in (
-        (plate, Plate(), wavelength, retardance),
-        (element, Element(), angle, flux * u.one),
+    for what, ours, theirs, x, y in (
+        ("retardance of a plate", plate, Plate(), wavelength, retardance),
+        ("element of a Mueller matrix", element, Element(), angle, flux * u.one),
     ):
         found = [fit(model, x, y).parameters for model in (ours, theirs)]
         np.testing.assert_allclose(*found, rtol=1e-6)
@@ -76,5 +76,5 @@ def test_a_fit_through_a_curve_costs_what_a_model_by_hand_does(capsys):
             lambda theirs=theirs, x=x, y=y: fit(theirs, x, y),
             repeats=60,
         )
-        report(capsys, f"{1e3 * curve:.2f} ms through a curve, {1e3 * by_hand:.2f} ms by hand")
+        measured(f"fit of a curve, {what}", curve, {"model of astropy by hand": by_hand})
         assert curve < 1.5 * by_hand

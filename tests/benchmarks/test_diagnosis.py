@@ -46,21 +46,17 @@ def pair(cycles=1):
     return chains, data
 
 
-def report(capsys, text):
-    with capsys.disabled():
-        print(f"\n  {text}")
-
-
 @pytest.fixture(scope="module")
 def model():
     return nominal_model(*pair())
 
 
-def test_whole_diagnosis(benchmark):
+def test_whole_diagnosis(benchmark, measured):
     """Nominal fit, scan, refits, exchanges and left-out frames with the whole library."""
     chains, data = pair()
     found = benchmark.pedantic(diagnose, (chains, data), rounds=3, warmup_rounds=0, iterations=1)
     assert [cause.name for cause in found.causes] == [EFFECT]
+    measured("a whole diagnosis, 2 x 64 frames", benchmark.stats.stats.min)
     assert benchmark.stats.stats.median < 20
 
 
@@ -69,9 +65,10 @@ def test_nominal_model(benchmark):
     assert found.fit.converged
 
 
-def test_scan(benchmark, model):
+def test_scan(benchmark, model, measured):
     """All cells and the library without refits."""
     found = benchmark.pedantic(scan, (model, SMOOTH), rounds=3, warmup_rounds=1, iterations=1)
+    measured("scan of a diagnosis, 2 x 64 frames", benchmark.stats.stats.min)
     assert EFFECT in [one.name for one in found.candidates[:3]]
     assert len(found.candidates) > 1000
 
@@ -88,12 +85,12 @@ def seconds(function, *arguments):
     return time.perf_counter() - started
 
 
-def test_time_grows_as_the_number_of_frames(capsys):
+def test_time_grows_as_the_number_of_frames(measured):
     """Scan at 64 and at 640 frames a dataset; a factor of ten may cost little more than ten."""
     times = []
     for cycles in (1, 10):
         model = nominal_model(*pair(cycles))
         times.append(min(seconds(scan, model, SMOOTH) for _ in range(3)))
     ratio = times[1] / times[0]
-    report(capsys, f"scan at 64 and 640 frames: {times[0]:.2f} s, {times[1]:.2f} s; x {ratio:.1f}")
+    measured("the same, 2 x 640 frames", times[1])
     assert ratio < 15

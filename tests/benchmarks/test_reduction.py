@@ -11,7 +11,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from timing import fastest, in_new_process, report
+from timing import fastest, in_new_process
 
 from astropolcal import instruments
 from astropolcal.reduction import reduce_run
@@ -20,6 +20,7 @@ from astropolcal.simulation import half_wave_plate_cycles
 
 N_CUBES = 100
 GOALS = {"star": 20.0, "internal": 5.0}
+NAMES = {"star": "a star", "internal": "a lamp"}
 MEMORY = 500.0
 
 
@@ -46,17 +47,16 @@ def reduced(paths, source, raw):
     return len(reduction.frames), time.process_time() - started
 
 
-def test_run_of_a_hundred_cubes(run, capsys):
+def test_run_of_a_hundred_cubes(run, measured):
     source, paths, raw = run
     (n, seconds), memory = in_new_process(reduced, paths, source, raw)
-    with capsys.disabled():
-        print(f"\n  {source}: {N_CUBES} cubes in {seconds:.1f} s, at most {memory:.0f} MB")
+    measured(f"reduction of {N_CUBES} cubes, {NAMES[source]}", seconds, memory=memory)
     assert n == N_CUBES
     assert seconds < GOALS[source]
     assert memory < MEMORY
 
 
-def test_against_a_plain_loop(run, capsys):
+def test_against_a_plain_loop(run, measured):
     """The loop has the places of the star given; it need not find it."""
     source, paths, raw = run
     few = paths[:2]
@@ -72,11 +72,12 @@ def test_against_a_plain_loop(run, capsys):
     flux = np.array([frame.photometry.flux for frame in ours().frames])
     np.testing.assert_allclose(np.array(theirs()), flux, rtol=0.01)
     times = fastest(ours, theirs, repeats=3, clock=time.process_time)
-    report(capsys, f"{source}: {times[1] / times[0]:.1f} times faster than a plain loop")
+    ours, loop = (each / len(few) for each in times)
+    measured(f"photometry of a cube, {NAMES[source]}", ours, {"loop with photutils": loop})
     assert times[1] > times[0]
 
 
-def test_aperture_correction(run, capsys):
+def test_aperture_correction(run, measured):
     """The profile of the wings costs no more than the photometry does."""
     source, paths, raw = run
     if source != "star":
@@ -89,7 +90,7 @@ def test_aperture_correction(run, capsys):
     plain, corrected = fastest(
         reduce, lambda: reduce(aperture_correction=True), repeats=3, clock=clock
     )
-    report(capsys, f"aperture correction: {corrected / plain:.1f} times the time without")
+    measured("the same with aperture correction", corrected / 4)
     assert corrected < 4 * plain
 
 

@@ -11,7 +11,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
-from timing import fastest, report
+from timing import fastest
 
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import sample
@@ -42,19 +42,19 @@ def calibration(shared_data):
 
 
 @pytest.mark.parametrize("parameters", [GLOBAL, None], ids=["5 parameters", "93 parameters"])
-def test_log_posterior(calibration, parameters, capsys):
+def test_log_posterior(calibration, parameters, measured):
     """The goal is 1,000 evaluations a second."""
     log_posterior = LogPosterior(calibration.measurement, parameters=parameters)
     walkers = np.tile(log_posterior.centre, (12, 1))
     (seconds,) = fastest(lambda: log_posterior(walkers), repeats=60)
     rate = 12 / seconds
-    with capsys.disabled():
-        print(f"\n  {rate:.0f} log-posteriors a second, {rate / PUBLISHED:.0f} times the published")
+    n = len(parameters or calibration.measurement.free.names)
+    measured(f"log-posterior, {n} parameters", 1 / rate, {"published path": 1 / PUBLISHED})
     assert rate > 1000
 
 
 @pytest.mark.parametrize("with_checkpoint", [False, True])
-def test_run_of_the_paper(calibration, tmp_path, with_checkpoint, capsys):
+def test_run_of_the_paper(calibration, tmp_path, with_checkpoint, measured):
     """10,000 steps of 24 walkers in 5 parameters, from 1,000; the goal is minutes."""
     path = tmp_path / "chain.h5" if with_checkpoint else None
     started = time.process_time()
@@ -62,12 +62,12 @@ def test_run_of_the_paper(calibration, tmp_path, with_checkpoint, capsys):
         warnings.simplefilter("ignore", AstropolcalWarning)
         sample(calibration, parameters=GLOBAL, n_steps=1000, seed=1, checkpoint=path)
     minutes = (time.process_time() - started) * 10 / 60
-    with capsys.disabled():
-        print(f"\n  10,000 steps take {minutes:.1f} min, checkpoint: {with_checkpoint}")
+    kept = ", with a checkpoint" if with_checkpoint else ""
+    measured(f"10,000 steps of 24 walkers in 5 parameters{kept}", 60 * minutes)
     assert minutes < 4
 
 
-def test_over_bare_emcee(calibration, capsys):
+def test_over_bare_emcee(calibration, measured):
     """Steps of `sample` against those of emcee with the same log-posterior and moves."""
     import emcee
 
@@ -85,11 +85,11 @@ def test_over_bare_emcee(calibration, capsys):
             sample(calibration, parameters=GLOBAL, n_walkers=24, n_steps=100, seed=1)
 
     times = fastest(ours, bare, repeats=3, clock=time.process_time)
-    report(capsys, f"100 steps of 24 walkers: {times[0]:.2f} s, {times[0] / times[1]:.2f} of emcee")
+    measured("100 steps of 24 walkers", times[0], {"emcee with the same posterior": times[1]})
     assert times[0] < 1.5 * times[1]
 
 
-def test_log_posterior_over_the_prediction(calibration, capsys):
+def test_log_posterior_over_the_prediction(calibration, measured):
     """What a log-posterior costs beyond the forward sweep that it needs."""
     log_posterior = LogPosterior(calibration.measurement)
     (dataset,) = calibration.measurement.datasets
@@ -97,5 +97,5 @@ def test_log_posterior_over_the_prediction(calibration, capsys):
     times = fastest(
         lambda: log_posterior(vector), lambda: dataset.values(dataset.forward(vector)), repeats=300
     )
-    report(capsys, f"log-posterior: {times[0] / times[1]:.2f} of the prediction")
+    measured("log-posterior of one walker", times[0], {"the prediction in it": times[1]})
     assert times[0] < 1.5 * times[1]

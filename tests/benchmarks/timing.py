@@ -67,9 +67,3 @@ def _with_memory(function, arguments):
     result = function(*arguments)
     text = Path("/proc/self/status").read_text(encoding="ascii")
     return result, int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
-
-
-def report(capsys, text):
-    """Print a line past pytest's capture."""
-    with capsys.disabled():
-        print(f"\n  {text}")
