@@ -13,13 +13,14 @@ from astropolcal.correction.rows import RowModel, ideal_chain
 from astropolcal.correction.solve import covariance_index, estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
+    AstropolcalError,
     AstropolcalWarning,
     ObservationError,
     ParameterError,
 )
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
-from astropolcal.pipeline.tasks import cluster_client
+from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting, shown
 from astropolcal.words import check_choice
 
@@ -57,7 +58,7 @@ def correct(
     seed=None,
     workers=None,
     cluster=None,
-    chunk=1,
+    chunk=None,
     progress=False,
     provenance=None,
 ):
@@ -118,9 +119,10 @@ def correct(
     workers : int, optional
         Threads among which the wavelengths are divided.
     cluster : str, optional
-        Address of a ``dask.distributed`` scheduler, which divides them among its processes.
-    chunk : int
-        Wavelengths that are worked on at a time, more of which need more memory.
+        Address of a ``dask.distributed`` scheduler, among whose workers the frames are divided.
+    chunk : int, optional
+        Wavelengths that are worked on at a time, more of which need more memory; by default one,
+        and all on a cluster.
     progress : bool
         Whether to show how far it is; on a terminal only.
     provenance : dict, optional
@@ -330,47 +332,60 @@ def _provenance(calibration, frames, systematic, given):
 
 # ---- the sum over frames, in bounded memory ------------------------------------------------------
 # A block is a range of wavelengths: its frames are read a few at a time and added to its images.
-# Wavelengths do not depend on each other and frames are added in the same order always, so the
-# numbers do not depend on how the work is divided.
+# Wavelengths do not depend on each other, and the same frames are added in the same order always,
+# so the numbers do not depend on how the work is divided.
+
+# frames, or pairs of them, whose sum is one task of a cluster
+_TOGETHER = 8
 
 
-def correct_block(source, solution, start, stop, by_variance=False):
+def correct_block(source, solution, start, stop, by_variance=False, in_order=map):
     """
     Return the Stokes parameters at wavelengths start to stop, (n, stop - start, ...).
 
     The components, then, if the fluxes have variances, their covariances in the order of
-    `covariance_index`. ``by_variance`` weights each pixel by its own variances.
+    `covariance_index`. ``by_variance`` weights each pixel by its own variances. ``in_order`` calls
+    a function with parts of the frames, and gives the results in the order of the parts.
     """
     if by_variance and not source.has_variances:
         raise ParameterError("weights by variance need variances of the fluxes, and there are none")
-    n = len(solution.components)
-    wavelengths = slice(start, stop)
-    n_pixels = int(np.prod(source.image_shape, dtype=int))
-    n_out = n + (len(covariance_index(n)) if source.has_variances else 0)
-    if by_variance:
-        out = np.full((n_out, stop - start, n_pixels), np.nan)
-    else:
-        out = _linear(source, solution, wavelengths, n_out, n_pixels)
+    n, wavelengths = len(solution.components), slice(start, stop)
+    index = covariance_index(n) if source.has_variances else []
+    shape = (n + len(index), stop - start, int(np.prod(source.image_shape, dtype=int)))
+    out = np.full(shape, np.nan if by_variance else 0.0)
+    if not by_variance:
+        linear = partial(_linear, source, solution, wavelengths, shape)
+        for part in in_order(linear, _together(source.batches())):
+            out += part
     known = solution.determined[wavelengths]
-    for i, w in enumerate(range(start, stop)):
-        bad = ~np.isfinite(out[:, i]).all(axis=0)
-        # a NaN in any frame makes the sum NaN; such pixels are fitted alone, from the other frames
-        if bad.any() and known[i, :3].all():
-            out[:, i, bad] = _pixel_by_pixel(source, solution, w, bad, n_out, by_variance)
-        # the components, then their covariances
-        for kept, column in enumerate([(c,) for c in range(n)] + covariance_index(n)[: n_out - n]):
-            out[kept, i] = out[kept, i] if known[i, list(column)].all() else np.nan
-    return out.reshape(n_out, stop - start, *source.image_shape)
+    # a NaN in any frame makes the sum NaN; such pixels are fitted alone, from the other frames
+    bad = ~np.isfinite(out).all(axis=0) & known[:, :3].all(axis=1)[:, None]
+    if bad.any():
+        equations = partial(_equations, source, solution, wavelengths, bad, by_variance)
+        sums = sum(in_order(equations, _together(list(enumerate(solution.channels.units)))))
+        for i in np.flatnonzero(bad.any(axis=1)):
+            # as for all other pixels: where V is not determined it is taken as zero
+            solved = 3 if n == 4 and not known[i, 3] else n
+            found = _solved(sums[:, np.nonzero(bad)[0] == i], n, solved, solution.max_condition)
+            out[:, i, bad[i]] = found[: len(out)]
+    # the components, then their covariances
+    for kept, column in enumerate([*((c,) for c in range(n)), *index]):
+        out[kept, ~known[:, list(column)].all(axis=1)] = np.nan
+    return out.reshape(*shape[:2], *source.image_shape)
 
 
-def _linear(source, solution, wavelengths, n_out, n_pixels):
-    """Return the weighted sum over frames, with the same weights for all pixels."""
+def _together(parts):
+    return [parts[i : i + _TOGETHER] for i in range(0, len(parts), _TOGETHER)]
+
+
+def _linear(source, solution, wavelengths, shape, batches):
+    """Return the weighted sum over some frames, with the same weights for all pixels."""
     # components that are not determined are made NaN in the end, so here they may be anything
     gain = np.nan_to_num(solution.gain[wavelengths])
-    n, count = gain.shape[1], len(gain)
+    n = gain.shape[1]
     index = np.array(covariance_index(n)).T
-    out = np.zeros((n_out, count, n_pixels))
-    for frames in source.batches():
+    out = np.zeros(shape)
+    for frames in batches:
         for beam in (0, 1):
             part = gain[:, :, beam, frames]
             _add(out[:n], part, source.fluxes(beam, frames, wavelengths))
@@ -389,20 +404,22 @@ def _add(out, gain, cubes):
             out[:, i] += gain[i] @ frames
 
 
-def _pixel_by_pixel(source, solution, w, pixels, n_out, by_variance):
-    """Return what a least-squares fit gives of pixels that lack some fluxes."""
-    n = len(solution.components)
-    # as for all other pixels: where V is not determined it is taken as zero
-    solved = 3 if n == 4 and not solution.determined[w, 3] else n
-    index = covariance_index(solved)
-    size = int(pixels.sum())
-    normal, spread = np.zeros((2, len(index), size))
-    right = np.zeros((solved, size))
-    for unit, frames in enumerate(solution.channels.units):
-        data, variance = _unit(source, solution.channels, frames, w, pixels)
+def _equations(source, solution, wavelengths, pixels, by_variance, units):
+    """
+    Return the normal equations of pixels that lack some fluxes, summed over some units.
+
+    Of ``pixels``, (n_wavelengths, n_pixels), those that are true: their matrices and what the
+    scatter of the data adds to these, by the order of `covariance_index`, and the right sides.
+    """
+    n, of = len(solution.components), np.nonzero(pixels)[0]
+    index = covariance_index(n)
+    normal, spread = np.zeros((2, len(index), of.size))
+    right = np.zeros((n, of.size))
+    for unit, frames in units:
+        data, variance = _unit(source, solution.channels, frames, wavelengths, pixels)
         for channel in (0, 1):
-            row = solution.channel_rows[channel, w, unit, :solved]
-            weight = solution.weights[channel, w, unit]
+            row = solution.channel_rows[channel, wavelengths, unit, :n][of].T
+            weight = solution.weights[channel, wavelengths, unit][of]
             good = np.isfinite(data[channel])
             if variance is not None:
                 good &= np.isfinite(variance[channel]) & (variance[channel] > 0)
@@ -411,45 +428,45 @@ def _pixel_by_pixel(source, solution, w, pixels, n_out, by_variance):
                         # a flux that the user gave the weight zero stays out
                         weight = (weight > 0) / variance[channel]
             weight = np.where(good, weight, 0.0)
-            right += row[:, None] * (weight * np.where(good, data[channel], 0.0))
-            products = np.array([row[i] * row[j] for i, j in index])[:, None]
+            right += row * (weight * np.where(good, data[channel], 0.0))
+            products = np.array([row[i] * row[j] for i, j in index])
             normal += products * weight
             if variance is not None:
                 # A^T W V W A: with W = 1 / V it is the normal matrix itself
                 spread += products * (weight**2 * np.where(good, variance[channel], 0.0))
-    return _solved(normal, right, spread, n, n_out, solution.max_condition)
+    return np.concatenate([normal, spread, right])
 
 
-def _unit(source, channels, frames, w, pixels):
-    """Return the channels of one unit and their variances, of some pixels at a wavelength."""
+def _unit(source, channels, frames, wavelengths, pixels):
+    """Return the channels of one unit and their variances, of some pixels."""
 
     def read(method):
         cells = [slice(f, f + 1) for f in frames]
-        found = [[method(b, cell, slice(w, w + 1)) for cell in cells] for b in (0, 1)]
-        return np.array(found).reshape(2, len(cells), -1)[..., pixels]
+        found = [[method(b, cell, wavelengths)[0] for cell in cells] for b in (0, 1)]
+        return np.reshape(found, (2, len(cells), *pixels.shape))[..., pixels]
 
     data = channels.one(read(source.fluxes))
     variance = channels.one(read(source.variances), True) if source.has_variances else None
     return data, variance
 
 
-def _solved(normal, right, spread, n, n_out, max_condition):
-    """Solve the normal equations of all pixels; NaN where they are poorly determined."""
-    solved, size = right.shape
-    matrix = _full(normal, solved)
+def _solved(sums, n, solved, max_condition):
+    """Return components and covariances of pixels; NaN where they are poorly determined."""
+    index = covariance_index(n)
+    normal, spread, right = np.split(sums, [len(index), 2 * len(index)])
+    matrix = _full(normal, n)[:, :solved, :solved]
     # eigenvalues of A^T W A are the squares of the singular values of the rows
     values = np.linalg.eigvalsh(matrix)
     good = values[:, 0] * max_condition**2 > values[:, -1]
-    inverse = np.full((size, solved, solved), np.nan)
+    inverse = np.full(matrix.shape, np.nan)
     inverse[good] = np.linalg.inv(matrix[good])
-    out = np.full((n_out, size), np.nan)
-    out[:solved] = np.einsum("pij,jp->ip", inverse, right)
-    if n_out > n:
-        # (A^T W A)^-1 A^T W V W A (A^T W A)^-1, right for any weights W
-        covariance = inverse @ _full(spread, solved) @ inverse
-        for plane, (i, j) in enumerate(covariance_index(n), start=n):
-            if max(i, j) < solved:
-                out[plane] = covariance[:, i, j]
+    out = np.full((n + len(index), sums.shape[1]), np.nan)
+    out[:solved] = np.einsum("pij,jp->ip", inverse, right[:solved])
+    # (A^T W A)^-1 A^T W V W A (A^T W A)^-1, right for any weights W
+    covariance = inverse @ _full(spread, n)[:, :solved, :solved] @ inverse
+    for plane, (i, j) in enumerate(index, start=n):
+        if max(i, j) < solved:
+            out[plane] = covariance[:, i, j]
     return out
 
 
@@ -464,30 +481,29 @@ def _full(planes, n):
 # ---- dividing the work -----------------------------------------------------------------------
 
 
-def run_blocks(block, shape, *, chunk=1, workers=None, cluster=None, progress=False):
+def run_blocks(block, shape, *, chunk=None, workers=None, cluster=None, progress=False):
     """
     Call a function with start and stop of ranges of ``chunk`` wavelengths.
 
-    Return its results, (n, stop - start, ...), put together in ``shape``. With ``workers`` by
-    threads, with ``cluster`` (the address of a scheduler) by its processes.
+    Return its results, (n, stop - start, ...), put together in ``shape``. With ``workers`` threads
+    divide the ranges. With ``cluster``, the address of a scheduler, its processes divide what the
+    function calls ``in_order``, and the range by default is that of all wavelengths.
     """
     for name, value in (("chunk", chunk), ("workers", workers)):
         if value is not None and not value >= 1:
             raise ParameterError(f"{name} = {value}; it must be at least 1")
     out = np.empty(shape)
-    ranges = [(i, min(i + chunk, shape[1])) for i in range(0, shape[1], chunk)]
-    with shown(progress), counting(shape[1], "wavelengths") as add:
-
-        def keep(limits, result):
-            out[:, limits[0] : limits[1]] = result
-            add(limits[1] - limits[0])
+    if cluster is not None:
+        block, workers = partial(block, in_order=partial(_on_cluster, cluster)), None
+        chunk = chunk or shape[1]
+    ranges = [(i, min(i + (chunk or 1), shape[1])) for i in range(0, shape[1], chunk or 1)]
+    with shown(progress), counting(0 if cluster else shape[1], "wavelengths") as add:
 
         def work(limits):
-            keep(limits, block(*limits))
+            out[:, limits[0] : limits[1]] = block(*limits)
+            add(limits[1] - limits[0])
 
-        if cluster is not None:
-            _on_cluster(block, ranges, cluster, keep)
-        elif workers is None:
+        if workers is None:
             for limits in ranges:
                 work(limits)
         else:
@@ -497,14 +513,19 @@ def run_blocks(block, shape, *, chunk=1, workers=None, cluster=None, progress=Fa
     return out
 
 
-def _on_cluster(block, ranges, cluster, keep):
-    client = cluster_client(cluster)
-    from distributed import as_completed
+def _on_cluster(address, function, parts):
+    """Yield the results of a function in the order of its arguments."""
+    waiting, due = {}, 0
+    with counting(len(parts), "groups of frames") as add:
+        for ended in ended_tasks(partial(_numbered, function), enumerate(parts), cluster=address):
+            if ended.reason:
+                raise AstropolcalError(ended.reason)
+            waiting[ended.task[0]] = ended.result
+            add()
+            while due in waiting:
+                yield waiting.pop(due)
+                due += 1
 
-    with client:
-        futures = client.map(block, *zip(*ranges, strict=True), pure=False)
-        places = dict(zip(futures, ranges, strict=True))
-        for future, result in as_completed(futures, with_results=True):
-            keep(places[future], result)
-            # results of many images must not stay in the memory of the cluster
-            future.release()
+
+def _numbered(function, task):
+    return function(task[1])

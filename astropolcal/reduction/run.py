@@ -175,6 +175,7 @@ def reduce_run(
     flat=None,
     meta=None,
     workers=None,
+    cluster=None,
     resume=None,
     progress=False,
     hwp_sequence=None,
@@ -209,6 +210,8 @@ def reduce_run(
         More for the table's meta, such as ``{"yjh50_dichroic": "in"}``.
     workers : int, optional
         Number of processes; by default one for 100 files, up to that of the CPUs.
+    cluster : str, optional
+        Address of a ``dask.distributed`` scheduler, whose workers measure a file each at a time.
     resume : path-like, optional
         Journal of what is done: files in it are not measured again.
     progress : bool
@@ -275,7 +278,7 @@ def reduce_run(
         "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
     }
-    frames = _measure_all(files, task, workers, resume, progress)
+    frames = _measure_all(files, task, workers, cluster, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
@@ -364,7 +367,7 @@ def _hint(task, reduction):
 # --- all files -------------------------------------------------------------------
 
 
-def _measure_all(files, task, workers, resume, progress):
+def _measure_all(files, task, workers, cluster, resume, progress):
     """Return the frames of all files in their order, from the journal or measured now."""
     settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
@@ -374,7 +377,7 @@ def _measure_all(files, task, workers, resume, progress):
     found = {path: frame for path, frame in found.items() if frame is not None}
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
-    results = _results(todo, task, _count(workers, len(todo)))
+    results = _results(todo, task, _count(workers, len(todo)), cluster)
     with shown(progress):
         for frame in steps(results, "cubes", len(set(files)), len(found)):
             found[frame.path] = frame
@@ -391,15 +394,16 @@ def _count(workers, n_files):
     return min(workers, max(n_files, 1))
 
 
-def _results(files, task, workers):
+def _results(files, task, workers, cluster):
     """Yield the frames of files as they are done."""
-    if workers == 1:
+    if workers == 1 and cluster is None:
         yield from (reduce_frame(path, **task) for path in files)
         return
     # imported once, not by each process
     preload = ["astropolcal.reduction.frames", "photutils.aperture"]
     measure = partial(_measured, reduce_frame, task)
-    with closing(ended_tasks(measure, files, workers=workers, preload=preload)) as ended:
+    given = {"workers": workers, "cluster": cluster, "preload": preload}
+    with closing(ended_tasks(measure, files, **given)) as ended:
         for each in ended:
             if isinstance(each.result, Exception):
                 raise each.result

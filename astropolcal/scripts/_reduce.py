@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.scripts._common import (
@@ -57,7 +57,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
     of the light) or pixels
 --aperture-correction  stars: scale the fluxes to all of the star's light, by a profile of its wings
 --workers N int  number of processes
---cluster ADDRESS  with --archive: scheduler of dask.distributed, in place of processes
+--cluster ADDRESS  scheduler of dask.distributed, in place of processes
 --resume FILE Continued  journal of what is done, to go on after a stop
 --quicklook DIR Folder  write figures to this folder
 @ full json online quiet
@@ -84,8 +84,6 @@ def run(arguments):
     _options(arguments)
     if is_archive(arguments, ("resume", "quicklook")):
         return run_archive("reduce", arguments)
-    if arguments.cluster:
-        raise ParameterError(f"--cluster {arguments.cluster}: is for --archive DIR")
     check_suffix("-o", arguments.output, ".ecsv")
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument or _recognized(files))
@@ -98,6 +96,7 @@ def run(arguments):
         flat=arguments.flat,
         meta=dict(arguments.meta),
         workers=arguments.workers,
+        cluster=arguments.cluster,
         resume=arguments.resume,
         hwp_sequence=arguments.hwp_sequence,
         **_options(arguments),

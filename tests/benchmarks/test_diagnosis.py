@@ -76,7 +76,7 @@ def test_scan(benchmark, model, measured):
 def test_where(benchmark, model):
     """Patterns and places of the gap."""
     where = benchmark.pedantic(locate, (model,), rounds=3, warmup_rounds=1, iterations=1)
-    assert where.told["detail"][0].startswith("what is constant in the half-wave-plate angle")
+    assert where[0]["detail"].startswith("what is constant in the half-wave-plate angle")
 
 
 def seconds(function, *arguments):
@@ -92,5 +92,5 @@ def test_time_grows_as_the_number_of_frames(measured):
         model = nominal_model(*pair(cycles))
         times.append(min(seconds(scan, model, SMOOTH) for _ in range(3)))
     ratio = times[1] / times[0]
-    measured("the same, 2 x 640 frames", times[1])
+    measured("scan of a diagnosis, 2 x 640 frames", times[1])
     assert ratio < 15

@@ -90,7 +90,7 @@ def test_aperture_correction(run, measured):
     plain, corrected = fastest(
         reduce, lambda: reduce(aperture_correction=True), repeats=3, clock=clock
     )
-    measured("the same with aperture correction", corrected / 4)
+    measured("the same with an aperture correction", corrected / 4)
     assert corrected < 4 * plain
 
 

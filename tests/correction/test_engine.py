@@ -17,12 +17,19 @@ from astropolcal.exceptions import AstropolcalError, ObservationError, Parameter
 
 
 def test_a_cluster_changes_no_number(star, sky, charis):
+    """It divides the frames, also those from which a flux is missing."""
     distributed = pytest.importorskip("distributed", reason="distributed is not installed")
-    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    beams = [np.array(beam) for beam in (star.right, star.left)]
+    # it is fitted from the other frames, which are divided too
+    beams[0][3, 5] = np.nan
+    given = (*beams, charis.wavelength, star.positions)
     settings = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
     with distributed.LocalCluster(processes=False, **settings) as cluster:
-        found = correct(sky, frames, cluster=cluster.scheduler_address, chunk=4)
-    np.testing.assert_array_equal(found.stokes, correct(sky, frames).stokes)
+        for batch, chunk in ((None, 4), (1, None)):
+            frames = ScienceFrames.from_arrays(*given, batch=batch)
+            found = correct(sky, frames, cluster=cluster.scheduler_address, chunk=chunk)
+            np.testing.assert_array_equal(found.stokes, correct(sky, frames).stokes)
+    assert np.isfinite(found.stokes).all()
 
 
 @pytest.mark.slow

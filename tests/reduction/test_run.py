@@ -427,6 +427,12 @@ def test_processes_give_the_same(tmp_path, small):
     many = reduce_cubes(paths, small, source="star", workers=2)
     one = reduce_cubes(paths, small, source="star", workers=1)
     assert many.content_hash == one.content_hash
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
+    settings = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with distributed.LocalCluster(processes=False, **settings) as cluster:
+        address = cluster.scheduler_address
+        there = reduce_cubes(paths, small, source="star", cluster=address)
+    assert there.content_hash == one.content_hash
 
 
 @pytest.mark.slow

@@ -338,7 +338,7 @@ def test_bad_input(lab, tmp_path, capsys):
         (["correct", tmp_path / "empty", *calibration, *out], "no FITS file in this folder"),
         (["correct", tmp_path / "none", *calibration, *out], "no such folder"),
         (["reduce", tree, *out, "--quicklook", tmp_path / "q"], "--quicklook"),
-        (["reduce", tree, "-o", "a.ecsv", "--cluster", "tcp://a:1"], "is for --archive DIR"),
+        (["correct", tree, *calibration, "-o", "a.fits", "--timeout", "1"], "is for --archive"),
     ):
         assert main(list(map(str, words))) == 2
         lines = capsys.readouterr().err.splitlines()
