@@ -7,8 +7,8 @@ from importlib import import_module
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
+from astropolcal.calibration.result.calibration import ParameterTable
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.exceptions import AstropolcalError, ParameterError
 
@@ -543,7 +543,10 @@ class Posterior:
         columns = {"name": self.names, "unit": [str(unit or "") for unit in self.units]}
         keys = ("median", "lower", "upper", "std", "times", "r_hat", "ess_bulk", "ess_tail")
         columns |= {key: getattr(self.convergence, key) for key in keys}
-        return QTable({"tau" if key == "times" else key: c for key, c in columns.items()})
+        table = ParameterTable({"tau" if key == "times" else key: c for key, c in columns.items()})
+        for key in table.colnames[2:]:
+            table[key].info.format = ".5g" if key in ("median", "lower", "upper") else ".3g"
+        return table
 
     def report(self):
         """

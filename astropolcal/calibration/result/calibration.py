@@ -70,13 +70,13 @@ class DatasetRecord:
 
 
 class ParameterTable(QTable):
-    """A table that prints value, error, unit and status of every row; the rest is by name."""
+    """A table that prints every row; of fitted values value, error, unit and status only."""
 
     def __str__(self):
-        shown = [
-            name for name in ("name", "value", "std", "unit", "status") if name in self.columns
-        ]
-        lines = QTable(self, copy=False)[shown] if shown else self
+        lines = QTable(self, copy=False)
+        if "value" in self.columns:
+            known = ("name", "value", "std", "unit", "status")
+            lines = lines[[name for name in known if name in self.columns]]
         return "\n".join(lines.pformat(max_lines=-1, max_width=-1))
 
 
