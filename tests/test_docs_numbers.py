@@ -4,6 +4,7 @@
 import json
 import re
 import warnings
+from datetime import datetime
 from pathlib import Path
 
 import astropy.units as u
@@ -285,6 +286,19 @@ def test_text_of_the_challenges_is_that_of_their_tables():
     none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
     assert f"nothing in all {none} challenges without a fault" in text
     assert "Of the nine wrong answers four are to mechanisms" in text
+
+
+def test_speed_is_that_of_one_run_on_the_machine_that_the_page_names():
+    """What the text says of the machine is what the measurement of the growth wrote down."""
+    machine = Table.read(PAGE.with_name("speed_scaling.ecsv")).meta
+    text = " ".join(PAGE.with_name("speed.rst").read_text(encoding="utf-8").split())
+    versions = {name: machine[name].rpartition(".")[0] for name in ("python", "numpy", "scipy")}
+    for words in ("Python {python}", "numpy {numpy}", "scipy {scipy}"):
+        assert words.format(**versions) in text
+    assert f"in {datetime.fromisoformat(machine['date'] + '-01'):%B %Y}" in text
+    rows = Table.read(PAGE.with_name("speed.csv"), format="csv")
+    others = " ".join(str(name) for name in rows["Beside"])
+    assert all(name in others for name in ("katsu", "py_pol", "scipy", "photutils", "emcee"))
 
 
 def test_costs_of_an_archive_are_those_of_its_record():
