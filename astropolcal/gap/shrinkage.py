@@ -165,10 +165,14 @@ def foreseen(model, groups):
         rows, scale = np.concatenate(rows), np.concatenate(scale)
         if not rows.size:
             continue
-        lever, left = np.linalg.eigh(tangent[rows] @ tangent[rows].T)
+        here = tangent[rows]
+        # there are fewer parameters than data of a group
+        lever, along = np.linalg.eigh(here.T @ here)
         # what the group alone determines cannot be foreseen at all; it is not counted
-        lever = np.clip(lever, 0.0, _MOST_LEVER)
-        gap = residual[rows] + left @ ((lever / (1 - lever)) * (left.T @ residual[rows]))
+        along = along / np.sqrt(1 - np.clip(lever, 0.0, _MOST_LEVER))
+        pull = (here @ along).T @ residual[rows]
+        # N (1 - N^T N)^-1 N^T r is what (1 - N N^T)^-1 r has beyond r
+        gap = residual[rows] + here @ (along @ pull)
         squares[i] = np.sum((gap * scale) ** 2)
         whitened[i] = np.sum(gap**2) / problem.channels[0].count
     keep = counts > 0

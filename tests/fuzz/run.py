@@ -15,6 +15,7 @@ of memory, a file or a program touched, and a wrong object are failures.
 
 import argparse
 import collections
+import csv
 import hashlib
 import json
 import os
@@ -316,9 +317,10 @@ def main(argv=None):
     parser.add_argument("--only", type=int, nargs="*")
     parser.add_argument("--state", help="file of outcomes, from which a run goes on")
     parser.add_argument("--keep", help="folder for files that failed")
+    parser.add_argument("--record", help="table of the counts (CSV) that docs/trust.rst shows")
     arguments = parser.parse_args(argv)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    failed = 0
+    failed, table = 0, [("read as", "refused", "valid", "failed")]
     for name in READERS if arguments.reader == "all" else [arguments.reader]:
         counts = run(
             name,
@@ -329,8 +331,13 @@ def main(argv=None):
             keep=arguments.keep,
         )
         failed += counts["failure"]
+        title = READERS[name].__doc__.strip().splitlines()[0].rstrip(".")
+        table.append((title, *(counts[key] for key in ("error", "valid", "failure"))))
         shown = ", ".join(f"{counts[key]} {key}" for key in ("error", "valid", "failure"))
         print(f"{name}: {sum(counts.values())} mutations: {shown}", flush=True)
+    if arguments.record:
+        with open(arguments.record, "w", encoding="utf-8", newline="") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(table)
     return int(failed > 0)
 
 
