@@ -412,7 +412,7 @@ def stated(headers, column, layout):
     """Yield all keywords that hold a value for a column, with the value, see ``look_up``."""
     keywords = (layout.keywords.get(column), *layout.alternatives.get(column, ()))
     for header, keyword in product(headers, filter(None, keywords)):
-        value = _read(header, keyword)
+        value = card_value(header, keyword)
         if value is None or isinstance(value, Undefined):
             continue
         if str(value).strip().lower() not in _MISSING:
@@ -428,7 +428,8 @@ def unit_of(column, layout):
     return u.Unit(layout.units.get(column, _UNITS.get(column, "deg")))
 
 
-def _read(header, keyword):
+def card_value(header, keyword):
+    """Return the value of a keyword, None without it; of a card that astropy cannot read, words."""
     try:
         return header.get(keyword)
     except VerifyError:

@@ -112,9 +112,12 @@ def sky_angle(name, value):
     raises a ValueError.
     """
     try:
-        return plain_number(value)
+        angle = plain_number(value)
     except (TypeError, ValueError):
-        return _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
+        angle = _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
+    if not np.isfinite(angle):
+        raise ValueError(f"{value!r} is not finite")
+    return angle
 
 
 # the frames of a target have the same text

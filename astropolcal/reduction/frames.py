@@ -14,6 +14,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.fitscheck import open_fits, readable_fits
+from astropolcal.instruments.layout import card_value
 from astropolcal.reduction.headers import (
     FrameHeader,
     add_pointing,
@@ -85,7 +86,8 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             frame.number, frame.values = known.number, known.values
             frame.errors, frame.doubts = known.errors, known.doubts
             _check_header(frame, layout, source)
-            unit = header.get("BUNIT", primary.get("BUNIT"))
+            units = (card_value(one, "BUNIT") for one in (header, primary))
+            unit = next((one for one in units if one is not None), None)
             # per file: gain and exposure time may change within a night
             detector = detector_of(layout, unit, frame.values.get("exposure_time"), frame.values)
             if layout.beam_files:

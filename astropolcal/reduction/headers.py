@@ -27,6 +27,7 @@ from astropolcal.instruments.layout import (
     ANGLES,
     RANGES,
     TEXTS,
+    card_value,
     convert,
     look_up,
     stated,
@@ -63,7 +64,7 @@ def frame_number(name, layout, header=None):
 
     The header knows the name that a file had before it was renamed.
     """
-    other = "" if header is None else str(header.get(layout.original_name, ""))
+    other = "" if header is None else str(card_value(header, layout.original_name) or "")
     for text in (Path(name).name, other):
         # the last one: a date may stand before it
         if found := re.findall(layout.frame_pattern, text):
@@ -106,10 +107,10 @@ def read_header(path, layout, *, header=None, raw=None):
     """
     header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
-    frame.unit = header.get("BUNIT")
+    frame.unit = card_value(header, "BUNIT")
     # what is in the file goes before what a header says of it
-    stack = header.get("NAXIS3", 1) if header.get("NAXIS") == 3 else 1
-    if layout.stacked and layout.shape[0] == 1 and stack > 1:
+    stack = card_value(header, "NAXIS3") if card_value(header, "NAXIS") == 3 else 1
+    if layout.stacked and layout.shape[0] == 1 and isinstance(stack, int) and stack > 1:
         frame.values["exposures"] = float(stack)
     columns = list(layout.keywords)
     try:

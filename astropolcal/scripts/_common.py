@@ -344,7 +344,7 @@ def sky_position(text, option):
     try:
         right_ascension, declination = text.split(",")
         angles = sky_angle("right_ascension", right_ascension), sky_angle("", declination)
-        if not (text.isascii() and np.isfinite(angles).all()):
+        if not text.isascii():
             raise ValueError
         return SkyCoord(*angles, unit=u.deg)
     except (ValueError, u.UnitsError):
