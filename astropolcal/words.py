@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
 Words that messages share: near matches of a name, numbers with their nouns, and p-values.
+
+And how many of them a terminal shows.
 """
 
 import difflib
@@ -13,6 +15,8 @@ __all__ = []
 _SIMILAR = 0.6
 # smaller p-values depend on the far wings of a law that nobody knows
 _LEAST_P = 1e-6
+# the terminal's columns, and its 24 lines less the prompt
+WIDTH, HEIGHT = 80, 23
 
 
 def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
@@ -47,6 +51,13 @@ def listed(texts, word="and", most=None):
     if most is not None and len(texts) > most:
         return f"{', '.join(texts[:most])} {word} {len(texts) - most} more"
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
+
+
+def shortened(line, width=WIDTH):
+    """Cut a line off at a word; blanks at its begin and inside stay."""
+    if len(line) <= width:
+        return line
+    return line[: width - 3].rpartition(" ")[0].rstrip(",;: ") + " ..."
 
 
 def html(text, table=None):

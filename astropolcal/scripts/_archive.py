@@ -19,8 +19,8 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
-from astropolcal.scripts._common import give
-from astropolcal.words import counted
+from astropolcal.scripts._common import give, with_ending, written_lines
+from astropolcal.words import counted, shortened
 
 # what sequences are worked on by, and what does not change a product
 _SUFFIX = {"correct": ".fits", "reduce": ".ecsv"}
@@ -249,9 +249,6 @@ def _content(found, n_worked, index, folder, arguments):
 
 def _lines(content, folder, arguments):
     """Return the summary, and what failed as far as there is room."""
-    from astropolcal.calibration.result.verdict import shortened
-    from astropolcal.scripts._ending import with_ending, written_lines
-
     n_failed, total = content["n_failed"], content["n_sequences"]
     n_left, n_warned = content["n_left_out"], content["n_warned"]
     body = [f"  failed: {name}: {why}" for name, why in content["failed"].items()]

@@ -19,6 +19,7 @@ from astropolcal.scripts._common import (
     show,
     stated_model,
     write_calibration,
+    written_calibration,
 )
 from astropolcal.units import plain_number
 
@@ -135,7 +136,6 @@ def _tell(arguments, calibration, targets, written):
     """Print the summary and what was written; of an unusable result something even if quiet."""
     from astropolcal.calibration.result.summary import summary
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines, verdict
-    from astropolcal.scripts._ending import written_calibration
 
     found = verdict(calibration, targets)
     if is_quiet(arguments):

@@ -21,11 +21,14 @@ from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
+    ending,
     is_quiet,
     number_or,
     show,
+    with_ending,
     wrapped,
     write_json,
+    written_lines,
 )
 from astropolcal.units import plain_number
 from astropolcal.words import counted
@@ -409,8 +412,6 @@ def _subtracted(table):
 
 def _report(summary, systematic, arguments):
     """Print how well the Stokes parameters are determined, the star, and the summary."""
-    from astropolcal.scripts._ending import ending, with_ending, written_lines
-
     named = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
     ends = ending(*_verdict(summary, systematic), written_lines(named))
     show("\n".join(with_ending(_lines(summary, systematic), ends, arguments.full)))

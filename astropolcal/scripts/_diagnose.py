@@ -17,6 +17,7 @@ from astropolcal.scripts._common import (
     stated_model,
     wrapped,
     write_json,
+    written_lines,
 )
 
 HELP = "find what a model lacks to explain the measurements"
@@ -104,7 +105,6 @@ def run(arguments):
 def _ending(content, written):
     """Return what to do next, and the files that were written."""
     from astropolcal.gap._words import exposure
-    from astropolcal.scripts._ending import written_lines
 
     following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
     found = {

@@ -7,7 +7,7 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import one_line, plain
-from astropolcal.scripts._common import give, printer, wrapped
+from astropolcal.scripts._common import give, printer, wrapped, written_lines
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
@@ -99,7 +99,6 @@ def _calibration(path, arguments):
     from astropolcal.calibration.result.calibration import validity_of
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines
     from astropolcal.converters.calibration import content_hash
-    from astropolcal.scripts._ending import written_lines
 
     calibration = Calibration.read(path)
     # when it was made and for when it holds are two things

@@ -15,10 +15,13 @@ from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
+    ending,
     number_or,
     printer,
     show,
+    with_ending,
     write_json,
+    written_lines,
 )
 from astropolcal.words import counted
 
@@ -162,8 +165,6 @@ def _report(reduction, arguments, figures):
 
 def _words(reduction, arguments, figures):
     """Return what is masked, and the summary."""
-    from astropolcal.scripts._ending import ending, with_ending, written_lines
-
     summary, output = reduction.summary(), one_line(arguments.output, None)
     n_masked, n_cells = summary["n_masked"], summary["n_cells"]
     lost = n_masked == n_cells

@@ -12,11 +12,13 @@ from astropolcal.scripts._common import (
     printer,
     read_datasets,
     show,
+    with_ending,
     wrapped,
     write_calibration,
+    written_calibration,
 )
 from astropolcal.units import plain_number
-from astropolcal.words import counted
+from astropolcal.words import counted, shortened
 
 HELP = "sample the posterior of a calibration's parameters"
 DESCRIPTION = """\
@@ -143,8 +145,6 @@ def _sample(calibration, arguments):
 
 def _words(calibration, arguments, written):
     """Return the run in words, a table of the parameters, and what the calibration is worth."""
-    from astropolcal.scripts._ending import shortened, with_ending, written_calibration
-
     posterior, words = calibration.posterior, calibration.verdict().words
     complaints = posterior.convergence.complaints(posterior.names)
     if complaints:

@@ -220,8 +220,9 @@ def _content(node):
     found = plain(_spelled({k: v for k, v in node.items() if k not in _DERIVED}, node_from_optic))
     # nothing in a list is as good as no list
     found = {k: v for k, v in found.items() if k != "priors" or v}
-    if not found.get("identifiability", {}).get("near_null", True):
-        del found["identifiability"]["near_null"]
+    for key in ("near_null", "branches"):
+        if not found.get("identifiability", {}).get(key, True):
+            del found["identifiability"][key]
     factor = found.get("covariance", {}).get("factor")
     if factor is not None and 0 in factor.get("shape", []):
         del found["covariance"]["factor"]

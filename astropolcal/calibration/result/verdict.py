@@ -12,11 +12,10 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.words import counted, p_words
+from astropolcal.words import HEIGHT, WIDTH, counted, p_words, shortened
 
 __all__ = ["Verdict"]
 
-_WIDTH = 80
 # what holds at more than this share of the wavelengths holds of the calibration
 _MOST = 0.5
 # bare metals polarize by a few percent at most, coated ones by little more
@@ -117,21 +116,14 @@ def verdict(calibration, targets=TARGETS):
     return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
 
 
-def shortened(line, width=_WIDTH):
-    """Cut a line off at a word; blanks at its begin and inside stay."""
-    if len(line) <= width:
-        return line
-    return line[: width - 3].rpartition(" ")[0].rstrip(",;: ") + " ..."
-
-
 def _first(reasons, cautions):
     told = reasons or cautions
     head = "NOT USABLE AS IT IS" if reasons else "Usable"
     line = f"{head}: {'; '.join(told)}" if told else head
-    if len(line) <= _WIDTH or len(told) == 1:
+    if len(line) <= WIDTH or len(told) == 1:
         return line
     more = f" (and {len(told) - 1} more)"
-    return shortened(f"{head}: {told[0]}", _WIDTH - len(more)) + more
+    return shortened(f"{head}: {told[0]}", WIDTH - len(more)) + more
 
 
 # ---- reasons ------------------------------------------------------------------------------
@@ -405,10 +397,7 @@ def _mount(calibration, free, sky):
 # ---- a summary that fits a terminal of 80 columns and 24 lines ----
 
 
-# the terminal's 24 lines less the prompt
-HEIGHT = 23
 HINT = "--full (full=True) adds tables per wavelength, the gauge and mirror solutions"
-_LINE_WIDTH = 80
 _COLUMN = 28
 # estimates of the noise, in few words
 _NOISES = {"errors": "stated errors"}
@@ -503,7 +492,7 @@ def _wrapped(name, text):
     first = f"  {name:<{_COLUMN}}"
     indent = " " * (_COLUMN + 5)
     return textwrap.wrap(
-        first + text, _LINE_WIDTH, subsequent_indent=indent, drop_whitespace=True,
+        first + text, WIDTH, subsequent_indent=indent, drop_whitespace=True,
         break_on_hyphens=False,
     )  # fmt: skip
 
