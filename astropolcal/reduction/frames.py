@@ -169,6 +169,9 @@ def _read_beams(path, hdus, layout, masters):
     cube = np.asarray(data, dtype=data.dtype.newbyteorder("=") if data.dtype.kind == "f" else float)
     # NaN marks what extraction could not reach
     good = np.isfinite(cube)
+    if not good.all():
+        # of a signalling NaN numpy would warn wherever it is used
+        cube = np.where(np.isnan(cube), np.array(np.nan, cube.dtype), cube)
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
     if weight is not None and weight.size == cube.size:
         good &= np.asarray(weight.reshape(cube.shape)) > 0

@@ -284,9 +284,8 @@ def evenly_lit(cube, good, layout):
     for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
         inside = (slice(None), rows, columns)
         known = np.ones((1, 1, 1), bool) if good is None else good[inside]
-        # in the precision of the cube a damaged pixel would overflow; it may be a signalling NaN
-        with np.errstate(invalid="ignore"):
-            total = np.sum(cube[inside], axis=0, dtype=float, where=known)
+        # in the precision of the cube a damaged pixel would overflow
+        total = np.sum(cube[inside], axis=0, dtype=float, where=known)
         number = np.broadcast_to(known, cube[inside].shape).sum(axis=0)
         whole = (weights >= 1.0) & (number > 0)
         pixels = total[whole] / number[whole]
