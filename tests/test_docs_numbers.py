@@ -301,6 +301,13 @@ def test_speed_is_that_of_one_run_on_the_machine_that_the_page_names():
     assert all(name in others for name in ("katsu", "py_pol", "scipy", "photutils", "emcee"))
 
 
+def test_damaged_files_of_every_reader_are_counted_and_none_failed():
+    counts = Table.read(PAGE.with_name("fuzz_counts.csv"), format="csv")
+    assert not counts["Failed"].any()
+    assert (counts["Refused"] + counts["Valid"] == 1000).all()
+    assert "For a thousand damaged files" in PAGE.with_name("trust.rst").read_text(encoding="utf-8")
+
+
 def test_costs_of_an_archive_are_those_of_its_record():
     """What the page derives for a million frames follows from what was measured."""
     record = json.loads(PAGE.with_name("archives.json").read_text(encoding="utf-8"))

@@ -320,7 +320,7 @@ def main(argv=None):
     parser.add_argument("--record", help="table of the counts (CSV) that docs/trust.rst shows")
     arguments = parser.parse_args(argv)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    failed, table = 0, [("read as", "refused", "valid", "failed")]
+    failed, table = 0, [("Read as", "Refused", "Valid", "Failed")]
     for name in READERS if arguments.reader == "all" else [arguments.reader]:
         counts = run(
             name,
@@ -331,7 +331,7 @@ def main(argv=None):
             keep=arguments.keep,
         )
         failed += counts["failure"]
-        title = READERS[name].__doc__.strip().splitlines()[0].rstrip(".")
+        title = READERS[name].__doc__.strip().splitlines()[0].rstrip(".").replace("`", "")
         table.append((title, *(counts[key] for key in ("error", "valid", "failure"))))
         shown = ", ".join(f"{counts[key]} {key}" for key in ("error", "valid", "failure"))
         print(f"{name}: {sum(counts.values())} mutations: {shown}", flush=True)
