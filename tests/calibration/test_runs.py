@@ -104,6 +104,38 @@ def test_errors_are_as_large_as_the_deviations():
     assert wrong <= 2
 
 
+@pytest.mark.slow
+def test_ten_years_of_a_recoating_a_drift_and_a_replaced_plate_are_told_apart():
+    chains = [
+        CHARIS.chain(source, derotator="linear", wavelength=GRID)
+        for source in ("polarized", "unpolarized")
+    ]
+    chains[0]["calibration_polarizer"].theta.fixed = True
+    runs = []
+    for i in range(20):
+        tables = []
+        for source, chain in zip(("polarized", "unpolarized"), chains, strict=True):
+            truth = chain.copy()
+            if source == "unpolarized":
+                truth["fold_mirror"].diattenuation = np.full(3, 0.009 if i >= 7 else 0.012)
+            truth["derotator"].theta = 0.015 * i * u.deg
+            truth["hwp"].w_sio2 = (1.657 if i >= 13 else 1.654) * u.mm
+            date = f"{2021 + i // 2}-{1 + 6 * (i % 2):02d}-15"
+            meta = {"date": date, "source": source, "instrument": "CHARIS"}
+            seed = 2 * i + (source == "unpolarized")
+            tables.append(simulate(truth, GRID, FRAMES, seed=seed, flux=1e6, meta=meta))
+        runs.append(tables)
+    found = calibrate_runs([chains] * 20, runs).courses
+    varies = {row["what"]: row for row in found if row["course"] != "constant"}
+    assert {name: str(row["course"]) for name, row in varies.items()} == {
+        "fold_mirror.diattenuation": "steps",
+        "hwp.w_sio2": "steps",
+        "derotator.theta": "drift",
+    }
+    assert varies["fold_mirror.diattenuation"]["when"] == "2024-01-15 to 2024-07-15"
+    assert varies["hwp.w_sio2"]["when"] == "2027-01-15 to 2027-07-15"
+
+
 def test_own_values_are_those_of_calibrate():
     tables, chain = make_runs([0.0, 0.4, -0.3]), make_chain()
     runs = calibrate_runs(chain, tables, vary=None, own=["hwp.theta"], errors="white")
