@@ -299,8 +299,10 @@ def plot_cause_map(diagnosis, *, figure=None):
                 if chance < _LEAST:
                     continue
                 look = {"ha": "center", "color": "white" if chance > _DARK else st.BLACK}
-                axes.text(j, i - 0.16, share(chance), va="center", weight="bold", **look)
-                axes.text(j, i + 0.22, words, va="center", fontsize=8, **look)
+                axes.text(j, i - 0.26, share(chance), va="center", weight="bold", **look)
+                # on a telephone a cell is narrow
+                words = textwrap.fill(words, _CELL, break_long_words=False)
+                axes.text(j, i - 0.06, words, va="top", fontsize=7.5, linespacing=0.95, **look)
         axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
         axes.set_yticks(range(len(rows)), labels=[_place_label(place) for place in rows])
         axes.tick_params(length=0, labelsize=9.5)
@@ -318,6 +320,8 @@ def plot_cause_map(diagnosis, *, figure=None):
 _OTHER = "other"
 _FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
 _AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear"}
+# characters of a line in a cell
+_CELL = 8
 # probabilities that are not written, and from which the ground is dark
 _LEAST, _DARK = 0.01, 0.65
 # words in the place of a named effect, and the place that they mean
