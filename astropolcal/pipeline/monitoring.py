@@ -111,7 +111,7 @@ def _positive(name, value, unit):
     except (TypeError, u.UnitConversionError):
         number = np.nan
     if not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r}; a positive number of {unit.long_names[0]}s")
+        raise ParameterError(f"{name} = {value!r}; allowed are numbers of {unit} above zero")
     return number
 
 

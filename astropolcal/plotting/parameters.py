@@ -17,7 +17,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import _Named, named_by_date, parameter_history, significance
 from astropolcal.plotting import _style as st
-from astropolcal.words import counted, did_you_mean
+from astropolcal.words import check_choice, counted
 
 __all__ = ["plot_efficiency", "plot_history", "plot_mirrors", "plot_retardances"]
 
@@ -333,9 +333,7 @@ def plot_parameters(calibration, names=None, *, figure=None):
     known = calibration.parameter_values()
     names = _per_wavelength(known) if names is None else list(names)
     for name in names:
-        if name not in known:
-            near = did_you_mean(name, known)
-            raise ParameterError(f"no parameter {name!r}; allowed are {', '.join(known)}{near}")
+        check_choice("parameter", name, known, ParameterError)
     if not names:
         raise ChainError("no free parameter has one value per wavelength: nothing to draw")
     optics = _optics(calibration)

@@ -146,7 +146,7 @@ def test_bad_arguments_get_one_line_and_status_two(capsys, tmp_path, monkeypatch
     for arguments, complaint in [
         (["missing.ecsv"], "missing.ecsv: no such file"),
         (["--instrument", "charix"], "unknown instrument 'charix'.*did you mean 'charis'"),
-        (["--observable", "ratios"], "unknown observable"),
+        (["--observable", "duoble"], "did you mean 'normalized_double_difference'"),
         (["--strategy", "three-step"], "three-step.*joint, two-step"),
         (["--derotator", "circular"], "elliptical, linear"),
         (["--bounds", "none"], "physical, paper"),

@@ -42,6 +42,13 @@ _QUANTILES = (0.16, 0.5, 0.84)
 _TAIL = (0.05, 0.95)
 
 
+class _Whole(QTable):
+    """A table that prints all of its rows and columns."""
+
+    def __str__(self):
+        return "\n".join(self.pformat(max_lines=-1, max_width=-1))
+
+
 def autocorrelation(chain):
     """Return the autocorrelation of (n_steps, n_walkers); NaN where nothing moves.
 
@@ -543,7 +550,10 @@ class Posterior:
         columns = {"name": self.names, "unit": [str(unit or "") for unit in self.units]}
         keys = ("median", "lower", "upper", "std", "times", "r_hat", "ess_bulk", "ess_tail")
         columns |= {key: getattr(self.convergence, key) for key in keys}
-        return QTable({"tau" if key == "times" else key: c for key, c in columns.items()})
+        table = _Whole({"tau" if key == "times" else key: c for key, c in columns.items()})
+        for name in table.colnames[2:]:
+            table[name].info.format = ".6g" if name in keys[:3] else ".3g"
+        return table
 
     def report(self):
         """
