@@ -4,6 +4,7 @@
 import base64
 import io
 import textwrap
+from datetime import timedelta
 from itertools import pairwise
 
 import astropy.units as u
@@ -642,7 +643,8 @@ def _mark_changes(ax, calibrations, own, name):
 def draw_accuracies(group, goal=None, *, figure=None):
     """Draw the accuracies of the calibrations of `~astropolcal.pipeline.health` against date."""
     dated = [one for one in group["calibrations"] if one["date"] is not None]
-    with st.canvas(figure, 7.2, 4.0) as fig:
+    # half as wide as the page: a telephone shows it in full
+    with st.canvas(figure, 5.4, 4.0) as fig:
         ax = fig.subplots()
         dates = Time([one["date"] for one in dated], scale="tai").datetime
         for key, color, marker, label in (
@@ -661,10 +663,14 @@ def draw_accuracies(group, goal=None, *, figure=None):
                 lw=0,
             )
         ax.set(ylabel="accuracy (% of polarization)", xlabel="date of the calibration data (UTC)")
-        ax.set_ylim(bottom=0)
+        # what is highest stays off the edge, even if it is all there is
+        ax.set_ylim(0, 1.1 * ax.get_ylim()[1])
+        if len(set(dates)) == 1:
+            ax.set_xlim(dates[0] - timedelta(days=60), dates[0] + timedelta(days=60))
         ax.tick_params(axis="x", labelrotation=25)
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-        fig.suptitle("Accuracy over time; grey: an optic changed")
+        fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        changed = "; grey: an optic changed" if group["events"] else ""
+        fig.suptitle(f"Accuracy over time{changed}")
     return fig
 
 

@@ -84,6 +84,7 @@ def run(arguments):
     nominal, datasets, instrument = _nominal(arguments)
     options |= {"changes": arguments.changes, "nested": arguments.nested}
     diagnosis = diagnose(nominal, datasets, **options)
+    stage("what to observe next")
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
@@ -196,6 +197,7 @@ def _write(diagnosis, content, arguments, instrument):
     if arguments.report:
         from astropolcal.gap.report import write_html
 
+        stage("drawing")
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)

@@ -51,6 +51,8 @@ class Verdict:
     words : list of str
         Five lines of at most 80 columns: the verdict, the accuracy on sky, what is
         determined, what is not, and which observation would help most.
+    advice : str, optional
+        Which observation would help most, in full.
 
     Examples
     --------
@@ -63,6 +65,7 @@ class Verdict:
     reasons: list
     cautions: list
     words: list
+    advice: str = ""
 
     def to_dict(self):
         """
@@ -71,7 +74,7 @@ class Verdict:
         Returns
         -------
         dict
-            Keys ``usable``, ``reasons``, ``cautions``, ``words``.
+            Keys ``usable``, ``reasons``, ``cautions``, ``words``, ``advice``.
         """
         return dict(vars(self))
 
@@ -108,13 +111,14 @@ def verdict(calibration, targets=TARGETS):
     # what is not known runs to its bounds, too
     wrong = any(wrong) or bool(stuck and not any(unknown))
     cautions = [] if reasons else _cautions(calibration, free)
+    advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
         "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
         *_determined(calibration, free),
-        f"Next        {_next(calibration, free, wrong, sky)}",
+        f"Next        {advice}",
     ]
-    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
+    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words], advice)
 
 
 def shortened(line, width=_WIDTH):
