@@ -16,7 +16,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal import instruments
+from astropolcal import instruments, progress
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import plain
@@ -61,7 +61,7 @@ def to_dict(diagnosis):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import instruments
+    >>> from astropolcal import instruments, progress
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.gap.report import to_dict
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -274,7 +274,7 @@ def summary(diagnosis, written=()):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import instruments
+    >>> from astropolcal import instruments, progress
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.gap.report import summary
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -315,7 +315,7 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import instruments
+    >>> from astropolcal import instruments, progress
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.gap.report import write_html
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -397,7 +397,8 @@ def _prepared(observations):
 
 
 def _images(figures):
-    return {name: _image(figure) for name, figure in (figures or {}).items()}
+    drawn = list((figures or {}).items())
+    return {name: _image(figure) for name, figure in progress.steps(drawn, "figures")}
 
 
 def _image(figure):

@@ -193,6 +193,13 @@ def _spoil(table, how):
     return table
 
 
+def test_the_page_of_the_health_replaces_no_table(small, capsys):
+    kept = Path(small).read_bytes()
+    line = _fails(capsys, "health", str(Path(small).parent), "--html", str(small))
+    assert "the name must end with .html or .htm" in line
+    assert Path(small).read_bytes() == kept
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_bad_tables_get_one_line_and_leave_nothing_behind(small, capsys, tmp_path):
     for how, complaint in [
