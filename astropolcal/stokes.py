@@ -16,6 +16,7 @@ import numpy as np
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import to_unit
+from astropolcal.words import check_choice
 
 __all__ = ["aolp_interval", "debias_dolp"]
 
@@ -142,8 +143,7 @@ def debias_dolp(dolp, sigma, method="mas"):
     """
     from scipy.special import exprel
 
-    if method not in ("mas", "wardle-kronberg"):
-        raise ParameterError(f"method = {method!r} must be one of ['mas', 'wardle-kronberg']")
+    check_choice("method", method, ("mas", "wardle-kronberg"), ParameterError)
     dolp, sigma = np.broadcast_arrays(checked_error(dolp, "dolp"), checked_error(sigma, "sigma"))
     if method == "wardle-kronberg":
         # two roots, because the squares of tiny values underflow

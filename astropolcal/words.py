@@ -6,6 +6,7 @@ And how many of them a terminal shows.
 """
 
 import difflib
+import re
 from collections.abc import Hashable
 from html import escape
 
@@ -13,6 +14,8 @@ __all__ = []
 
 # difflib's own default: from this similarity on, 1 being the same, a name is suggested
 _SIMILAR = 0.6
+# the same for one word of a name, such as double of normalized_double_difference
+_SIMILAR_WORD = 0.8
 # smaller p-values depend on the far wings of a law that nobody knows
 _LEAST_P = 1e-6
 # the terminal's columns, and its 24 lines less the prompt
@@ -23,11 +26,16 @@ def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
     """
     Return the end of a message that suggests what may have been meant, empty where nothing is near.
 
-    Up to ``most`` names of a similarity from ``cutoff`` on (1 is the same); ``show`` returns what
-    the message says of a name.
+    Up to ``most`` names of a similarity from ``cutoff`` on (1 is the same), else up to two names of
+    which one word is near; ``show`` returns what the message says of a name.
     """
     # a dictionary is a sequence of its keys here
-    near = difflib.get_close_matches(str(name), list(known), n=most, cutoff=cutoff)
+    known = list(known)
+    near = difflib.get_close_matches(str(name), known, n=most, cutoff=cutoff)
+    if not near:
+        words = {word for one in known for word in re.split(r"[\W_]+", str(one)) if len(word) > 3}
+        found = difflib.get_close_matches(str(name), words, n=1, cutoff=_SIMILAR_WORD)
+        near = [one for one in known if found and found[0] in re.split(r"[\W_]+", str(one))][:2]
     shown = list(dict.fromkeys(show(match) for match in near))
     return f"; did you mean {' or '.join(shown)}?" if shown else ""
 

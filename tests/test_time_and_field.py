@@ -405,7 +405,7 @@ def test_other_parameters_of_the_optic_stay_shared(still, nights):
 
 def test_own_parameters_that_cannot_be(still, nights):
     for own, message in [
-        (["plate.theta"], "own: no parameter 'plate.theta'; there are polarizer.theta"),
+        (["plate.theta"], "own = 'plate.theta'; allowed are polarizer.theta"),
         (["hwp.theta"], "own: hwp.theta is fixed"),
         ({"polarizer.theta": [1, 2]}, "own: polarizer.theta has 2 groups; there are 3 datasets"),
     ]:

@@ -206,7 +206,7 @@ def test_source_and_modulator_of_a_table():
     assert VAMPIRES.setup(read(differences(META | {"flc": "out"}))) == ("polarized", ())
     with pytest.raises(InstrumentError, match="flc = 'maybe'; allowed are in, out"):
         VAMPIRES.setup(read(differences(META | {"flc": "maybe"})))
-    with pytest.raises(InstrumentError, match="night: source 'moon' in the table's meta; allowed"):
+    with pytest.raises(InstrumentError, match="source of the table's meta = 'moon'; allowed"):
         VAMPIRES.setup(read(differences(META | {"source": "moon"})))
 
 

@@ -394,9 +394,10 @@ def _settings(n, seed, snr, kinds, setup):
     for name, value in (("n", n), ("seed", seed)):
         if not isinstance(value, (int, np.integer)) or value < (name == "n"):
             raise GapError(f"{name} = {value!r}; allowed are whole numbers from {int(name == 'n')}")
-    unknown = [kind for kind in kinds if kind not in KINDS]
-    if unknown or not len(kinds):
+    if not len(kinds):
         raise GapError(f"kinds = {list(kinds)}; allowed are {', '.join(KINDS)}")
+    for kind in kinds:
+        check_choice("kinds", kind, KINDS, GapError)
     low, high = (float(x) for x in snr)
     if not (0 < low <= high < np.inf):
         raise GapError(f"snr = {snr}; allowed are two positive numbers, the lower first")

@@ -16,7 +16,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal import instruments
+from astropolcal import instruments, progress
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import plain
@@ -397,7 +397,8 @@ def _prepared(observations):
 
 
 def _images(figures):
-    return {name: _image(figure) for name, figure in (figures or {}).items()}
+    drawn = list((figures or {}).items())
+    return {name: _image(figure) for name, figure in progress.steps(drawn, "figures")}
 
 
 def _image(figure):

@@ -223,8 +223,8 @@ def without_nuisance(chain):
 
 def _check(kind, wanted, names):
     check_choice("nuisance", kind, NUISANCES, InstrumentError)
-    if wanted and wanted not in names:
-        raise InstrumentError(f"nuisance {kind}: no dataset {wanted!r}; there are {names}")
+    if wanted:
+        check_choice(f"nuisance {kind}: dataset", wanted, names, InstrumentError)
 
 
 def _lamps(chains, chosen, text):
@@ -393,10 +393,8 @@ class Instrument(ABC):
         known = {plain_source(word): name for word, name in allowed.items()}
         word = plain_source(observations.source)
         if word not in known:
-            raise InstrumentError(
-                f"{observations.name}: source {observations.source!r} in the table's meta; "
-                f"allowed are {', '.join(allowed) or 'none'}"
-            )
+            what = f"{observations.name}: source of the table's meta"
+            check_choice(what, observations.source, allowed, InstrumentError)
         return known[word]
 
     def meta_without(self, names):

@@ -28,6 +28,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
+from astropolcal.words import check_choice
 
 __all__ = ["Normal", "Tie", "parameter_table"]
 
@@ -167,8 +168,7 @@ def with_own(chains, names, own, ties=None):
     for name, groups in own.items():
         groups = list(map(str, groups))
         count = len(chains)
-        if name not in table:
-            raise ParameterError(f"own: no parameter {name!r}; there are {', '.join(table)}")
+        check_choice("own", name, table, ParameterError)
         if len(groups) != count:
             raise ParameterError(
                 f"own: {name} has {len(groups)} groups; there are {count} datasets"

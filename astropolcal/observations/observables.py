@@ -25,7 +25,7 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.pointings import angle_or_zero, clock
 from astropolcal.units import angle_to_rad
-from astropolcal.words import counted, did_you_mean
+from astropolcal.words import check_choice, counted
 
 __all__ = ["OBSERVABLES", "Observable"]
 
@@ -469,10 +469,9 @@ def get_observable(name):
     # "Double-Difference" and "double difference" are one name
     key = "_".join(str(name).lower().replace("-", " ").replace("_", " ").split())
     known = OBSERVABLES | {_INTENSITY.name: _INTENSITY}
-    if key in known:
-        return known[key]
-    hint = did_you_mean(key, known)
-    raise ObservationError(f"unknown observable {name!r}; allowed are {', '.join(known)}{hint}")
+    if key not in known:
+        check_choice("observable", name, known, ObservationError)
+    return known[key]
 
 
 # ---- pairing -------------------------------------------------------------------------------

@@ -81,6 +81,8 @@ def _check_header(path, text):
         lines += [line[1:]] if line[1:] else []
     try:
         check_yaml(textwrap.dedent("\n".join(lines[1:])), ObservationError)
+        if "datatype" not in "".join(lines):
+            raise ObservationError("its header describes no columns (datatype)")
     except ObservationError as error:
         raise ObservationError(f"{path}: not a readable ECSV table: {error}") from None
 

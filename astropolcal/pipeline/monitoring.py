@@ -111,7 +111,7 @@ def _positive(name, value, unit):
     except (TypeError, u.UnitConversionError):
         number = np.nan
     if not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r}; a positive number of {unit.long_names[0]}s")
+        raise ParameterError(f"{name} = {value!r}; allowed are numbers of {unit} above zero")
     return number
 
 
@@ -141,8 +141,10 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
-    advice = verdict.words[-1].partition(" ")[2].strip()
-    content["next"] = [*_next(content, newest, moment, limit), f"{newest.name}: {advice}"]
+    content["next"] = [
+        *_next(content, newest, moment, limit),
+        f"{newest.name}: {verdict.advice}",
+    ]
     return content
 
 

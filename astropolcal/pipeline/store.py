@@ -18,6 +18,7 @@ from astropy.config.paths import get_cache_dir
 
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.files import atomic_path, check_new, one_line
+from astropolcal.words import check_choice
 
 __all__ = ["fetch", "import_context"]
 
@@ -52,8 +53,8 @@ def frozen(folder, name):
         with open(path, "rb") as stream:
             known = _understood(stream.read(_MOST_NAMES), path)
     except FileNotFoundError:
-        there = ", ".join(contexts(folder)) or "none"
-        raise CalibrationFileError(f"{folder}: no context {name!r}; there are {there}") from None
+        check_choice(f"{folder}: context", name, contexts(folder), CalibrationFileError)
+        raise
     for file, digest in known.items():
         found = Path(folder) / file
         if not found.is_file():

@@ -78,8 +78,9 @@ def looks(count):
 def save(figure, path, error=AstropolcalError):
     """Write a figure, atomically; raise ``error`` if the suffix is that of no known format."""
     path = Path(path)
-    if path.suffix.removeprefix(".").lower() not in figure.canvas.get_supported_filetypes():
-        raise error(f"{path}: no format of this suffix is known")
+    known = figure.canvas.get_supported_filetypes()
+    if path.suffix.removeprefix(".").lower() not in known:
+        raise error(f"{path}: the name must end with .{', .'.join(known)}")
     with atomic_path(path, error) as temporary:
         figure.savefig(temporary, dpi=_DPI)
     return path

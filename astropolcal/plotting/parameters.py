@@ -4,6 +4,7 @@
 import base64
 import io
 import textwrap
+from datetime import timedelta
 from itertools import pairwise
 
 import astropy.units as u
@@ -17,7 +18,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import _Named, named_by_date, parameter_history, significance
 from astropolcal.plotting import _style as st
-from astropolcal.words import counted, did_you_mean
+from astropolcal.words import check_choice, counted
 
 __all__ = ["plot_efficiency", "plot_history", "plot_mirrors", "plot_retardances"]
 
@@ -333,9 +334,7 @@ def plot_parameters(calibration, names=None, *, figure=None):
     known = calibration.parameter_values()
     names = _per_wavelength(known) if names is None else list(names)
     for name in names:
-        if name not in known:
-            near = did_you_mean(name, known)
-            raise ParameterError(f"no parameter {name!r}; allowed are {', '.join(known)}{near}")
+        check_choice("parameter", name, known, ParameterError)
     if not names:
         raise ChainError("no free parameter has one value per wavelength: nothing to draw")
     optics = _optics(calibration)
@@ -644,7 +643,8 @@ def _mark_changes(ax, calibrations, own, name):
 def draw_accuracies(group, goal=None, *, figure=None):
     """Draw the accuracies of the calibrations of `~astropolcal.pipeline.health` against date."""
     dated = [one for one in group["calibrations"] if one["date"] is not None]
-    with st.canvas(figure, 7.2, 4.0) as fig:
+    # half as wide as the page: a telephone shows it in full
+    with st.canvas(figure, 5.4, 4.0) as fig:
         ax = fig.subplots()
         dates = Time([one["date"] for one in dated], scale="tai").datetime
         for key, color, marker, label in (
@@ -663,10 +663,14 @@ def draw_accuracies(group, goal=None, *, figure=None):
                 lw=0,
             )
         ax.set(ylabel="accuracy (% of polarization)", xlabel="date of the calibration data (UTC)")
-        ax.set_ylim(bottom=0)
+        # what is highest stays off the edge, even if it is all there is
+        ax.set_ylim(0, 1.1 * ax.get_ylim()[1])
+        if len(set(dates)) == 1:
+            ax.set_xlim(dates[0] - timedelta(days=60), dates[0] + timedelta(days=60))
         ax.tick_params(axis="x", labelrotation=25)
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-        fig.suptitle("Accuracy over time; grey: an optic changed")
+        fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        changed = "; grey: an optic changed" if group["events"] else ""
+        fig.suptitle(f"Accuracy over time{changed}")
     return fig
 
 

@@ -27,6 +27,7 @@ from astropolcal.plotting.parameters import (
 )
 from astropolcal.plotting.posterior import MAX_CORNER, MAX_TRACES, plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_double_differences, plot_residuals
+from astropolcal.progress import stage, steps
 
 __all__ = ["save_all"]
 
@@ -95,7 +96,8 @@ def save_all(calibration, folder):
         reason = getattr(error, "strerror", None) or error
         raise AstropolcalError(f"{folder}: cannot be created: {reason}") from error
     paths = []
-    for name, draw in _figures(calibration):
+    stage("drawing")
+    for name, draw in steps(list(_figures(calibration)), "figures"):
         # no such optic, no data in a file, or no datum left: the figure has nothing to show
         with suppress(ChainError, CalibrationFileError, ObservationError):
             paths.append(save(draw(), folder / f"{name}.png"))

@@ -12,6 +12,7 @@ from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.reduction.wings import HALO_BETA
 from astropolcal.simulation import check_electrons
 from astropolcal.units import angle_to_rad
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -210,8 +211,7 @@ _MAS_PER_DEG = 3.6e6
 
 def choice(name, value, allowed):
     """Return a word, or refuse it if it is not among those allowed."""
-    if value not in allowed:
-        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+    check_choice(name, value, allowed, ParameterError)
     return value
 
 

@@ -24,6 +24,7 @@ from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
+from astropolcal.words import check_choice
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
@@ -342,8 +343,8 @@ def _photometry(source, instrument):
     known = getattr(instrument, "sources", ())
     allowed = dict.fromkeys(("internal", "star", *known))
     # an instrument of somebody else need not list its sources
-    if known and source not in allowed:
-        raise ParameterError(f"source = {source!r}; allowed are {', '.join(map(repr, allowed))}")
+    if known:
+        check_choice("source", source, allowed, ParameterError)
     return "star" if is_star(source) else "internal"
 
 

@@ -25,7 +25,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.progress import clear
 from astropolcal.units import mjd_of, plain_number
-from astropolcal.words import HEIGHT, counted, did_you_mean, shortened
+from astropolcal.words import HEIGHT, counted, did_you_mean, listed, shortened
 
 # what a terminal has that nobody made wider
 _COLUMNS = 80
@@ -38,6 +38,9 @@ _NO_TABLES = {
     b"SIMPLE  =": "a FITS file, where an observation table (ECSV) is wanted; reduce makes one of "
     "cubes",
 }
+
+# endings of a page
+PAGES = (".html", ".htm")
 
 # ---- files that are named -------------------------------------------------------------------
 
@@ -392,10 +395,10 @@ def printer(arguments):
     return (lambda *_: None) if is_quiet(arguments) else show
 
 
-def check_suffix(option, path, suffix):
+def check_suffix(option, path, *suffixes):
     """Raise if a file that is to be written is called what others take for another format."""
-    if path is not None and Path(path).suffix.lower() != suffix:
-        raise AstropolcalError(f"{option} {path}: the name must end with {suffix}")
+    if path is not None and Path(path).suffix.lower() not in suffixes:
+        raise AstropolcalError(f"{option} {path}: the name must end with {listed(suffixes, 'or')}")
 
 
 def wrapped(line, indent=0):
@@ -645,7 +648,9 @@ def _value(name, parameter, text):
     try:
         value = plain_number(number)
     except ValueError:
-        raise ParameterError(f"{name}={text}: not a number") from None
+        raise ParameterError(
+            f"{name}={text}: not a number; allowed are such as 1.5 or 1.5{parameter.unit or ''}"
+        ) from None
     if unit:
         try:
             value = (value * u.Unit(unit)).to_value(parameter.unit or u.dimensionless_unscaled)

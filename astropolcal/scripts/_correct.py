@@ -413,11 +413,11 @@ def _subtracted(table):
 def _report(summary, systematic, arguments):
     """Print how well the Stokes parameters are determined, the star, and the summary."""
     named = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
-    ends = ending(*_verdict(summary, systematic), written_lines(named))
+    ends = ending(*_verdict(summary, systematic, arguments.output), written_lines(named))
     show("\n".join(with_ending(_lines(summary, systematic), ends, arguments.full)))
 
 
-def _verdict(summary, systematic):
+def _verdict(summary, systematic, output):
     """Return verdict, accuracy, what is determined, and what to do next, of the star."""
     star, n = summary["aperture"], len(summary["wavelength_nm"])
     good = n - len(summary["poorly_determined"])
@@ -439,7 +439,7 @@ def _verdict(summary, systematic):
     # the unit once: the line is short
     if not told:
         degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
-    verdict, advice = "Usable", "astropolcal info tells what the product holds"
+    verdict, advice = "Usable", f"astropolcal info {output}"
     if not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
         advice = "frames at more angles of the half-wave plate and of the field"

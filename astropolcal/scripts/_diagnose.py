@@ -8,6 +8,7 @@ from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.progress import stage
 from astropolcal.scripts._common import (
     MODEL,
+    PAGES,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -35,7 +36,6 @@ examples:
 
 Several tables are used together. The effects are listed by --effects help.
 """
-_PAGES = (".html", ".htm")
 _HINT = "--full adds each cause with its sizes, and where the gap lies"
 # what the figure with both channels of the data shows
 _SPECTRUM = (
@@ -80,14 +80,12 @@ def run(arguments):
         return
     say = printer(arguments)
     check_suffix("--save", arguments.save, ".asdf")
-    if arguments.report and Path(arguments.report).suffix.lower() not in _PAGES:
-        raise AstropolcalError(
-            f"--report {arguments.report}: the name must end with {' or '.join(_PAGES)}"
-        )
+    check_suffix("--report", arguments.report or None, *PAGES)
     options = {"effects": _effects(arguments.effects), "progress": stage}
     nominal, datasets, instrument = _nominal(arguments)
     options |= {"changes": arguments.changes, "nested": arguments.nested}
     diagnosis = diagnose(nominal, datasets, **options)
+    stage("what to observe next")
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
@@ -199,6 +197,7 @@ def _write(diagnosis, content, arguments, instrument):
     if arguments.report:
         from astropolcal.gap.report import write_html
 
+        stage("drawing")
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)

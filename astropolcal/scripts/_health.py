@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal health``: how an instrument does, from all its calibrations."""
 
-from astropolcal.scripts._common import give, printer, say_written, wrapped
+from astropolcal.scripts._common import PAGES, check_suffix, give, printer, say_written, wrapped
 from astropolcal.words import counted
 
 HELP = "what changed over all calibrations of an instrument, and what needs care"
@@ -32,6 +32,7 @@ def run(arguments):
 
     from astropolcal.pipeline import Library, health, write_health
 
+    check_suffix("--html", arguments.html, *PAGES)
     library = Library(arguments.library)
     content = health(
         library,

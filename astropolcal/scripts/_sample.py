@@ -3,12 +3,14 @@
 
 import argparse
 import sys
+import warnings
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
     check_suffix,
+    is_quiet,
     printer,
     read_datasets,
     show,
@@ -117,17 +119,21 @@ def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
     try:
-        return sample(
-            calibration,
-            parameters=arguments.parameters,
-            n_walkers=arguments.walkers,
-            n_steps=arguments.steps,
-            burn_in=arguments.burn,
-            seed=arguments.seed,
-            checkpoint=arguments.checkpoint,
-            # as for all commands, and not at all where that is not wanted
-            progress=False,
-        )
+        with warnings.catch_warnings():
+            if not is_quiet(arguments):
+                # the summary says the same
+                warnings.filterwarnings("ignore", message="the chain (is|has)")
+            return sample(
+                calibration,
+                parameters=arguments.parameters,
+                n_walkers=arguments.walkers,
+                n_steps=arguments.steps,
+                burn_in=arguments.burn,
+                seed=arguments.seed,
+                checkpoint=arguments.checkpoint,
+                # as for all commands, and not at all where that is not wanted
+                progress=False,
+            )
     except FitError as error:
         # about the option instead of the argument
         words, option = str(error), _OPTIONS.get(error.argument)

@@ -26,6 +26,15 @@ _COMMANDS = (
     *("simulate", "challenge", "health", "info"),
 )
 _DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
+_EXAMPLES = """\
+examples:
+  astropolcal calibrate                          the packaged example
+  astropolcal calibrate run.ecsv -o cal.asdf     fit a model to a table
+  astropolcal diagnose cal.asdf run.ecsv         find what the model lacks
+  astropolcal correct cubes/ --calibration cal.asdf -o stokes.fits
+  astropolcal info cal.asdf                      what a file holds
+  astropolcal calibrate --help                   the options of a command
+"""
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -97,7 +106,9 @@ def build_parser():
     """Return the parser of the command and its subcommands."""
     from astropolcal.scripts._common import add_command
 
-    parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
+    form = argparse.RawDescriptionHelpFormatter
+    texts = {"description": _DESCRIPTION, "epilog": _EXAMPLES}
+    parser = _OneLineParser(prog="astropolcal", formatter_class=form, **texts)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     words = "print what completes commands, options and files in a shell (needs shtab)"
     shells = {"choices": ("bash", "zsh", "tcsh"), "help": words}

@@ -16,7 +16,7 @@ from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
 from astropolcal.standards.priors import StandardStar, check_kind, get, names
 from astropolcal.units import angle_to_rad, iso_date
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["observability", "search", "telescope_information"]
 
@@ -527,8 +527,8 @@ def search(
         raise ParameterError("site and night go together")
     if (center is None) != (radius is None):
         raise ParameterError("center and radius go together")
-    if band not in (None, *_BANDS):
-        raise ParameterError(f"band = {band!r} must be one of {', '.join(_BANDS)}")
+    if band is not None:
+        check_choice("band", band, _BANDS, ParameterError)
     stars = [s for s in map(get, names(kind)) if _in_band(s, band) and _bright(s, band, magnitude)]
     if center is not None:
         stars = _around(stars, center, radius)

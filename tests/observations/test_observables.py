@@ -268,7 +268,7 @@ def test_an_observable_passes_through():
 
 
 def test_a_misspelt_name_gets_a_suggestion():
-    with pytest.raises(ObservationError, match=r"unknown observable 'ratoi'.*did you mean 'ratio'"):
+    with pytest.raises(ObservationError, match=r"observable = 'ratoi'.*did you mean 'ratio'"):
         get_observable("ratoi")
 
 

@@ -74,6 +74,7 @@ def test_not_a_table(tmp_path):
         (b"\x80\x04\x95\x10pickle", "not a text file"),
         (b"\x89PNG\r\n\x1a\n\0\0\xff", "not a text file"),
         (b"# %ECSV 1.0\n", "not a readable ECSV table"),
+        (b"# %ECSV 1.0\n# ---\n", "its header describes no columns"),
         (b"# %ECSV 1.0\n# ---\n# datatype: [\n", "not a readable ECSV table"),
         (b"# %ECSV 1.0\n# ---\n# {a: *b}\nframe\n", "not a readable ECSV table"),
         (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\nx\n", "readable"),

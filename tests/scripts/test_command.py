@@ -146,7 +146,7 @@ def test_bad_arguments_get_one_line_and_status_two(capsys, tmp_path, monkeypatch
     for arguments, complaint in [
         (["missing.ecsv"], "missing.ecsv: no such file"),
         (["--instrument", "charix"], "unknown instrument 'charix'.*did you mean 'charis'"),
-        (["--observable", "ratios"], "unknown observable"),
+        (["--observable", "duoble"], "did you mean 'normalized_double_difference'"),
         (["--strategy", "three-step"], "three-step.*joint, two-step"),
         (["--derotator", "circular"], "elliptical, linear"),
         (["--bounds", "none"], "physical, paper"),
@@ -191,6 +191,13 @@ def _spoil(table, how):
     if how == "star":
         table.meta["source"] = "unpolarized standard star"
     return table
+
+
+def test_the_page_of_the_health_replaces_no_table(small, capsys):
+    kept = Path(small).read_bytes()
+    line = _fails(capsys, "health", str(Path(small).parent), "--html", str(small))
+    assert "the name must end with .html or .htm" in line
+    assert Path(small).read_bytes() == kept
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -339,6 +339,7 @@ def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
 def test_every_help_has_examples():
     for name, command in COMMANDS.items():
         assert f"examples:\n  astropolcal {name}" in command.format_help(), name
+    assert "examples:\n  astropolcal " in build_parser().format_help()
 
 
 def test_commands_that_do_something_can_be_quiet():

@@ -35,7 +35,8 @@ def moment_of(when, name):
     try:
         return Time(getattr(when, "isot", when), scale="tai")
     except (ValueError, TypeError):
-        raise ParameterError(f"{name} {when!r} is not a date") from None
+        words = f"{name} {when!r} is not a date; allowed are dates such as 2025-10-05"
+        raise ParameterError(words) from None
 
 
 def chances_of(dates, events, usual):

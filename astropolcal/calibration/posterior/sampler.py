@@ -25,6 +25,7 @@ from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import shown, steps
+from astropolcal.words import did_you_mean
 
 __all__ = ["LogPosterior", "sample"]
 
@@ -179,7 +180,7 @@ def _elements(free, parameters):
             raise ParameterError(
                 f"no free parameter {name!r}; allowed are "
                 f"{', '.join(slot.name for slot in free.slots)}, or one value of them such as "
-                f"{free.names[-1]}"
+                f"{free.names[-1]}{did_you_mean(name, by_name)}"
             )
     found = [i for name in parameters for i in by_name[name]]
     if not found or len(set(found)) < len(found):

@@ -50,6 +50,8 @@ class Verdict:
     words : list of str
         Five lines of at most 80 columns: the verdict, the accuracy on sky, what is
         determined, what is not, and which observation would help most.
+    advice : str, optional
+        Which observation would help most, in full.
 
     Examples
     --------
@@ -62,6 +64,7 @@ class Verdict:
     reasons: list
     cautions: list
     words: list
+    advice: str = ""
 
     def to_dict(self):
         """
@@ -72,7 +75,7 @@ class Verdict:
         dict
             Keys ``usable``, ``reasons``, ``cautions``, ``words``.
         """
-        return dict(vars(self))
+        return {key: value for key, value in vars(self).items() if key != "advice"}
 
 
 def verdict(calibration, targets=TARGETS):
@@ -107,13 +110,14 @@ def verdict(calibration, targets=TARGETS):
     # what is not known runs to its bounds, too
     wrong = any(wrong) or bool(stuck and not any(unknown))
     cautions = [] if reasons else _cautions(calibration, free)
+    advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
         "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
         *_determined(calibration, free),
-        f"Next        {_next(calibration, free, wrong, sky)}",
+        f"Next        {advice}",
     ]
-    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
+    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words], advice)
 
 
 def _first(reasons, cautions):

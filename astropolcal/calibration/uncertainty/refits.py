@@ -41,7 +41,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.progress import counting, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
@@ -212,7 +212,8 @@ def profile(calibration, name, values=None, n=21):
     covariance = calibration.covariance
     if name not in covariance.names:
         known = ", ".join(covariance.names[:8]) + (", ..." if len(covariance.names) > 8 else "")
-        raise ParameterError(f"no free parameter {name!r}; there are {known}")
+        hint = did_you_mean(name, covariance.names)
+        raise ParameterError(f"no free parameter {name!r}; there are {known}{hint}")
     if n < 3:
         raise FitError(f"n = {n}; a profile needs at least 3 values")
     index = covariance.names.index(name)
