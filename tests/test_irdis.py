@@ -305,7 +305,7 @@ def test_internal_source_needs_no_date():
 def test_table_of_unknown_source_is_refused():
     table = star_table()
     table.meta["source"] = "twilight"
-    with pytest.raises(InstrumentError, match="night: source .* = 'twilight'"):
+    with pytest.raises(InstrumentError, match=r"night: source .* = 'twilight'"):
         IRDIS_.setup(table)
 
 

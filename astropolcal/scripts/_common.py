@@ -683,7 +683,7 @@ def _set(name, parameter, text):
 def ending(verdict, accuracy, determined, advice, written):
     """Return verdict, accuracy, what is determined, what to do next, and the files written."""
     told = {"Accuracy": accuracy, "Determined": determined, "Next": advice}
-    words = [verdict, *(f"{name:<12}{text}" for name, text in told.items())]
+    words = [verdict, *(f"{name:<12}{one_line(text, None)}" for name, text in told.items())]
     return [*(shortened(line) for line in words), *written]
 
 

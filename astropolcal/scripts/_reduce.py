@@ -2,6 +2,7 @@
 """``astropolcal reduce``: from FITS cubes to an observation table."""
 
 import argparse
+import shlex
 import sys
 from collections import Counter
 from contextlib import suppress
@@ -165,7 +166,7 @@ def _report(reduction, arguments, figures):
 
 def _words(reduction, arguments, figures):
     """Return what is masked, and the summary."""
-    summary, output = reduction.summary(), one_line(arguments.output, None)
+    summary = reduction.summary()
     n_masked, n_cells = summary["n_masked"], summary["n_cells"]
     lost = n_masked == n_cells
     verdict = "NOT USABLE AS IT IS: all cells are masked" if lost else "Usable"
@@ -175,11 +176,12 @@ def _words(reduction, arguments, figures):
     if told:
         verdict += ("; " if lost else ": ") + ", ".join(told)
     masked = f"{n_masked} of {counted(n_cells, 'cell')} masked"
+    following = f"astropolcal calibrate {shlex.quote(arguments.output)}"
     ends = ending(
         verdict,
         _accuracy(reduction.table),
         f"{counted(summary['n_frames'], 'frame')}, {masked}",
-        "astropolcal info FILE tells of a cube" if lost else f"astropolcal calibrate {output}",
+        "astropolcal info FILE tells of a cube" if lost else following,
         written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
     )
     flags = summary["flags"].items()

@@ -81,7 +81,7 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     cal.write(tmp_path / "cal.asdf")
     again = Calibration.read(tmp_path / "cal.asdf")
     assert again.verdict() == found
-    assert json.loads(json.dumps(again.to_dict(), allow_nan=False))["verdict"] == vars(found)
+    assert json.loads(json.dumps(again.to_dict(), allow_nan=False))["verdict"] == found.to_dict()
     # and with the advice followed
     held = calibrate(chain, example, fix={"hwp.theta": None}, cross_validate=False)
     assert held.verdict().usable
