@@ -5,6 +5,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import stat
 import sys
 import textwrap
@@ -683,8 +684,13 @@ def _set(name, parameter, text):
 def ending(verdict, accuracy, determined, advice, written):
     """Return verdict, accuracy, what is determined, what to do next, and the files written."""
     told = {"Accuracy": accuracy, "Determined": determined, "Next": advice}
-    words = [verdict, *(f"{name:<12}{one_line(text, None)}" for name, text in told.items())]
+    words = [verdict, *(f"{name:<12}{text}" for name, text in told.items())]
     return [*(shortened(line) for line in words), *written]
+
+
+def following(command, path):
+    """Return the command to give next, its file as a shell takes it, in one line."""
+    return one_line(f"astropolcal {command} {shlex.quote(str(path))}", None)
 
 
 def written_lines(named, figures=0, folder=None):

@@ -4,7 +4,6 @@
 import argparse
 import copy
 import os
-import shlex
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
     ending,
+    following,
     is_quiet,
     number_or,
     show,
@@ -440,7 +440,7 @@ def _verdict(summary, systematic, output):
     # the unit once: the line is short
     if not told:
         degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
-    verdict, advice = "Usable", f"astropolcal info {shlex.quote(output)}"
+    verdict, advice = "Usable", following("info", output)
     if not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
         advice = "frames at more angles of the half-wave plate and of the field"

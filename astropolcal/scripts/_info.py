@@ -7,7 +7,7 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import one_line, plain
-from astropolcal.scripts._common import give, printer, wrapped, written_lines
+from astropolcal.scripts._common import following, give, printer, wrapped, written_lines
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
@@ -221,7 +221,8 @@ def _observations(path):
         "wavelength_nm": observations.wavelength.to_value(u.nm),
         "content_hash": observations.content_hash,
     }
-    return [wrapped(line, indent=2) for line in observations.summary().splitlines()], content
+    lines = [*observations.summary().splitlines(), f"Next: {following('calibrate', path)}"]
+    return [wrapped(line, indent=2) for line in lines], content
 
 
 # ---- tables ---------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 """``astropolcal reduce``: from FITS cubes to an observation table."""
 
 import argparse
-import shlex
 import sys
 from collections import Counter
 from contextlib import suppress
@@ -17,6 +16,7 @@ from astropolcal.scripts._common import (
     check_suffix,
     cube_files,
     ending,
+    following,
     number_or,
     printer,
     show,
@@ -166,7 +166,7 @@ def _report(reduction, arguments, figures):
 
 def _words(reduction, arguments, figures):
     """Return what is masked, and the summary."""
-    summary = reduction.summary()
+    summary, output = reduction.summary(), arguments.output
     n_masked, n_cells = summary["n_masked"], summary["n_cells"]
     lost = n_masked == n_cells
     verdict = "NOT USABLE AS IT IS: all cells are masked" if lost else "Usable"
@@ -176,12 +176,11 @@ def _words(reduction, arguments, figures):
     if told:
         verdict += ("; " if lost else ": ") + ", ".join(told)
     masked = f"{n_masked} of {counted(n_cells, 'cell')} masked"
-    following = f"astropolcal calibrate {shlex.quote(arguments.output)}"
     ends = ending(
         verdict,
         _accuracy(reduction.table),
         f"{counted(summary['n_frames'], 'frame')}, {masked}",
-        "astropolcal info FILE tells of a cube" if lost else following,
+        "astropolcal info FILE tells of a cube" if lost else following("calibrate", output),
         written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
     )
     flags = summary["flags"].items()
