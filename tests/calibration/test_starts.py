@@ -4,12 +4,13 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import Weighting
+from astropolcal.chain import insert_optic
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -327,3 +328,26 @@ def test_a_thickness_off_by_little_ends_in_no_other_minimum():
         found = calibrate(chain, table, cross_validate=False)
         measurement = found.live_measurement()
         assert np.sqrt(np.mean(measurement.residuals() ** 2)) < 1e-3, i
+
+
+def test_a_wavelength_of_half_a_wave_keeps_the_branch_of_its_neighbours():
+    """Where the plate has half a wave a small error of the model outweighs the sign."""
+    charis = instruments.get("charis")
+    wavelength = charis.wavelength[[6, 12, 15, 18, 21]]
+    frames = half_wave_plate_cycles(derotator=np.arange(45, 135, 12.5) * u.deg)
+    truth = charis.chain(derotator="linear", wavelength=wavelength)
+    truth["hwp"].w_sio2 = 1.644 * u.mm
+
+    def beside(thickness):
+        truth["hwp"].w_mgf2 = thickness * u.mm
+        return truth["hwp"].retardance(wavelength[3]).to_value(u.deg) + 179.99
+
+    brentq(beside, 1.27, 1.30)
+    for seed in range(6):
+        diagonal = 0.04 * np.cos(2 * np.pi * 12 / wavelength.to_value(u.um) + seed) * u.deg
+        window = optics.EllipticalRetarder(diagonal=diagonal, name="window")
+        unknown = insert_optic(truth, window, after="derotator")
+        data = simulate(unknown, wavelength, frames, flux=1e7, seed=seed)
+        start = charis.chain(derotator="linear", wavelength=wavelength)
+        cal = calibrate(start, data, cross_validate=False)
+        assert np.all(cal.chain["derotator"].retardance.value < -50), seed

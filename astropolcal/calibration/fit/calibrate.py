@@ -30,6 +30,7 @@ from astropolcal.calibration.fit.strategies import (
     search_branches,
     sequential,
     settled,
+    smooth_branches,
     telescope_alone,
     two_step,
 )
@@ -87,6 +88,8 @@ _HOPELESS = 100.0
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
+# a smooth course in wavelength is worth up to so many times the sum of squares of what it moves
+_WORTH = 3.0
 
 
 def calibrate(
@@ -438,6 +441,21 @@ def _descend(measurement, weighting, fitter, search, prepare, origin, start=None
         if not moved.any():
             break
         measurement.stand_at(better)
+    return _smoothed(measurement, weighting, fitter, outcome) if search else (outcome, weighting)
+
+
+def _smoothed(measurement, weighting, fitter, outcome):
+    """Fit again from the branches of the smoothest course, where that is worth its residuals."""
+    problem, found = BinProblem(*_thinned(measurement, weighting)), measurement.vector()
+    start, moved = smooth_branches(problem, found)
+    if not moved.any():
+        return outcome, weighting
+    costs = problem.costs(found)[moved]
+    measurement.stand_at(start)
+    again = _run(measurement, weighting, fitter)
+    if np.all(problem.costs(measurement.vector())[moved] < _WORTH * costs):
+        return again
+    measurement.stand_at(found)
     return outcome, weighting
 
 
