@@ -11,7 +11,6 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
-from astropolcal.calibration.fit.strategies import smoothest
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
@@ -575,10 +574,32 @@ def _smoothest(problem, slots, found):
     for slot in slots:
         where = problem.slices[slot.name]
         if slot.unit == u.deg and slot.size > 2:
-            bounds = problem.low[where], problem.high[where]
-            start[where] = smoothest(problem.wavelength, start[where], *bounds, _OTHER_SIGN)
+            start[where] = _smooth(
+                problem.wavelength, start[where], problem.low[where], problem.high[where]
+            )
     if not np.array_equal(start, found.coefficients):
         yield start
+
+
+def _smooth(wavelength, values, low, high):
+    """Return values with the signs and turns with which their course is least bent."""
+    turn = 2 * np.pi
+    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
+    # what is out of the bounds is no choice; its own value is always one, and preferred
+    cost = np.where((choices >= low) & (choices <= high), _OTHER_SIGN, np.inf)
+    cost[0] = 0.0
+    total, back = cost[:, :1] + cost[:, 1], []
+    for i in range(2, len(values)):
+        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
+        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
+        straight = second[None] + share * (second[None] - first[:, None])
+        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
+        back.append(bends.argmin(axis=0))
+        total = bends.min(axis=0)
+    path = list(np.unravel_index(total.argmin(), total.shape))
+    for step in reversed(back):
+        path.insert(0, int(step[path[0], path[1]]))
+    return choices[path, np.arange(len(values))]
 
 
 def _datasets(problem):

@@ -48,7 +48,7 @@ _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
 # but this, where the freedom of the best costs more (log evidence): two simple ones may do better
-_HALF, _DEAR = 0.5, 40.0
+_HALF, _DEAR = 0.5, 30.0
 # names are asked for beside so many causes
 _NAMES = 2
 # and so many times as many where all of these are impossible
@@ -459,8 +459,10 @@ def _exchanged(base, best, library, first, say, cells):
             others = [other for other in best.chosen if other is not one]
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
-            found = first if not others else _beside(best.model, one, library, cells, like)
-            like = like or (found.probes if others else None)
+            found, is_near = first, False
+            if others:
+                found, is_near = _beside(base, best, one, library, cells, like)
+            like = like or (found.probes if is_near else None)
             scans[one.name] = (others, found)
             if len(best.chosen) > _MOST:
                 # so many that none is sure: what each can be told from is all that is asked
@@ -491,10 +493,18 @@ def _exchanged(base, best, library, first, say, cells):
     return best, {name: found for name, (_, found) in scans.items()}
 
 
-def _beside(model, one, library, cells, like):
-    """Return the evidence beside all other causes of a model."""
+def _beside(base, best, one, library, cells, like):
+    """Return the evidence beside all other causes, and whether it is of the derivatives of all."""
+    model = best.model
     temper = max(1.0, model.mean_square)
-    return scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
+    found = scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
+    own = max((c.statistic for c in found.candidates if c.name == one.name), default=0.0)
+    if own <= base.fit.chi2 - model.fit.chi2:
+        return found, True
+    # no cause does more than all of them: along an open direction it went too far for derivatives
+    recipes = [other.recipe for other in best.chosen if other is not one]
+    model = base.with_effects(recipes, like=model, **_QUICK)
+    return scan(model, library, cells=cells, temper=temper), False
 
 
 def _rivals_beside(found, own, library):

@@ -88,7 +88,7 @@ _HOPELESS = 100.0
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
-# a smooth course in wavelength is worth up to so many times the sum of squares of what it moves
+# a wavelength in the branch of its neighbours may have up to so many times the sum of squares
 _WORTH = 3.0
 
 
@@ -445,7 +445,7 @@ def _descend(measurement, weighting, fitter, search, prepare, origin, start=None
 
 
 def _smoothed(measurement, weighting, fitter, outcome):
-    """Fit again from the branches of the smoothest course, where that is worth its residuals."""
+    """Fit again with single wavelengths in the branch of their neighbours, if nearly as good."""
     problem, found = BinProblem(*_thinned(measurement, weighting)), measurement.vector()
     start, moved = smooth_branches(problem, found)
     if not moved.any():

@@ -36,9 +36,9 @@ __all__ = []
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4
 _CLEARLY_BETTER = 0.99
-# a course in wavelength has to bend so much less (radian^2) for each bin of another sign, which may
-# be so many times worse before all are fitted again
-_LESS_BENT, _FAR_WORSE = 1.0, 30.0
+# a phase so far off its neighbours (radian) is given the other sign if that is four times as near;
+# the bin may be so many times worse before all are fitted again
+_STICKS_OUT, _FAR_WORSE = 1.0, 30.0
 # a polish ends when no bin gains a thousandth in a step, or is about to
 _STILL_GAINING = 0.999
 _STUCK = 1.0
@@ -208,17 +208,17 @@ def search_branches(problem, vector, origin=None):
 
 def smooth_branches(problem, vector):
     """
-    Return a vector with bins in the branches of the smoothest course, and which bins moved there.
+    Return a vector with single bins in the branch of their neighbours, and which bins moved there.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
     well. Any error of the model then decides between them; their neighbours tell which is true.
     """
     start, moved = vector.copy(), np.zeros(problem.n_bins, dtype=bool)
-    wavelength = problem.measurement.wavelength
     for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
         where = problem.elements[row]
-        start[where] = smoothest(wavelength, vector[where], low, high, _LESS_BENT)
-        moved |= start[where] != vector[where]
+        turned = _turned(problem.measurement.wavelength, vector[where], low, high)
+        start[where] = np.where(np.isfinite(turned), turned, vector[where])
+        moved |= np.isfinite(turned)
     if not moved.any():
         return vector, moved
     start, costs = problem.polish(start)
@@ -228,29 +228,16 @@ def smooth_branches(problem, vector):
     return best, moved
 
 
-def smoothest(wavelength, values, low, high, other_sign):
-    """
-    Return phases, radian, with the signs and turns with which their course is least bent.
-
-    Each sign or turn that is not the given one costs as much as bends of ``other_sign``, radian^2.
-    """
-    turn = 2 * np.pi
-    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
-    # what is out of the bounds is no choice; its own value is always one, and preferred
-    cost = np.where((choices >= low) & (choices <= high), other_sign, np.inf)
-    cost[0] = 0.0
-    total, back = cost[:, :1] + cost[:, 1], []
-    for i in range(2, len(values)):
-        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
-        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
-        straight = second[None] + share * (second[None] - first[:, None])
-        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
-        back.append(bends.argmin(axis=0))
-        total = bends.min(axis=0)
-    path = list(np.unravel_index(total.argmin(), total.shape))
-    for step in reversed(back):
-        path.insert(0, int(step[path[0], path[1]]))
-    return choices[path, np.arange(len(values))]
+def _turned(wavelength, phases, low, high):
+    """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
+    found = np.full(len(phases), np.nan)
+    for i in range(1, len(phases) - 1):
+        beside = np.interp(wavelength[i], wavelength[[i - 1, i + 1]], phases[[i - 1, i + 1]])
+        off = abs(phases[i] - beside)
+        for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
+            if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
+                found[i] = other
+    return found
 
 
 def other_laws(problem, vector, origin):
