@@ -20,8 +20,8 @@ from astropolcal.reduction import (
     simulate_cubes,
     true_observations,
 )
+from astropolcal.reduction.frames import survey_frames
 from astropolcal.reduction.headers import read_header
-from astropolcal.reduction.science import survey_frames
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
 

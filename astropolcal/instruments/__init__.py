@@ -12,15 +12,11 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
 from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
-from astropolcal.instruments.gpi import GPI
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.instruments.magaox import MagAOX
-from astropolcal.instruments.nirc2 import NIRC2
-from astropolcal.instruments.roman import RomanCoronagraph
+from astropolcal.instruments.nominal import FORS2, GPI, NIRC2, MagAOX, NaCo, RomanCoronagraph
 from astropolcal.instruments.subaru import IRCS, REACH, FastPDI, HiCIAO
 from astropolcal.instruments.vampires import VAMPIRES
-from astropolcal.instruments.vlt import FORS2, NaCo
 from astropolcal.words import did_you_mean
 
 __all__ = [

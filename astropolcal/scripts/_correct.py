@@ -157,7 +157,7 @@ def run(arguments):
     """Correct the cubes and write the product."""
     from astropolcal import instruments
     from astropolcal.correction import ScienceFrames, correct
-    from astropolcal.reduction.science import configured, survey_frames
+    from astropolcal.reduction.frames import configured, survey_frames
 
     _check_options(arguments)
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
@@ -271,7 +271,7 @@ def choose_calibration(arguments, files):
     """
     from astropolcal import instruments
     from astropolcal.correction.rows import sky_chain
-    from astropolcal.reduction.science import read_night
+    from astropolcal.reduction.frames import read_night
 
     path = Path(arguments.calibration)
     # a folder is searched when it is known what the frames need

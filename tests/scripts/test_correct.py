@@ -18,15 +18,15 @@ from astropolcal.correction import Corrected
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.pipeline import tasks
 from astropolcal.pipeline.library import Library
-from astropolcal.reduction import science
+from astropolcal.reduction import frames as frame_files
 from astropolcal.reduction.cubes import (
     CubeFiles,
     DetectorModel,
     ImageModel,
     simulate_cubes,
 )
+from astropolcal.reduction.frames import configured, read_night, survey_frames
 from astropolcal.reduction.headers import FrameHeader
-from astropolcal.reduction.science import configured, read_night, survey_frames
 from astropolcal.scripts import _correct
 from astropolcal.scripts._correct import (
     _WAYS,
@@ -306,7 +306,9 @@ def told(monkeypatch):
         files = [f"CRSA{i:08d}_cube.fits" for i in range(len(frames))]
         known = dict(zip(files, frames, strict=True))
         monkeypatch.setattr(
-            science, "_read", lambda *_: [FrameHeader(f, values=dict(known[f])) for f in files]
+            frame_files,
+            "_survey",
+            lambda *_: [FrameHeader(f, values=dict(known[f])) for f in files],
         )
         return survey_frames(files, CHARIS.files, centre=centre)
 
@@ -360,7 +362,7 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
         found.photometry = SimpleNamespace(x=x, y=x + 15.0)
         return found
 
-    monkeypatch.setattr(science, "_read", lambda files, *_: [frame(file) for file in files])
+    monkeypatch.setattr(frame_files, "_survey", lambda files, *_: [frame(file) for file in files])
     files = [f"CRSA0000000{i}_cube.fits" for i in range(3)]
     words = "CRSA00000001_cube.fits: the star was not found; give its place with --centre"
     with pytest.raises(ObservationError, match=words):

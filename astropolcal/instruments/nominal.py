@@ -1,0 +1,438 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Dual-beam polarimeters that are known from what is public of them; the rest is nominal.
+
+VLT/FORS2, linear imaging and spectropolarimetry in the visible.
+
+FORS2 stands at the Cassegrain focus. Its adapter turns with the sky, so that the sky turns
+upstream of the instrument by the position angle of the instrument; the stage ``parallactic`` of
+the chain has this angle, and there is no derotator. Downstream of the collimator are a half-wave
+plate and a Wollaston prism.
+
+Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1.5 % at the edges
+of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
+Gonzalez-Gaitan et al. 2020 (imaging in four filters).
+
+ESO's manual (Sec. 4.6.2, as the public code https://github.com/gongsale/FORS2-INSTPOL reads it)
+has angles of polarization too large by 1.54, 1.80, -1.19 and -2.89 deg in the four filters here,
+because the zero of the plate depends on the wavelength: it starts at half of that with the other
+sign, and is free.
+
+Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99,
+and what is polarized on the axis starts at 0. The sign of ``ESO ADA POSANG`` is taken as that of a
+position angle from north to east.
+
+VLT/NaCo, near-infrared dual-beam polarimetry at a Nasmyth focus, decommissioned.
+
+The adapter turns the whole instrument downstream of the tertiary mirror M3, so that there is no
+derotator in the beam. Half-wave plate and Wollaston prism are in the instrument, upstream of the
+plate M3 and the mirrors of the adaptive optics. Witzel et al. (2011) find up to 4 % of
+instrumental polarization in Ks, from bare aluminium on M3 and what is downstream of it, and an
+angle of the plate of 13.2 deg off the header until autumn 2009; a measurement in Proc. SPIE 9147,
+87 (2014) finds 1.8 +/- 0.5 deg.
+
+``ESO INS ADC1 ENC`` is the encoder of the plate, 4096 steps a turn from 205 steps below zero
+(NACO manual, as the public pipeline PIPPIN reads it, https://github.com/samderegt/PIPPIN-NACO).
+``ESO ADA POSANG`` is the position angle of the instrument.
+
+Not known, and assumed or nominal here: the signs of these angles, the retardance of the plate
+(178 deg), the efficiency of the prism (0.99). The mirrors downstream of M3, which do not turn
+against the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not
+included.
+
+Keck II/NIRC2, near-infrared dual-beam polarimetry downstream of the adaptive optics.
+
+A half-wave plate stands upstream of the K-mirror of the adaptive optics, at the Nasmyth
+focus, and a Wollaston prism. Chain, keywords and signs are those of the public pipeline
+NIRC2Pol-DPP, https://github.com/UCSB-Exoplanet-Polarimetry-Lab/NIRC2Pol-DPP (its Eq. 3: for ideal
+optics Q and U are turned by -2 PARANG + 2 EL + 2 ROTPDEST + 4 offset of the plate; ROTPDEST is
+twice the angle of the K-mirror on the bench). So plate, K-mirror and altitude count the other way
+here than at Subaru. The offset of the plate is found on sky; the pipeline's log has 10.4 to 11.4
+deg in J, H and Kp in June 2026, known up to 45 deg, so that it is free within half of that.
+
+Not published, and nominal here: the retardances of plate and K-mirror (178 and 160 deg), the
+tertiary mirror (aluminium), the efficiency of the prism (0.99). A model is announced as Zhang et
+al. 2026; no values were public.
+
+Magellan/MagAO-X, visible polarimetry with two cameras and a polarizing beam splitter.
+
+From its handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html, a work
+in progress: a half-wave plate, a cube that sends horizontal polarization to camsci1 and vertical
+to camsci2, the difference camsci2 - camsci1, and the keywords of the plate's angles. So camsci2 is
+the right beam here. From the public calibration https://github.com/mileslucas/2025_magaox_polcal:
+the plate stands upstream of the K-mirror, whose keyword is ``STAGEK POS``, and static retarders
+downstream of it are not negligible there; no values of them are published.
+
+Not known, and assumed here: plate and K-mirror count as at Subaru, and the tertiary mirror is bare
+aluminium. The retardances (178 and 160 deg, and 0 of the static optics) and the efficiency of the
+cube (0.99) are nominal. Real frames have not been seen.
+
+Gemini South/GPI, near-infrared dual-beam polarimetry at the straight Cassegrain focus.
+
+It turns with the telescope, so that the sky turns upstream of it by the parallactic angle, and
+there is no derotator. The half-wave plate is downstream of the adaptive optics, the Wollaston
+prism downstream of the lenslets (Perrin et al. 2015). What polarizes is all upstream of the plate:
+Wiktorowicz et al. (2014) measured how unpolarized light leaves it in the band H. Millar-Blanchaer
+et al. (2016) find it to be the same at all wavelengths within their errors.
+
+The public pipeline, https://github.com/geminiplanetimager/gpi_pipeline, gives keywords and signs
+(primitive ``gpi_combine_polarization_sequence``): the sky is turned by ``PAR_ANG`` and the plate
+stands at ``WPANGLE`` + 29.14 deg. It has the retardances of the plate measured in the laboratory,
+within 7 deg of half a wave. Both are starts here, and free. That of K2 is above half a wave, and
+starts as far below it: linear polarization does not tell the two apart.
+
+Not known from these, and nominal here: the efficiency of the prism, 0.99.
+
+Coronagraph of the Nancy Grace Roman Space Telescope, linear polarimetry in bands 1 and 4.
+
+One of two Wollaston prisms is in the beam, clocked by 45 deg, so that q and u are measured one
+after the other (Groff et al.); nothing modulates. Rolls of the spacecraft turn the sky. The
+centres of the bands, the keywords ``ROLL`` and ``DPAMNAME``, and the sign of the roll (the angle of
+polarization on the detector is that on the sky plus the roll) are those of the public pipeline
+corgidrp, https://github.com/roman-corgi/corgidrp.
+
+Not known, and nominal here: what telescope and coronagraph do to polarized light, the efficiency
+of the prisms (0.99), and by how much their clocking departs from 0 and 45 deg. There is no
+polarizer on board: standard stars calibrate it.
+"""
+
+import re
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import replace_optic
+from astropolcal.instruments.base import SkyLaw
+from astropolcal.instruments.polarimeter import (
+    Polarimeter,
+    aluminium,
+    turning_retarder,
+    wollaston,
+)
+from astropolcal.instruments.telescope import PARANAL, STARS, misaligned, star_source
+
+__all__ = []
+
+# of the plate of NaCo: one of 4096 (deg)
+_STEP = 360 / 4096
+# of that of FORS2 in b_HIGH, v_HIGH, R_SPECIAL and I_BESS (deg)
+_FORS2_ZERO = (-0.77, -0.90, 0.595, 1.445)
+
+
+class FORS2(Polarimeter):
+    """
+    VLT/FORS2 with its half-wave plate at any angles, and its Wollaston prism.
+
+    Its polarized source is a polarizer upstream of the instrument, such as the prism with which
+    ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
+    and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
+    hides.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> fors2 = instruments.get("fors2")
+    >>> [optic.name for optic in fors2.chain("star")]
+    ['star', 'parallactic', 'collimator', 'hwp', 'wollaston']
+    """
+
+    name = "fors2"
+    aliases = ("VLT/FORS2",)
+    # nominal centres of b_HIGH, v_HIGH, R_SPECIAL and I_BESS
+    wavelength = [440, 557, 655, 768] * u.nm
+    keywords = {
+        "hwp": "ESO INS RETA2 POSANG",
+        "parallactic": "ESO ADA POSANG",
+        "altitude": "ESO TEL ALT",
+    }
+    references = (
+        "Patat & Romaniello 2006, PASP 118, 146, doi:10.1086/497581",
+        "Cikota et al. 2017, MNRAS 464, 4146, doi:10.1093/mnras/stw2545",
+        "Gonzalez-Gaitan et al. 2020, A&A 634, A70, doi:10.1051/0004-6361/201936379",
+        "FORS2-INSTPOL, https://github.com/gongsale/FORS2-INSTPOL",
+    )
+    entrance = "collimator"
+    # M1 and M2 do not polarize on the axis
+    site, focus = PARANAL, "cassegrain"
+
+    def inner(self, source, optics_in, grid):
+        """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
+        zero = np.zeros(grid.size)
+        collimator = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="collimator")
+        collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
+        theta = np.interp(grid.to_value(u.nm), self.wavelength.value, _FORS2_ZERO)
+        plate = turning_retarder("hwp", 178, grid, most=15, theta=theta * u.deg)
+        return [collimator, plate, wollaston(grid)]
+
+
+class NaCo(Polarimeter):
+    """
+    VLT/NaCo with half-wave plate and Wollaston prism, observing stars.
+
+    Free are, per wavelength, the diattenuation of M3, that of the mirrors downstream of it, the
+    retardance of the plate and the efficiency of the prism; and the angle of the plate, within
+    20 deg, as it was once 13 deg off.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> naco = instruments.get("VLT/NACO")
+    >>> [optic.name for optic in naco.chain("star")][1:]
+    ['parallactic', 'm3', 'adapter', 'position_angle', 'mirrors', 'hwp', 'wollaston']
+    """
+
+    name = "naco"
+    aliases = ("VLT/NaCo", "NAOS+CONICA")
+    # nominal centres of J, H and Ks
+    wavelength = [1.265, 1.66, 2.18] * u.um
+    keywords = {
+        "hwp": "ESO INS ADC1 ENC",
+        "parallactic": "ESO TEL PARANG START",
+        "altitude": "ESO TEL ALT",
+        "position_angle": "ESO ADA POSANG",
+    }
+    transforms = {"hwp": (_STEP, 205 * _STEP)}
+    references = (
+        "Witzel et al. 2011, A&A 525, A130, doi:10.1051/0004-6361/201015009",
+        "Characterizing instrumental effects on polarization at a Nasmyth focus using NaCo, 2014, "
+        "Proc. SPIE 9147, 87",
+    )
+    sources = STARS
+    entrance = "mirrors"
+    site = PARANAL
+
+    def inner(self, source, optics_in, grid):
+        """Return the mirrors of the instrument, the plate and the prism."""
+        zero = np.zeros(grid.size)
+        mirrors = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="mirrors")
+        return [mirrors, turning_retarder("hwp", 178, grid, most=20), wollaston(grid)]
+
+    def telescope_optics(self, behind=(), *, wavelength=None):
+        """Return M3 of aluminium, and the adapter, which keeps the sky at the position angle."""
+        return [
+            optics.Rotator(mount="parallactic", name="parallactic"),
+            aluminium(self.grid(wavelength)),
+            # a mirror turns the sense of the angles
+            optics.Rotator(mount="parallactic", name="adapter"),
+            optics.Rotator(mount="-position_angle", name="position_angle"),
+        ]
+
+
+class NIRC2(Polarimeter):
+    """
+    Keck II/NIRC2 with half-wave plate, K-mirror and Wollaston prism.
+
+    Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the
+    prism; the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror,
+    whose retardance is held.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> nirc2 = instruments.get("nirc2")
+    >>> [optic.name for optic in nirc2.chain("star")]
+    ['star', 'parallactic', 'm3', 'altitude', 'hwp', 'derotator', 'wollaston']
+    """
+
+    name = "nirc2"
+    aliases = ("Keck/NIRC2", "NIRC2-Pol")
+    # nominal centres of J, H and Kp; the band L has a plate of its own
+    wavelength = [1.248, 1.633, 2.124] * u.um
+    keywords = {
+        "hwp": "PCUPR",
+        "derotator": "OBRT",
+        "parallactic": "PARANG",
+        "altitude": "EL",
+    }
+    references = (
+        "NIRC2Pol-DPP, https://github.com/UCSB-Exoplanet-Polarimetry-Lab/NIRC2Pol-DPP",
+        "Lewis et al. 2026, announced there",
+    )
+    site, altitude = (-155.4747, 19.8260, 4145.0), "altitude"
+    #: The plate stays where it is put; the K-mirror keeps image or pupil still, by the same signs.
+    sky_law = SkyLaw(plate=(0, 0), derotator={"pupil": (0, -0.5), "field": (0.5, -0.5)})
+
+    def inner(self, source, optics_in, grid):
+        """Return the plate, the K-mirror and the prism."""
+        k_mirror = turning_retarder("derotator", 160, grid, bounds=(0, 360), sign="-")
+        plate = turning_retarder("hwp", 178, grid, sign="-", most=22.5)
+        return [plate, k_mirror, wollaston(grid)]
+
+
+class MagAOX(Polarimeter):
+    """
+    Magellan/MagAO-X with half-wave plate, K-mirror and polarizing beam splitter.
+
+    Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the cube;
+    the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror. The
+    static retarder ``bench`` is fixed at 0 deg until you free it. Unequal gains of the cameras are
+    the nuisance ``"beam_gain"``.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> magaox = instruments.get("MagAO-X")
+    >>> [optic.name for optic in magaox.chain("star")][4:]
+    ['hwp', 'derotator', 'bench', 'wollaston']
+    """
+
+    name = "magaox"
+    aliases = ("MagAO-X", "Magellan/MagAO-X")
+    # nominal centres of g', r', i' and z'
+    wavelength = [527, 614, 762, 908] * u.nm
+    keywords = {
+        "hwp": "HWPTRACK SET ANGLE",
+        "hwp_true": "HWPTRACK ACTUAL ANGLE",
+        "derotator": "STAGEK POS",
+        "parallactic": "PARANG",
+    }
+    references = (
+        "MagAO-X handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html",
+        "Calibration of 2025, https://github.com/mileslucas/2025_magaox_polcal",
+    )
+    site = (-70.6926, -29.0146, 2400.0)
+    #: The plate stays where it is put, the K-mirror follows as at any Nasmyth focus.
+    sky_law = SkyLaw(plate=(0, 0))
+
+    def inner(self, source, optics_in, grid):
+        """Return the plate, the K-mirror, the optics of the bench and the cube."""
+        still = np.zeros(grid.size) * u.deg
+        return [
+            turning_retarder("hwp", 178, grid),
+            turning_retarder("derotator", 160, grid, bounds=(0, 360)),
+            optics.LinearRetarder(retardance=still, name="bench", fixed={"retardance": True}),
+            # the right beam, camsci2, has the vertical polarization
+            wollaston(grid, theta=90 * u.deg),
+        ]
+
+
+# Wiktorowicz et al. 2014: Q, U and V of unpolarized light that leaves telescope and optics
+_POLARIZANCE = (-0.00037, 0.004338, -0.0664)
+# of the public pipeline of GPI: retardances in Y, J, H, K1 and K2, and the angle of the plate (deg)
+_RETARDANCE, _GPI_ZERO = (178.9, 175.6, 172.9, 178.5, 175.8), 29.14
+
+
+class GPI(Polarimeter):
+    """
+    Gemini Planet Imager with half-wave plate and Wollaston prism, observing stars.
+
+    Free are, per wavelength, the linear diattenuation of all that is upstream of the plate, the
+    retardance of the plate and the efficiency of the prism; and the angle of the plate.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> gpi = instruments.get("gpi")
+    >>> [optic.name for optic in gpi.chain("star")]
+    ['star', 'parallactic', 'telescope_and_ao', 'hwp', 'wollaston']
+    >>> (100 * gpi.published()["telescope_and_ao"].mueller()[1:, 0]).round(4).tolist()
+    [-0.037, 0.4338, -6.64]
+    """
+
+    name = "gpi"
+    aliases = ("Gemini/GPI",)
+    # nominal centres of Y, J, H, K1 and K2
+    wavelength = [1.05, 1.24, 1.65, 2.05, 2.26] * u.um
+    keywords = {"hwp": "WPANGLE", "parallactic": "PAR_ANG"}
+    references = (
+        "Wiktorowicz et al. 2014, Proc. SPIE 9147, arXiv:1407.2505",
+        "Perrin et al. 2015, ApJ 799, 182, arXiv:1407.2495",
+        "Millar-Blanchaer et al. 2016, Proc. SPIE 9908, 990836, arXiv:1609.08691",
+        "GPI data pipeline, https://github.com/geminiplanetimager/gpi_pipeline",
+    )
+    sources = STARS
+    entrance = "telescope_and_ao"
+    # what the telescope polarizes is published together with the instrument
+    site, focus = (-70.7366, -30.2407, 2722.0), "cassegrain"
+
+    def inner(self, source, optics_in, grid):
+        """Return what is upstream of the plate, the plate and the prism."""
+        q, u_ = (np.full(grid.size, value) for value in _POLARIZANCE[:2])
+        upstream = optics.VectorDiattenuator(horizontal=q, diagonal=u_, name="telescope_and_ao")
+        retardance = np.interp(grid.to_value(u.um), self.wavelength.value, _RETARDANCE)
+        plate = turning_retarder("hwp", retardance, grid, about=_GPI_ZERO, most=30)
+        return [upstream, plate, wollaston(grid)]
+
+    def published(self):
+        """
+        Return the chain of a star with the published polarization, of circular light too.
+
+        A diattenuator with that polarizance has a known matrix (Lu & Chipman 1996).
+        """
+        vector = np.array(_POLARIZANCE)
+        size = np.linalg.norm(vector)
+        root, axis = np.sqrt(1 - size**2), vector / size
+        matrix = np.eye(4)
+        matrix[0, 1:] = matrix[1:, 0] = vector
+        matrix[1:, 1:] = root * np.eye(3) + (1 - root) * np.outer(axis, axis)
+        upstream = optics.MuellerElement.from_matrix(matrix, name="telescope_and_ao")
+        return replace_optic(self.chain("star"), "telescope_and_ao", upstream)
+
+    def published_meta(self):
+        """Return the meta of a table taken with the chain of `published`."""
+        return {"instrument": "gpi", "source": "star"}
+
+
+class RomanCoronagraph(Polarimeter):
+    """
+    Coronagraph of the Roman Space Telescope with its two Wollaston prisms.
+
+    A table has the columns ``roll``, and ``prism``: 0 deg where ``DPAMNAME`` is POL0, 45 deg where
+    it is POL45. Its sources are not called stars, as there is no site of the telescope whose sky
+    turns: "unpolarized standard", "polarized standard" and "target".
+
+    Free are, per band, the diattenuation of all that is upstream of the prisms, its retardance,
+    which lowers the signal of one prism, and the efficiency of the prisms; and their common
+    orientation.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> roman = instruments.get("roman")
+    >>> [optic.name for optic in roman.chain("target")]
+    ['star', 'roll', 'telescope', 'mirrors', 'wollaston']
+    """
+
+    name = "roman"
+    aliases = ("Roman/CGI", "CGI")
+    wavelength = [573.8, 825.5] * u.nm
+    keywords = {"roll": "ROLL", "prism": "DPAMNAME"}
+    transforms = {"prism": {"POL0": 0.0, "POL45": 45.0}}
+    references = (
+        "Groff et al., Proc. SPIE, Roman Space Telescope CGI: prism and polarizer "
+        "characterization modes",
+        "corgidrp, https://github.com/roman-corgi/corgidrp",
+    )
+    sources = ("unpolarized standard", "polarized standard", "target")
+    sky_options = ()
+    entrance = "roll"
+    # a chain is of a source in the sky; there is no other that a telescope could be put before
+    has_telescope = False
+
+    def light(self, source, grid, star, target):
+        """Return a standard star or a target."""
+        kind = "star" if source == "target" else f"{source} star"
+        light = star_source(kind, grid, star, target)
+        if source == "polarized standard" and not target:
+            # a start: of a star without polarization nothing tells the efficiencies
+            light.q = np.full(grid.size, 0.03)
+        return [light]
+
+    def inner(self, source, optics_in, grid):
+        """Return the turning of the sky, what is upstream of the prisms, and the prisms."""
+        zero = np.zeros(grid.size)
+        return [
+            optics.Rotator(mount="-roll", name="roll"),
+            optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="telescope"),
+            optics.LinearRetarder(
+                retardance=(zero + 10) * u.deg, bounds={"retardance": (0, 90)}, name="mirrors"
+            ),
+            wollaston(grid, mount="prism", **misaligned(0)),
+        ]
+
+    def particulars(self, observations):
+        """Return the names of a star, ``object`` in the meta: of its source, in the catalogue."""
+        target = str(observations.meta.get("object") or "")
+        words = re.sub(r"\W+", "", target)
+        return {"star": f"star_{words}", "target": target} if words else {}
