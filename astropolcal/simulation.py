@@ -111,7 +111,7 @@ def simulate(
     ------
     ParameterError
         If flux, gain, lamp or noise are not positive, too large or of the wrong shape,
-        the chain gives negative flux, or the seed is none.
+        the chain gives negative flux, the seed is none, or there are no frames.
     ChainError
         If the position of a stage is missing in ``frames``.
 
@@ -126,6 +126,8 @@ def simulate(
     16
     """
     wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
+    if not len(frames):
+        raise ParameterError("frames is a table without rows; at least one frame is needed")
     # for unit source, (n_wavelengths, n_frames)
     names, frames, lamp = beams_of_frames(chain, frames, lamp)
     fluxes = expected_fluxes(chain, wavelength, frames, source)[: len(names)]

@@ -184,6 +184,8 @@ def test_bad_numbers_are_refused(chain, frames):
     ]:
         with pytest.raises(ParameterError, match=words):
             simulate(chain, WAVELENGTH, frames, **options)
+    with pytest.raises(ParameterError, match="at least one frame is needed"):
+        simulate(chain, WAVELENGTH, frames[:0])
 
 
 def test_unphysical_chain_is_refused(frames):

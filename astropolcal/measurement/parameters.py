@@ -21,6 +21,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import astropy.units as u
 import numpy as np
@@ -52,6 +53,11 @@ class Tie:
     offset : `~astropy.units.Quantity` or float
         Constant part, in the target's unit.
 
+    Raises
+    ------
+    ParameterError
+        If the factor is not a finite number.
+
     Examples
     --------
     >>> from astropolcal.measurement import Tie
@@ -62,6 +68,10 @@ class Tie:
     source: str
     factor: float = 1.0
     offset: object = 0.0
+
+    def __post_init__(self):
+        if not (isinstance(self.factor, Real) and np.isfinite(self.factor)):
+            raise ParameterError(f"tie to {self.source}: factor = {self.factor!r}, not a number")
 
 
 @dataclass(frozen=True)
