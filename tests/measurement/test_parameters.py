@@ -166,7 +166,7 @@ def test_impossible_tie():
         with pytest.raises(ParameterError, match=words):
             FreeParameters([two_optics()], 3, ties)
     for factor in (np.nan, np.inf, "x", None):
-        with pytest.raises(ParameterError, match="tie to plate.theta: factor = "):
+        with pytest.raises(ParameterError, match=r"tie to plate.theta: factor = "):
             Tie("plate.theta", factor)
 
 
