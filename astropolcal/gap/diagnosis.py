@@ -28,6 +28,9 @@ __all__ = ["Cause", "Diagnosis", "diagnose"]
 
 # probabilities from which a cause is named, and from which it is located
 _SURE, _LIKELY = 0.9, 0.5
+# residuals of a smaller mean square, and more probable than this, show that the noise was taken
+# too large: by the roughness of a large gap, before its causes were known
+_TOO_QUIET, _TOO_PROBABLE = 0.8, 0.999
 
 
 @dataclass
@@ -292,12 +295,30 @@ def diagnose(
         nominal, base = (again if nominal is base else nominal), again
     say("looking for causes")
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+    left = selection.model
+    if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
+        say("looking for causes again: they leave less than what was taken for noise")
+        nominal = base = _with_noise_of(base, selection)
+        selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     found = _conclude(nominal, base, exchanged, selection, frames, started)
     found.settings["changes"] = changes
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)
         found.seconds = time.perf_counter() - started
     return found
+
+
+def _with_noise_of(base, selection):
+    """Return a nominal model, fitted with the noise that the residuals beside its causes show."""
+    problem = GapProblem(base.chains, base.observations)
+    problem.settle_noise(base.fit.coefficients)
+    fresh = Model(problem, base.fit, base.added)
+    recipes = [(group.best.effect, group.best.context) for group in selection.groups]
+    beside = fresh.with_effects(recipes, like=selection.model, steps=0)
+    beside.problem.settle_noise(beside.fit.coefficients)
+    # the noise is that of the channels, which both share
+    problem.fluxes, problem.flickering = beside.problem.fluxes, beside.problem.flickering
+    return Model(problem, problem.fit(base.fit.coefficients), base.added)
 
 
 def _nested(base, smooth, groups, say, cells):
