@@ -11,12 +11,15 @@ from gap_setups import SETUPS
 from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
 
-from astropolcal import Calibration, calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
+from astropolcal.gap.report import to_dict
 from astropolcal.instruments.telescope import published_mirror
+from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -269,3 +272,25 @@ def test_thinned_data_are_spread_over_the_wavelengths():
         picked = np.isin(np.round(grid), np.round(found))
         np.testing.assert_allclose(few_chain["derotator"].retardance.value, whole[picked])
     assert thinned([chain], [observations], 7) == ([chain], [observations])
+
+
+@pytest.mark.slow
+def test_a_large_gap_is_not_taken_for_noise():
+    """Unequal gains of 3 % are rough in wavelength; a retarder of 0.04 deg lies below."""
+    charis = instruments.get("charis")
+    wavelength = charis.wavelength[[2, 6, 10, 14, 18, 20]]
+    nominal = charis.chain(derotator="linear", wavelength=wavelength)
+    window = optics.LinearRetarder(retardance=0.04 * u.deg, name="window")
+    truth = insert_optic(nominal, window, after="hwp") | optics.BeamGain(imbalance=0.03)
+    frames = half_wave_plate_cycles(derotator=np.arange(45, 135, 12.5) * u.deg)
+    run = simulate(truth, wavelength, frames, flux=1e7, seed=1)
+    found = diagnose(nominal, run)
+    content = to_dict(found)
+    noise = content["double_difference"]["noise_percent"]
+    stated = 100 * np.sqrt(np.mean(Measurement(nominal, run).sigma ** 2))
+    assert abs(noise / stated - 1) < 0.02
+    assert content["double_difference"]["after_percent"] < 1.1 * noise
+    assert found.causes[0].name == "beam_gain"
+    assert "after:hwp/retardance_h/constant" in [
+        f"{c.place}/{c.kind}/{c.dependence}" for c in found.causes[1].effect.cells(nominal)
+    ] + names(found.causes[1])
