@@ -118,6 +118,13 @@ class Candidate:
         return self.named is not None
 
     @property
+    def size(self):
+        """Its size to first order where the data ask for it most, in units of the usual one."""
+        values, share, scale = self.spectrum
+        most = np.argmax(share)
+        return float(np.sqrt(share[most] / values[most])) / scale if share[most] > 0 else 0.0
+
+    @property
     def p_value(self):
         """Probability of the statistic by chance, for this cause alone."""
         return float(stats.chi2.sf(self.statistic, max(self.rank, 1)))

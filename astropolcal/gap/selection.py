@@ -16,7 +16,7 @@ import numpy as np
 
 from astropolcal import progress
 from astropolcal.gap.attribution import ALIKE, scan
-from astropolcal.gap.cells import Cell, count_runs
+from astropolcal.gap.cells import Cell, count_runs, split_run
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -59,12 +59,17 @@ _SAME = 1e-6
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
 _NEAR, _BENT = 0.03, 500.0
+# and so is one that needs a size so many times as far from the usual
+_FAR = 3.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs: of three, 12 of 54 causes were right in 934 challenges, of four 1 of 12, of more 2 of 69
 _UNLISTED = (0.0, 0.02, 0.08, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
 # the same where one of several causes is not asked for in every part of the data: of two such, 22
 # of 48 causes were right in another 1,000 challenges, of two stable ones 175 of 188
 _SHAKY = 0.5
+# and where both of two causes turn the polarization and change with time, as an axis that wanders
+# does: 6 of 18 such causes were right in 3,400 challenges
+_WANDERING, _TURNS_IT, _WITH_TIME = 0.65, ("rotation", "depolarization_d"), ("time", "step")
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # share of the gap that an answer may leave before it is doubtful
@@ -549,12 +554,22 @@ def _unlisted(base, best, stable):
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
         prior = max(prior, _SHAKY)
+    if len(best.chosen) == 2 and all(_may_wander(one.cell) for one in best.chosen):
+        prior = max(prior, _WANDERING)
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))
     after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size
     excess = max(base.fit.chi2 - freedom, 1.0)
     share = max(best.model.fit.chi2 - freedom, 0.0) / excess
     return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
+
+
+def _may_wander(cell):
+    return (
+        cell is not None
+        and cell.kind in _TURNS_IT
+        and split_run(cell.dependence)[0].startswith(_WITH_TIME)
+    )
 
 
 def _grouped(base, best, steps, scans, unlisted, stable):
@@ -589,7 +604,8 @@ def _members(chosen, beside, loss):
     rivals = beside.candidates
     own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
-    top = max(own.evidence, rivals[0].evidence) if rivals else own.evidence
+    farthest = _FAR * max(own.size, 1.0)
+    top = max([own.evidence, *(one.evidence for one in rivals if one.size <= farthest)])
     own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
     promised, known = max(chosen.statistic, own.statistic), {}
@@ -598,8 +614,9 @@ def _members(chosen, beside, loss):
         if one.name == own.name or len(weights) > _MOST_ALIASES:
             continue
         weight = np.exp(min(one.evidence - top, 0.0))
-        if weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT:
-            # where a signal is strong, derivatives alone do not tell what is alike
+        is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
+        if is_bent or (weight >= _ALIAS and one.size > farthest):
+            # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
                 known[key] = 0.5 * max(loss(one), 0.0) / beside.temper
