@@ -614,14 +614,22 @@ def _members(chosen, beside, loss):
         if one.name == own.name or len(weights) > _MOST_ALIASES:
             continue
         weight = np.exp(min(one.evidence - top, 0.0))
+        # where nothing but the usual sizes tells two apart, the data do not
+        is_same = one.rank <= own.rank and one.statistic >= (1 - _SAME) * promised
         is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
-        if is_bent or (weight >= _ALIAS and one.size > farthest):
+        if is_bent or ((is_same or weight >= _ALIAS) and one.size > farthest):
             # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
-                known[key] = 0.5 * max(loss(one), 0.0) / beside.temper
+                known[key] = 0.5 * loss(one) / beside.temper
             dearer = max(one.cost(beside.temper), 0.0) - cost
-            weight = np.exp(min(-known.get(key, np.inf) - dearer, 0.0))
+            lost = known.get(key, np.inf)
+            fitted = np.exp(min(-lost - dearer, 0.0))
+            # a fit that does as well as that of the chosen one confirms what was promised
+            weight = max(weight, fitted) if lost < 1 else fitted
+            is_same = is_same and lost < 1
+        if is_same:
+            weight = max(weight, _ALIAS)
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())

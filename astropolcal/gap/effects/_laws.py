@@ -296,7 +296,15 @@ class StandardPolarization(Effect):
                 values = {k: np.broadcast_to(getattr(star, k).value, size) for k in self.free}
                 fresh = star.with_parameters(**values)
                 for key, held in values.items():
-                    getattr(fresh, key).fixed, getattr(fresh, key).prior = False, None
+                    free = getattr(fresh, key)
+                    free.fixed, free.prior = False, None
+                    # a lamp that is known to be nearly fully polarized is outside the bounds of one
+                    # that is fitted
+                    low, high = free.bounds
+                    free.bounds = (
+                        min(low, held.min() - self.limit),
+                        max(high, held.max() + self.limit),
+                    )
                     # the law must hold the catalogue's values, from which the size counts
                     law = None if size == 1 else able_to_hold(held, context.basis(self.degree))
                     name = f"{star.name}.{key}"
