@@ -342,7 +342,7 @@ def _telling_apart(forecast, group, foreseen):
             few += f", not from {listed(same, most=2)}," if same else ""
             words = (
                 f"Take {exposure.words}: tells {first} from {few} at {_sigmas(gain)} "
-                f"standard deviations; the probability of the true one should rise from "
+                f"standard deviations; if one of these is the cause, its share should rise from "
                 f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
             )
             told = [names[0], *(names[j] for j in other)]
