@@ -82,8 +82,9 @@ _ROBUST_ROUNDS = 50
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
-# nor is one tried that leaves so many times as much before everything is fitted
-_HOPELESS = 100.0
+# nor is one tried that leaves so many times as much before everything is fitted, or is not better
+# after so many evaluations
+_HOPELESS, _GLANCE = 100.0, 15
 # of data without noise, residuals below this are rounding
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -398,6 +399,9 @@ def _joint(measurement, weighting, fitter, search, prepare):
     for promised, start in other_laws(problem, found, origin)[:_STARTS]:
         if promised > _HOPELESS * least:
             break
+        start, left = _glanced(problem, start, origin)
+        if left >= _BETTER * least:
+            continue
         measurement.stand_at(start)
         outcome = _descend(measurement, weighting, fitter, search, prepare, origin, start)
         left = np.sum(problem.residuals(measurement.vector()) ** 2)
@@ -407,6 +411,18 @@ def _joint(measurement, weighting, fitter, search, prepare):
                 break
     measurement.stand_at(found)
     return best
+
+
+def _glanced(problem, start, origin):
+    """Return where a start leads in a few steps of everything, and what it leaves there.
+
+    Most starts lead to the minimum that is known, or crawl towards one that is no better.
+    """
+    start = problem.fit(start, evaluations=_GLANCE)[0]
+    start, moved = search_branches(problem, start, origin)
+    if moved.any():
+        start = problem.fit(start, evaluations=_GLANCE)[0]
+    return start, np.sum(problem.residuals(start) ** 2)
 
 
 def _stands_out(measurement):

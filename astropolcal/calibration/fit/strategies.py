@@ -64,7 +64,7 @@ class BinProblem(Problem):
         starts = np.array([slot.start for slot in self.slots], dtype=int)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
         self.elements = starts[:, None] + np.arange(self.n_bins)
-        self._low, self._high = self._low[self.elements], self._high[self.elements]
+        self._below, self._above = self._low[self.elements], self._high[self.elements]
         rows = {slot.name: row for row, slot in enumerate(self.slots)}
         tight = [(slot, prior) for slot, prior in measurement.free.priors if not prior.is_flat]
         self._priors = [(rows[slot.name], prior) for slot, prior in tight if slot.name in rows]
@@ -136,7 +136,7 @@ class BinProblem(Problem):
         normal, gradient = self._normal_equations(vector)
         here = vector[self.elements]
         held = (
-            ((here <= self._low) & (gradient.T > 0)) | ((here >= self._high) & (gradient.T < 0))
+            ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
         ).T
         # a parameter that leans against its bound must not slow down the others
         normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
@@ -146,7 +146,7 @@ class BinProblem(Problem):
         # relative to the diagonal (Marquardt), plus a little for what changes nothing
         ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
         step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
-        return np.clip(here - step[..., 0].T, self._low, self._high)
+        return np.clip(here - step[..., 0].T, self._below, self._above)
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""

@@ -257,10 +257,11 @@ class Problem:
         rows, n = self.jacobian(vector).T, self.measurement.n_data
         return Whitened(rows[:, :n], physical_scale(free), rows[:, n:], free.at_bounds(vector))
 
-    def fit(self, start, counts=None, held=()):
+    def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS):
         """Return the vector, chi-square, and what scipy says of the fit.
 
-        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are, and
+        ``evaluations`` after how many the fit ends, where it has not arrived.
         """
         # a calibration is read where there is no scipy
         from scipy.optimize import least_squares
@@ -292,7 +293,7 @@ class Problem:
             jac=slopes,
             bounds=(self._low[live], self._high[live]),
             x_scale=1 / np.where(size > 0, size, 1.0),
-            max_nfev=_MAX_EVALUATIONS,
+            max_nfev=evaluations,
         )
         return place(found.x).copy(), 2 * found.cost, found
 
