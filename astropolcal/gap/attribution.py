@@ -149,8 +149,12 @@ class Scan:
     probes: object = None
     temper: float = 1.0
 
-    def freer(self, candidate):
-        """Return a cause with the law in wavelength for which there is most evidence."""
+    def freer(self, candidate, among=()):
+        """
+        Return a cause with the law in wavelength for which there is most evidence.
+
+        It is quicker where the candidates ``among`` which it is are known.
+        """
         best, probes = candidate, self.probes
         near = () if probes is None or candidate.is_named else probes.steps_near(candidate.cell)
         if near:
@@ -163,7 +167,8 @@ class Scan:
                     probes.waves.setdefault(one.cell.dependence, probes.waves_of(one.cell))
         for degree in _FREER if probes is not None else ():
             if candidate.is_named:
-                found = _named(probes, [candidate.named], self.temper, degree)
+                names = [one.named for one in among if one.is_named]
+                found = _named(probes, [candidate.named], self.temper, degree, names)
             else:
                 found = _of_cell(probes, candidate.cell, degree, self.temper)
             best = max([best, *found], key=lambda one: one.evidence)
@@ -325,12 +330,20 @@ def _rank(values, scale):
     return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
 
 
-def _named(probes, effects, temper, degree="default"):
-    """Return the candidates of named effects."""
+def _named(probes, effects, temper, degree="default", others=()):
+    """Return the candidates of named effects; ``others`` will be asked for, too."""
     model, found = probes.model, []
     chains = model.trains
-    fitting = [e for e in effects if e.name not in probes.own and not e.absorbed_by]
-    fitting = [e for e in fitting if e.name in model.added or e.applies(chains)]
+    fitting, others = (
+        [
+            e
+            for e in some
+            if e.name not in probes.own
+            and not e.absorbed_by
+            and (e.name in model.added or e.applies(chains))
+        ]
+        for some in (effects, others)
+    )
     context = None if degree == "default" else replace(model.context, degree=degree)
     law = replace(model.context, degree=degree)
     for effect in fitting:
@@ -338,7 +351,7 @@ def _named(probes, effects, temper, degree="default"):
         if bent:
             found += [replace(one, context=context) for one in bent]
             continue
-        slopes, size = _slopes_of(probes, effect, fitting, degree)
+        slopes, size = _slopes_of(probes, effect, [*fitting, *others], degree)
         if size is None or not size.size:
             continue
         found += [
@@ -351,7 +364,8 @@ def _named(probes, effects, temper, degree="default"):
 def _columns(model, effects, degree):
     """Return derivatives and usual sizes of named effects, all at zero in the same chains."""
     known = model.__dict__.setdefault("_named_columns", {})
-    waiting = [e for e in effects if (e.name, degree) not in known and e.name not in model.added]
+    waiting = {e.name: e for e in effects if (e.name, degree) not in known}
+    waiting = [effect for name, effect in waiting.items() if name not in model.added]
     context = replace(model.context, degree=degree)
     while waiting:
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []

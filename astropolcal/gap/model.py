@@ -114,10 +114,10 @@ class Model:
         """Mean square of the whitened residuals: 1 where noise is all that is left."""
         return self.fit.chi2 / max(self.problem.n_data - self.problem.size, 1)
 
-    @property
+    @cached_property
     def p_value(self):
         """Probability of the residuals by noise alone."""
-        tangent = self.problem.tangent(self.fit.coefficients)
+        tangent = self.problem.tangent(self.fit.coefficients, self.jacobian)
         return float(stats.chi2.sf(self.fit.chi2, self.problem.n_data - tangent.shape[1]))
 
     def edited(self, *recipes):

@@ -206,7 +206,8 @@ def _merged(base, best, library, say, cells):
 
 
 def _best_of(found, most):
-    return [found.freer(one) for one in _distinct(found.candidates, most)]
+    best = _distinct(found.candidates, most)
+    return [found.freer(one, best) for one in best]
 
 
 def _possible(base, best, scans):
@@ -285,7 +286,7 @@ def _growing(best):
 def explained_by_one(model, library, *, cells=True):
     """Return whether a single cause leaves no more than noise."""
     found = _scanned(model, library, cells)
-    for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):
+    for one in _best_of(found, _WIDTH[0]):
         if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
             return True
     return False
@@ -520,7 +521,7 @@ def _rivals_beside(found, own, library):
     """
     few = _best_of(found, _FITTED[1])
     named = [one for one in _distinct(found.candidates, _MORE * _FITTED[1]) if one.is_named]
-    few += map(found.freer, named[: _FITTED[-1]])
+    few += [found.freer(one, named) for one in named[: _FITTED[-1]]]
     mine = [found.freer(one) for one in found.candidates if one.name == own.name][:1]
     names = [
         name for one in [*few, *mine] if not one.is_named for name in found.named_as(one, library)

@@ -331,8 +331,8 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
 
     right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
     lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD)
-    assert lines[0].startswith("NOT USABLE AS IT IS: the model misses the data by 2.")
-    assert "astropolcal diagnose" in lines[4]
+    assert lines[0].startswith("NOT USABLE AS IT IS: calibration_polarizer.theta is at its bound")
+    assert any("astropolcal diagnose" in line for line in lines[:5])
 
 
 @pytest.mark.slow

@@ -20,8 +20,6 @@ __all__ = ["Verdict"]
 _MOST = 0.5
 # bare metals polarize by a few percent at most, coated ones by little more
 _NO_MIRROR = 30 * u.percent
-# so many angles common to all wavelengths at their bounds are no chance
-_ANGLES = 2
 # residuals at least as large happen by chance less often
 _UNLIKELY = 0.01
 # the mounts are known better than this before any fit, and it turns 6 % of Q into U
@@ -166,10 +164,12 @@ def _angles(calibration, free):
     """Say that most of the angles are at a bound, and the residuals larger than the noise."""
     angles = _orientations(free)
     stuck = [name for name, entry in angles.items() if entry["at_bound"]]
-    if len(stuck) < _ANGLES or len(stuck) <= _MOST * len(angles) or not _excess(calibration):
+    if len(stuck) <= _MOST * len(angles) or not _excess(calibration):
         return ""
+    where = "most angles at their bounds" if len(stuck) > 1 else f"{stuck[0]} is at its bound"
+    named = f"{', '.join(stuck)}; " if len(stuck) > 1 else ""
     return (
-        f"most angles at their bounds: are beams or signs exchanged? ({', '.join(stuck)}; "
+        f"{where}: are beams or signs exchanged? ({named}"
         f"residuals {_excess(calibration):.3g} times the noise)"
     )
 
