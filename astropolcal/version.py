@@ -6,7 +6,7 @@ A source tree that was never built has no such file; the version is then that
 of the installed distribution, or ``"0.0.0+unknown"`` if there is none.
 """
 
-__all__ = ["version"]
+__all__ = []
 
 try:
     from astropolcal._version import version

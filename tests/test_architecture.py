@@ -53,7 +53,6 @@ WITHOUT_REFERENCE_PAGE = {
     "conftest",
     "converters",
     "data",
-    "extension",
     "resources",
     "scripts",
     "version",

@@ -70,7 +70,7 @@ def test_no_physics_is_imported_for_files_of_others():
     """Both are called whenever any file of ASDF is opened."""
     code = """
 import sys
-from astropolcal.extension import get_extensions, get_resource_mappings
+from astropolcal.converters.extension import get_extensions, get_resource_mappings
 [list(mapping) for mapping in get_resource_mappings()], get_extensions()[0].converters
 heavy = ("optics", "calibration", "chain", "measurement", "mueller", "observations")
 print([name for name in heavy if f"astropolcal.{name}" in sys.modules])

@@ -20,9 +20,8 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.problem import GapProblem
-from astropolcal.optics import GENERATORS
 from astropolcal.optics.core import COORDINATES
-from astropolcal.optics.perturbations import Dependence, split_run
+from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 
 __all__ = []
 
@@ -67,7 +66,7 @@ class Cell:
         ``"source"``, ``"telescope"``, ``"in:OPTIC"`` (the frame that turns with it),
         ``"after:OPTIC"`` (the frame that is static) or ``"detector"``.
     kind : str
-        Key of `~astropolcal.optics.GENERATORS`, or ``"background"``,
+        Kind of a `~astropolcal.optics.Perturbation`, or ``"background"``,
         ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
     dependence : str
         As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of

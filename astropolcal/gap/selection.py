@@ -24,7 +24,7 @@ __all__ = []
 # the best candidates count where residuals are no noise
 _RETEMPERED = 400
 # fits on the way to the answer need not be carried to the end
-_QUICK = {"steps": 6, "share": 1e-3}
+_QUICK = {"steps": 24, "share": 1e-3}
 # of so many causes two may be one that was not seen while the others were missing
 _MERGED = (3, 4)
 # causes are looked at beside all the others so many times

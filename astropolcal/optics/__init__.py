@@ -23,7 +23,7 @@ from astropolcal.optics.modulated import (
     StateRetarder,
     StrayLight,
 )
-from astropolcal.optics.perturbations import GENERATORS, MuellerElement, Perturbation
+from astropolcal.optics.perturbations import MuellerElement, Perturbation
 from astropolcal.optics.polarizers import (
     BeamGain,
     Depolarizer,
@@ -43,7 +43,6 @@ from astropolcal.optics.sources import Light, PolarizedSource, StarSource
 
 __all__ = [
     "COORDINATES",
-    "GENERATORS",
     "OPTICS",
     "BeamGain",
     "Depolarizer",

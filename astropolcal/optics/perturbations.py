@@ -21,7 +21,7 @@ from astropolcal.optics.modulated import FrameOptic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.words import check_choice
 
-__all__ = ["GENERATORS", "MuellerElement", "Perturbation"]
+__all__ = ["MuellerElement", "Perturbation"]
 
 _I, _Q, _U, _V = range(4)
 
@@ -164,7 +164,9 @@ class Perturbation(_BeamOptic, FrameOptic):
     quadrature : float or array_like
         Size b of the second function, the sine of a harmonic; 0 for all other dependences.
     kind : str
-        Key of `GENERATORS`.
+        ``"retardance_h"``, ``"retardance_d"``, ``"rotation"``, ``"diattenuation_h"``,
+        ``"..._d"``, ``"..._c"``, ``"depolarization_linear"``, ``"..._h"``, ``"..._d"``,
+        ``"..._circular"`` or ``"gain"``.
     dependence : str
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N

@@ -10,8 +10,7 @@ from astropolcal.gap._numbers import Fitted
 from astropolcal.gap._words import is_determined, labels, share, shortened
 from astropolcal.gap.cells import places
 from astropolcal.gap.residuals import frame_blocks
-from astropolcal.optics import GENERATORS
-from astropolcal.optics.perturbations import Dependence
+from astropolcal.optics.perturbations import GENERATORS, Dependence
 from astropolcal.plotting import _style as st
 from astropolcal.words import check_choice
 

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import is_physical
 from astropolcal.observations import Observations, example_table
-from astropolcal.optics import GENERATORS, Perturbation
-from astropolcal.optics.perturbations import Dependence, split_run
+from astropolcal.optics import Perturbation
+from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 
 GOOD = [
     *("constant", "time", "time2", "step:12", "frame:3", "harmonic:hwp:2", "harmonic:derotator:4"),

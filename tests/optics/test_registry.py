@@ -24,6 +24,7 @@ from astropolcal import mueller, optics
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import get_material
 from astropolcal.optics import COORDINATES, OPTICS, FrameOptic, Optic
+from astropolcal.optics.perturbations import GENERATORS
 from astropolcal.thinfilm import reflect
 from astropolcal.units import canonical_factor, canonical_unit
 
@@ -171,7 +172,7 @@ def perturbation(kind, wave=lambda x: (x, 0 * x)):
         exponent = np.asarray(amplitude * first + quadrature * second)
         if kind == "gain":
             return gained(1 + exponent)
-        return expm(exponent[..., None, None] * optics.GENERATORS[kind])
+        return expm(exponent[..., None, None] * GENERATORS[kind])
 
     return expected
 

@@ -22,8 +22,7 @@ from astropolcal.gap.effects.where import SEVERAL, Roles, Where
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
-from astropolcal.optics import GENERATORS
-from astropolcal.optics.perturbations import Dependence, split_run
+from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.units import canonical_factor
 from astropolcal.words import did_you_mean
 
@@ -252,8 +251,9 @@ class Effect:
         ``"source"``, ``"telescope"`` (upstream of the half-wave plate) or ``"detector"``; an optic
         by its name or its role.
     kind : str or tuple of str
-        Key of `~astropolcal.optics.GENERATORS`; ``"diattenuation"`` and ``"retardance"`` are of
-        any axis; ``"orientation"`` is an error of the orientation of the optic inside which it is.
+        Kind of a `~astropolcal.optics.Perturbation`; ``"diattenuation"`` and ``"retardance"`` are
+        of any axis; ``"orientation"`` is an error of the orientation of the optic inside which it
+        is.
     dependence : str
         On the frame, such as ``"harmonic:derotator:1"``.
     degree : int, "number" or None
