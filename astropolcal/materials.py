@@ -112,13 +112,6 @@ class _Ranged:
             If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.materials import get_material
-        >>> get_material("silver").index(1.6 * u.um).round(2)
-        <Quantity 0.43+10.38j>
         """
         return u.Quantity(self._index_um(length_to_um(wavelength)), dtype=complex)
 
@@ -287,13 +280,6 @@ class BrendelBormannLaw:
     References
     ----------
     Rakić et al. 1998, Appl. Opt. 37, 5271, doi:10.1364/AO.37.005271.
-
-    Examples
-    --------
-    >>> from astropolcal.materials import BrendelBormannLaw
-    >>> free = BrendelBormannLaw(plasma=9.0, drude=(1.0, 0.05))
-    >>> free._index_um(1.6).round(2)
-    np.complex128(0.38+11.55j)
     """
 
     plasma: float

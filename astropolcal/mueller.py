@@ -483,38 +483,12 @@ def coherency_matrix(matrix):
 
 def is_physical(matrix, tolerance=1e-9):
     """
-    Tell which matrices are Mueller matrices that nature allows.
+    Tell which matrices, (..., 4, 4), are Mueller matrices that nature allows.
 
-    Parameters
-    ----------
-    matrix : array_like
-        Matrices of shape (..., 4, 4).
-    tolerance : float
-        How far below zero an eigenvalue of the coherency matrix may lie, as a
-        fraction of the transmission of unpolarized light.
-
-    Returns
-    -------
-    `~numpy.ndarray` of bool
-        Of the leading shape of ``matrix``.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite or the tolerance is
-        negative.
-
-    Notes
-    -----
-    A matrix is a mixture of at most four optics without depolarization where its coherency
-    matrix has no negative eigenvalue: Cloude 1990, doi:10.1117/12.962889.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import is_physical
-    >>> bool(is_physical(np.diag([1.0, 1.0, 1.0, -1.0])))
-    False
+    An eigenvalue of the coherency matrix may lie below zero by the tolerance, a fraction of the
+    transmission of unpolarized light; one that is negative raises. A matrix is a mixture of at
+    most four optics without depolarization where its coherency matrix has no negative eigenvalue:
+    Cloude 1990, doi:10.1117/12.962889.
     """
     matrix, tolerance = _mueller_array(matrix), to_unit(tolerance, None, "tolerance")
     if not (tolerance >= 0).all():

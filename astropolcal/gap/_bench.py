@@ -68,31 +68,12 @@ DETECTOR = {
 @dataclass(frozen=True)
 class Setup:
     """
-    What is simulated.
+    What is simulated: one cycle of the half-wave plate at each angle of the derotator.
 
-    Parameters
-    ----------
-    instrument : str
-        Name of the instrument.
-    options : dict, optional
-        Passed to its ``chain``: the nominal model. By default a linear derotator, where the
-        instrument knows one.
-    n_wavelengths, n_derotator : int
-        Numbers of wavelengths and of derotator angles; at each of these one
-        cycle of the half-wave plate. An instrument with filters keeps its own wavelengths.
-    flux : float
-        Median flux that enters, in electrons per wavelength and frame.
-    read_noise : float
-        Per beam and frame, in electrons.
-    drift, flicker : float
-        Drift of the lamp through the run and its flicker from frame to frame,
-        relative; every challenge draws between none and twice this.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.challenge import Setup
-    >>> Setup(n_derotator=4).n_wavelengths
-    8
+    ``options`` go to the ``chain`` of the instrument; an instrument with filters keeps its own
+    wavelengths. The median ``flux`` per wavelength and frame and the ``read_noise`` per beam and
+    frame are in electrons. ``drift`` of the lamp through the run and ``flicker`` from frame to
+    frame are relative; every challenge draws between none and twice this.
     """
 
     instrument: str = "charis"

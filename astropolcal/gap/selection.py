@@ -81,18 +81,9 @@ class Group:
     """
     One cause, with all that cannot be distinguished from it.
 
-    Parameters
-    ----------
-    members : list of (Candidate, float)
-        Candidates and their probabilities among each other, best first.
-    probability : float
-        That one of the members is a cause of the gap.
-    lowered : float
-        By how much chi-square is lower with it than with those chosen before it.
-    stability : float
-        Share of the halves of the wavelengths and of left-out angles in which it is found.
-    by_dataset : dict of str to float
-        Evidence for it in each of several runs alone.
+    ``members`` are candidates, best first, with their probabilities among each other, and
+    ``probability`` is that of one of them being a cause. The fit had ``lowered`` chi-square by so
+    much; ``stability`` is the share of halves and of left-out angles in which it is found.
     """
 
     members: list
@@ -110,20 +101,10 @@ class Group:
 @dataclass
 class Selection:
     """
-    The causes that were chosen.
+    The causes in the order in which they were added, and the model with all of them.
 
-    Parameters
-    ----------
-    groups : list of Group
-        The causes, in the order in which they were added.
-    model : Model
-        With all of them.
-    scan : Scan
-        Evidence beside the base.
-    unlisted : float
-        Probability that the gap has a cause that no table has.
-    history : list of HeldOut or None
-        Errors on left-out frames of the base and after each cause.
+    ``scan`` is the evidence beside the base, ``unlisted`` the probability of a cause that no table
+    has, and ``history`` the errors on left-out frames of the base and after each cause.
     """
 
     groups: list

@@ -128,13 +128,6 @@ class FORS2(Polarimeter):
     ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
     and the efficiency of the prism, and of stars what the collimator polarizes, which a polarizer
     hides.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> fors2 = instruments.get("fors2")
-    >>> [optic.name for optic in fors2.chain("star")]
-    ['star', 'parallactic', 'collimator', 'hwp', 'wollaston']
     """
 
     name = "fors2"
@@ -173,13 +166,6 @@ class NaCo(Polarimeter):
     Free are, per wavelength, the diattenuation of M3, that of the mirrors downstream of it, the
     retardance of the plate and the efficiency of the prism; and the angle of the plate, within
     20 deg, as it was once 13 deg off.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> naco = instruments.get("VLT/NACO")
-    >>> [optic.name for optic in naco.chain("star")][1:]
-    ['parallactic', 'm3', 'adapter', 'position_angle', 'mirrors', 'hwp', 'wollaston']
     """
 
     name = "naco"
@@ -226,13 +212,6 @@ class NIRC2(Polarimeter):
     Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the
     prism; the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror,
     whose retardance is held.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> nirc2 = instruments.get("nirc2")
-    >>> [optic.name for optic in nirc2.chain("star")]
-    ['star', 'parallactic', 'm3', 'altitude', 'hwp', 'derotator', 'wollaston']
     """
 
     name = "nirc2"
@@ -268,13 +247,6 @@ class MagAOX(Polarimeter):
     the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror. The
     static retarder ``bench`` is fixed at 0 deg until you free it. Unequal gains of the cameras are
     the nuisance ``"beam_gain"``.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> magaox = instruments.get("MagAO-X")
-    >>> [optic.name for optic in magaox.chain("star")][4:]
-    ['hwp', 'derotator', 'bench', 'wollaston']
     """
 
     name = "magaox"
@@ -319,15 +291,6 @@ class GPI(Polarimeter):
 
     Free are, per wavelength, the linear diattenuation of all that is upstream of the plate, the
     retardance of the plate and the efficiency of the prism; and the angle of the plate.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> gpi = instruments.get("gpi")
-    >>> [optic.name for optic in gpi.chain("star")]
-    ['star', 'parallactic', 'telescope_and_ao', 'hwp', 'wollaston']
-    >>> (100 * gpi.published()["telescope_and_ao"].mueller()[1:, 0]).round(4).tolist()
-    [-0.037, 0.4338, -6.64]
     """
 
     name = "gpi"
@@ -385,13 +348,6 @@ class RomanCoronagraph(Polarimeter):
     Free are, per band, the diattenuation of all that is upstream of the prisms, its retardance,
     which lowers the signal of one prism, and the efficiency of the prisms; and their common
     orientation.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> roman = instruments.get("roman")
-    >>> [optic.name for optic in roman.chain("target")]
-    ['star', 'roll', 'telescope', 'mirrors', 'wollaston']
     """
 
     name = "roman"

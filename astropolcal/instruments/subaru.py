@@ -50,17 +50,7 @@ _PLATE_AND_DEROTATOR = (
 
 
 class HiCIAO(SubaruPolarimeter):
-    """
-    Subaru/HiCIAO with half-wave plate, derotator and Wollaston prism.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> hiciao = instruments.get("hiciao")
-    >>> mirror = hiciao.on_sky(hiciao.chain("polarized"))["m3"]
-    >>> (100 * mirror.diattenuation(hiciao.wavelength)).round(2)
-    array([0.65, 0.55, 0.5 ])
-    """
+    """Subaru/HiCIAO with half-wave plate, derotator and Wollaston prism."""
 
     name = "hiciao"
     aliases = ("Subaru/HiCIAO",)
@@ -79,15 +69,7 @@ class HiCIAO(SubaruPolarimeter):
 
 
 class IRCS(SubaruPolarimeter):
-    """
-    Subaru/IRCS with the half-wave plate for J, H and K.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> [optic.name for optic in instruments.get("ircs").chain("unpolarized")]
-    ['fold_mirror', 'hwp', 'derotator', 'wollaston']
-    """
+    """Subaru/IRCS with the half-wave plate for J, H and K."""
 
     name = "ircs"
     aliases = ("Subaru/IRCS",)
@@ -101,16 +83,7 @@ class IRCS(SubaruPolarimeter):
 
 
 class FastPDI(SubaruPolarimeter):
-    """
-    Subaru/SCExAO/Fast-PDI with or without its liquid crystal.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> chain = instruments.get("fastpdi").chain("polarized", ["flc"])
-    >>> [optic.name for optic in chain]
-    ['calibration_polarizer', 'hwp', 'derotator', 'flc', 'wollaston']
-    """
+    """Subaru/SCExAO/Fast-PDI with or without its liquid crystal."""
 
     name = "fastpdi"
     aliases = ("Fast-PDI", "SCExAO/FastPDI", "Subaru/SCExAO/FastPDI")
@@ -136,14 +109,6 @@ class REACH(SubaruPolarimeter):
     Subaru/SCExAO/REACH; its wavelengths here are one for each band.
 
     Unequal throughputs of the two fibres are the nuisance ``"beam_gain"``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> spectrum = [1.30, 1.31, 1.32, 1.33] * u.um
-    >>> instruments.get("reach").chain(wavelength=spectrum)["derotator"].horizontal.size
-    4
     """
 
     name = "reach"

@@ -356,13 +356,6 @@ class Observability:
         ------
         ParameterError
             If ``frames`` is not positive.
-
-        Examples
-        --------
-        >>> from astropolcal import standards
-        >>> seen = standards.observability("HD 293396", "subaru", "2025-11-03")
-        >>> round(seen.information(frames=32).diattenuation, 2)
-        0.21
         """
         seen = self._seen
         if frames is not None:
