@@ -14,7 +14,7 @@ from astropolcal.gap.cells import Cell, Probes, dependences, places
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
-from astropolcal.optics import GENERATORS
+from astropolcal.optics.perturbations import GENERATORS
 from astropolcal.simulation import half_wave_plate_cycles
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
