@@ -10,6 +10,7 @@ set leaves lowers the probability of all its causes.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -138,10 +139,10 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     first = _scanned(base, library, cells)
     runs = count_runs(base.problem)
     most = _MOST if runs < 2 or not cells else _MOST // 2
-    best = _search(_State(base), library, first, say, cells, most)
+    best = _search(base, _State(base), library, first, say, cells, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
         best = _apart(base, first, say)
-        best = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
+        best = _search(base, best, [], first, say, cells, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, 0.0, [_errors(base, groups)])
     if first.probes.has_more_steps:
@@ -308,7 +309,8 @@ def _apart(base, first, say):
     for i, name in enumerate(first.probes.runs):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
-        state = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
+        seen = _scanned(alone, [], True)
+        state = _search(alone, _State(alone), [], seen, say, True, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     names = {one.name for one in chosen}
@@ -349,24 +351,25 @@ def _in_run(candidate, name, probes):
     return replace(candidate, cell=cell.in_run(name))
 
 
-def _search(best, library, first, say, cells, most_causes):
+def _search(base, best, library, first, say, cells, most_causes):
     """Return the best set of causes."""
     states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
         say(f"looking for cause {k + 1}, at most {most_causes}")
+        # what takes many causes has no names; they are asked for once more at the end
+        names = library if k <= _NAMES or not cells else ()
         for state in states:
             if state.outline not in known:
-                # what takes many causes has no names; they are asked for once more at the end
-                names = library if k <= _NAMES or not cells else ()
                 known[state.outline] = _scanned(state.model, names, cells)
+        instead = partial(_in_place, base, names, cells)
         fitted = []
         for several in (most, _MORE * most):
             # what is impossible is passed over, and is not the end of the search
             grown = _grown(states, known, several)
             tried = grown[:most] if several == most else grown[most:]
-            fitted = _fitted(tried)
+            fitted = _fitted(tried, instead)
             if fitted:
                 break
         fitted.sort(key=lambda state: -state.evidence)
@@ -379,14 +382,14 @@ def _search(best, library, first, say, cells, most_causes):
     return best
 
 
-def _fitted(grown):
+def _fitted(grown, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
         share = _HALF if any(other.is_dear for other in found) else _PROMISING
         if promised - state.evidence < share * (most - state.evidence):
             break
-        one = _extended(promised, state, added)
+        one = _extended(promised, state, added, instead)
         if one is not None:
             found.append(one)
             most = max(most, one.evidence)
@@ -419,16 +422,37 @@ def _continuations(found, most):
     return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
 
 
-def _extended(evidence, state, added):
+def _extended(evidence, state, added, instead):
     """Return a set with more causes, fitted in full, None where that is impossible."""
     model = state.model.with_effects([one.recipe for one in added], **_QUICK)
-    # what was possible before may be driven to its limit by what is added
-    if not all(model.is_physical(one.name) for one in (*state.chosen, *added)):
-        return None
+    chosen = [*state.chosen, *added]
     # what the full fit gains over the linear promise
     gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
-    temper = max(1.0, model.mean_square)
-    return _State(model, [*state.chosen, *added], evidence + 0.5 * gained / temper)
+    evidence += 0.5 * gained / max(1.0, model.mean_square)
+    impossible = [one for one in chosen if not model.is_physical(one.name)]
+    if not impossible:
+        return _State(model, chosen, evidence)
+    if impossible[0] in added or len(impossible) > 1:
+        return None
+    # what was possible before is driven to its limit by what is added: another is in its place
+    return instead(impossible[0], _State(model, chosen, evidence))
+
+
+def _in_place(base, library, cells, one, state):
+    """Return a set with the best that is possible in place of a cause, None if nothing is."""
+    temper = max(1.0, state.model.mean_square)
+    found = scan(state.model, library, cells=cells, temper=temper, without=one.name)
+    taken = {other.name for other in state.chosen}
+    for rival in _best_of(found, _FITTED[-1]):
+        if rival.name in taken or rival.evidence < ENOUGH:
+            continue
+        chosen = [rival if other is one else other for other in state.chosen]
+        model = base.with_effects([o.recipe for o in chosen], like=state.model, **_QUICK)
+        if all(model.is_physical(other.name) for other in chosen):
+            lost = 0.5 * (model.fit.chi2 - state.model.fit.chi2) / temper
+            dearer = rival.cost(temper) - one.cost(temper)
+            return _State(model, chosen, state.evidence - lost - dearer)
+    return None
 
 
 def _exchanged(base, best, library, first, say, cells):
