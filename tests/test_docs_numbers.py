@@ -3,6 +3,7 @@
 
 import json
 import re
+import runpy
 import warnings
 from datetime import datetime
 from pathlib import Path
@@ -286,6 +287,30 @@ def test_text_of_the_challenges_is_that_of_their_tables():
     none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
     assert f"nothing in all {none} challenges without a fault" in text
     assert "The three wrong answers are to mechanisms" in text
+
+
+def test_effects_that_the_model_lacks_are_within_the_claims_that_the_page_states():
+    runs = Table.read(PAGE.with_name("unlisted_effects.csv"), format="csv")
+    text = " ".join(PAGE.with_name("noise.rst").read_text(encoding="utf-8").split())
+    bright, faint = (runs[f"real_{dolp}"] / runs[f"stated_{dolp}"] for dolp in (30, 1))
+    within = [[round(100 * np.mean(one <= n)) for n in (1, 2, 3)] for one in (bright, faint)]
+    assert f"Each of {len(runs)} simulated runs" in text
+    shares = (
+        "{} % of the errors of the DoLP are within the claim, {} % within twice and {} % within"
+    )
+    assert shares.format(*within[0]) in text
+    assert "for one of 1 % these are {}, {} and {} %".format(*within[1]) in text
+    assert "{:.0f} and {:.0f} times".format(*np.sort(bright)[-2:]) in text
+
+
+@pytest.mark.slow
+def test_a_run_with_an_effect_that_the_model_lacks_is_that_of_the_table():
+    runs = Table.read(PAGE.with_name("unlisted_effects.csv"), format="csv")
+    measure = runpy.run_path(PAGE.with_name("measure_unlisted.py"))["measure"]
+    for row in runs[[1, 132]]:
+        found = measure(int(row["seed"]))
+        assert found[:4] == [str(row[name]) for name in runs.colnames[:4]]
+        np.testing.assert_allclose([float(x) for x in found[4:]], list(row)[4:], rtol=0.05)
 
 
 def test_speed_is_that_of_one_run_on_the_machine_that_the_page_names():
