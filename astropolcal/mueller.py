@@ -321,8 +321,8 @@ def retardance_slope(retardance):
 
 def transverse_share(diattenuation):
     """Return sqrt(1 - eps^2), what a diattenuator leaves of U and V."""
-    # 1 - eps^2 would lose the digits near a polarizer
-    return np.sqrt((1 - diattenuation) * (1 + diattenuation))
+    # 1 - eps^2 would lose the digits near a polarizer; a fit may try more than 1
+    return np.sqrt(np.maximum((1 - diattenuation) * (1 + diattenuation), 0.0))
 
 
 def fill_phase_block(matrix, c, s):

@@ -89,6 +89,9 @@ def check_broadcast(wavelength, position):
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
 
+# a fit may pass a bound by so much
+_ROUNDING = 1e-9
+
 
 class Optic(FittableModel, metaclass=KeywordOnly):
     """
@@ -156,6 +159,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     depends_on_beam = False
     #: True for an optic whose mount may name one of `COORDINATES`, which are not angles.
     takes_numbers = False
+    # parameters that are the components of a diattenuation
+    _components = ()
     # laws that parameters follow, by their names, and where this copy stands for them
     _follows, _places = {}, {}
 
@@ -320,7 +325,18 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             parameter = getattr(self, key)
             self._check_unit(key, parameter.unit)
             values.append(np.asarray(parameter.value) * canonical_factor(parameter.unit))
+        self._check_length(values)
         return values
+
+    def _check_length(self, values):
+        """Refuse a diattenuation of more than one, whose matrix is no number."""
+        where = [self.param_names.index(key) for key in self._components]
+        length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
+        if np.any(length > 1 + _ROUNDING):
+            raise ParameterError(
+                f"{self.name or type(self).__name__}: the diattenuation is {np.max(length):.4g}; "
+                "allowed is 1 at most"
+            )
 
     def _check_unit(self, key, unit):
         # a fitter may leave a parameter behind without its unit

@@ -86,6 +86,7 @@ class Diattenuator(Optic):
     np.float64(0.01)
     """
 
+    _components = ("diattenuation",)
     diattenuation = Parameter(
         default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
     )
@@ -126,6 +127,7 @@ class DiattenuatorRetarder(Optic):
     np.float64(0.015)
     """
 
+    _components = ("diattenuation",)
     diattenuation = Parameter(
         default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
     )
@@ -167,13 +169,14 @@ class VectorDiattenuator(Optic):
     array([ 1.  ,  0.01, -0.02,  0.  ])
     """
 
+    _components = ("horizontal", "diagonal")
     # 0.7 sqrt(2) < 1: any pair within its bounds is physical
     horizontal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along Q")
     diagonal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along U")
 
     def _matrix(self, dispersion, horizontal, diagonal):
         out = blank(horizontal, diagonal)
-        transverse = np.sqrt(1 - horizontal**2 - diagonal**2)
+        transverse = transverse_share(np.hypot(horizontal, diagonal))
         # (1 - t) / d^2, written so that nothing is divided by zero without diattenuation
         share = 1 / (1 + transverse)
         out[..., 0, 0] = 1.0
@@ -196,10 +199,10 @@ def _vector_slope(own, other, i):
     """Return the derivative to component i (0 along Q, 1 along U) of a diattenuation vector."""
     out = blank(own)
     j = 1 - i
-    transverse = np.sqrt(1 - own**2 - other**2)
+    transverse = transverse_share(np.hypot(own, other))
     share = 1 / (1 + transverse)
     # dt/dD_i; and of 1 / (1 + t)
-    fall = -own / transverse
+    fall = -own / np.maximum(transverse, np.sqrt(np.finfo(float).eps))
     rise = -(share**2) * fall
     out[..., 0, 1 + i] = out[..., 1 + i, 0] = 1.0
     out[..., 1 + i, 1 + i] = fall + rise * own**2 + 2 * share * own

@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import mueller
+from astropolcal.exceptions import ParameterError
 from astropolcal.optics import (
     Diattenuator,
     DiattenuatorRetarder,
     LinearPolarizer,
     LinearRetarder,
+    VectorDiattenuator,
 )
 
 EPSILON = st.floats(-1, 1)
@@ -101,3 +103,17 @@ def test_derivatives_are_finite_at_full_diattenuation():
 def test_mirror_is_a_half_wave_diattenuator_retarder():
     mirror = DiattenuatorRetarder(diattenuation=0, retardance=180 * u.deg).mueller()
     np.testing.assert_allclose(mirror, np.diag([1, 1, -1, -1]), atol=1e-15)
+
+
+def test_a_diattenuation_of_more_than_one_is_refused():
+    """It has no Mueller matrix: a number would be none."""
+    strong = (
+        Diattenuator(diattenuation=[0.1, -1.5], name="it"),
+        DiattenuatorRetarder(diattenuation=1.5, name="it"),
+        VectorDiattenuator(horizontal=[0.9, 1.2], diagonal=0.9, name="it"),
+    )
+    for optic in strong:
+        with pytest.raises(ParameterError, match=r"it: the diattenuation is 1\.5; allowed is 1"):
+            optic.mueller()
+    perfect = VectorDiattenuator(horizontal=0.6, diagonal=0.8)
+    np.testing.assert_allclose(perfect.mueller()[3, 3], 0.0, atol=1e-7)
