@@ -329,7 +329,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return values
 
     def _check_length(self, values):
-        """Refuse a diattenuation of more than one, whose matrix is no number."""
+        """Refuse a diattenuation of more than one, which has no Mueller matrix."""
         where = [self.param_names.index(key) for key in self._components]
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
         if np.any(length > 1 + _ROUNDING):
