@@ -5,15 +5,15 @@ Simulated observations: beam fluxes of any chain, with photon and read noise.
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from astropolcal.chain import leaves, stages, states_of
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ParameterError, need_type
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
 from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator, splits
-from astropolcal.units import length_to_um
+from astropolcal.units import angle_to_rad, length_to_um
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
 
@@ -42,6 +42,11 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     `~astropy.table.QTable`
         Columns ``hwp`` and ``derotator``, one row per frame.
 
+    Raises
+    ------
+    ParameterError
+        If there is no angle, or one that is not finite or has no unit of an angle.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -49,10 +54,18 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     >>> len(half_wave_plate_cycles(derotator=[45, 57.5] * u.deg))
     16
     """
-    hwp, derotator = np.atleast_1d(u.Quantity(hwp)), np.atleast_1d(u.Quantity(derotator))
+    hwp, derotator = (_angles(*each) for each in (("hwp", hwp), ("derotator", derotator)))
     return QTable(
         {"hwp": np.tile(hwp, derotator.size), "derotator": np.repeat(derotator, hwp.size)}
     )
+
+
+def _angles(name, values):
+    """Return finite angles, at least one, in their own unit."""
+    angles = angle_to_rad(values, name)
+    if not (angles.size and np.isfinite(angles).all()):
+        raise ParameterError(f"{name} = {values}; allowed are finite angles, at least one")
+    return np.atleast_1d(u.Quantity(values))
 
 
 def simulate(
@@ -126,6 +139,7 @@ def simulate(
     16
     """
     wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
+    need_type(frames, Table, "frames", "a table is needed, such as half_wave_plate_cycles() gives")
     if not len(frames):
         raise ParameterError("frames is a table without rows; at least one frame is needed")
     # for unit source, (n_wavelengths, n_frames)

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from astropolcal.correction.frames import ScienceFrames
 from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain
 from astropolcal.correction.solve import covariance_index, estimator
@@ -17,6 +18,7 @@ from astropolcal.exceptions import (
     AstropolcalWarning,
     ObservationError,
     ParameterError,
+    need_type,
 )
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
@@ -166,6 +168,7 @@ def correct(
     (0.02, -0.01)
     """
     by_variance = _check_choices(mode, weights)
+    need_type(frames, ScienceFrames, "frames", "ScienceFrames are needed, after the calibration")
     if hasattr(calibration, "datasets"):
         when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
         check_frames(calibration, frames.moments(), "the calibration", **when)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import GapError, need_type
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
@@ -22,10 +22,12 @@ from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
+from astropolcal.observations import Observations
 from astropolcal.words import counted, html
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
+_TABLES = "tables of fluxes are needed, after the calibration or the chain"
 # probabilities from which a cause is named, and from which it is located
 _SURE, _LIKELY = 0.9, 0.5
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
@@ -368,6 +370,8 @@ def _library(effects):
 
 
 def _check_instruments(observations):
+    for one in observations:
+        need_type(one, Observations, "observations", _TABLES, GapError)
     named = {o.instrument for o in observations if o.instrument is not None}
     if len({name.lower() for name in named}) > 1:
         raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")

@@ -8,8 +8,15 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal import instruments
-from astropolcal.chain import leaves, stages, states_of
-from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
+from astropolcal.chain import Train, leaves, stages, states_of
+from astropolcal.exceptions import (
+    ChainError,
+    InstrumentError,
+    ObservationError,
+    WavelengthRangeError,
+    need_type,
+)
+from astropolcal.observations import Observations
 from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
@@ -17,10 +24,17 @@ from astropolcal.propagation import Propagator, splits
 
 __all__ = []
 
+_TABLES = "tables of fluxes are needed, such as Observations.read(file) gives"
+_CHAINS = 'chains of optics are needed, such as instruments.get("charis").chain() gives'
+
 
 def as_pairs(chain, observations, positions):
     """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
+    for one in observations:
+        need_type(one, Observations, "observations", _TABLES, ObservationError)
+    for one in chain if isinstance(chain, (list, tuple)) else [chain]:
+        need_type(one, (Model, Train), "chain", _CHAINS, ChainError)
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
     positions = [None] * len(observations) if positions is None else list(positions)
     if not observations or len(chains) != len(observations) or len(positions) != len(observations):

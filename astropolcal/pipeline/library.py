@@ -18,6 +18,7 @@ import os
 import re
 import stat
 import time
+from collections.abc import Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -41,7 +42,7 @@ from astropolcal.calibration.result.calibration import (
 )
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
-from astropolcal.exceptions import CalibrationFileError, InstrumentError
+from astropolcal.exceptions import CalibrationFileError, InstrumentError, need_type
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
@@ -159,6 +160,8 @@ class Library:
 
     def __init__(self, source, context=None):
         one = isinstance(source, (str, Path)) or hasattr(source, "__fspath__")
+        if not one:
+            need_type(source, Iterable, "source", "a folder, a file or several are needed")
         self.source = Path(source) if one else None
         if context is not None:
             if not one or not self.source.is_dir():
