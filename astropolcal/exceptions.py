@@ -81,11 +81,5 @@ class GapError(AstropolcalError, ValueError):
     """A diagnosis of the gap cannot be made, or an effect is not what it says."""
 
 
-def need_type(value, kinds, name, wanted, error=ParameterError):
-    """Raise ``error`` where an argument is of no type that is taken; ``wanted`` says which are."""
-    if not isinstance(value, kinds):
-        raise error(f"{name} is of type {type(value).__name__}; {wanted}", argument=name)
-
-
 class AstropolcalWarning(AstropyUserWarning):
     """Something was masked, ignored or doubtful; the result says what."""

@@ -8,12 +8,13 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from astropolcal.chain import leaves, stages, states_of
-from astropolcal.exceptions import ParameterError, need_type
+from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
 from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator, splits
-from astropolcal.units import angle_to_rad, length_to_um
+from astropolcal.units import length_to_um
+from astropolcal.words import check_type
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
 
@@ -54,18 +55,13 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     >>> len(half_wave_plate_cycles(derotator=[45, 57.5] * u.deg))
     16
     """
-    hwp, derotator = (_angles(*each) for each in (("hwp", hwp), ("derotator", derotator)))
+    for name, angles in (("hwp", hwp), ("derotator", derotator)):
+        if not finite_position(angles, name).size:
+            raise ParameterError(f"{name} = {angles}; at least one angle is needed")
+    hwp, derotator = np.atleast_1d(u.Quantity(hwp)), np.atleast_1d(u.Quantity(derotator))
     return QTable(
         {"hwp": np.tile(hwp, derotator.size), "derotator": np.repeat(derotator, hwp.size)}
     )
-
-
-def _angles(name, values):
-    """Return finite angles, at least one, in their own unit."""
-    angles = angle_to_rad(values, name)
-    if not (angles.size and np.isfinite(angles).all()):
-        raise ParameterError(f"{name} = {values}; allowed are finite angles, at least one")
-    return np.atleast_1d(u.Quantity(values))
 
 
 def simulate(
@@ -139,7 +135,8 @@ def simulate(
     16
     """
     wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
-    need_type(frames, Table, "frames", "a table is needed, such as half_wave_plate_cycles() gives")
+    wanted = "a table is needed, such as half_wave_plate_cycles() gives"
+    check_type("frames", frames, Table, wanted, ParameterError)
     if not len(frames):
         raise ParameterError("frames is a table without rows; at least one frame is needed")
     # for unit source, (n_wavelengths, n_frames)

@@ -48,6 +48,12 @@ def check_choice(what, value, allowed, error):
         raise error(message + did_you_mean(value, known))
 
 
+def check_type(what, value, kinds, wanted, error):
+    """Raise an error unless a value is of one of some types; ``wanted`` says what is needed."""
+    if not isinstance(value, kinds):
+        raise error(f"{what} is of type {type(value).__name__}; {wanted}")
+
+
 def counted(number, noun, plural=None):
     """Return a number and its noun, which is singular for one only: "1 frame", "0 frames"."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"

@@ -36,7 +36,7 @@ def test_arguments_of_the_wrong_type_are_named(run):
             lambda: correct(chain, data),
             lambda: correct(data, chain),
         ],
-        "source": [lambda: load(3), lambda: Library(None)],
+        "the source of calibrations": [lambda: load(3), lambda: Library(None)],
     }
     for name, calls in mistakes.items():
         for call in calls:

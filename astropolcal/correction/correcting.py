@@ -18,13 +18,12 @@ from astropolcal.exceptions import (
     AstropolcalWarning,
     ObservationError,
     ParameterError,
-    need_type,
 )
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting, shown
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, check_type
 
 __all__ = ["correct"]
 
@@ -168,7 +167,8 @@ def correct(
     (0.02, -0.01)
     """
     by_variance = _check_choices(mode, weights)
-    need_type(frames, ScienceFrames, "frames", "ScienceFrames are needed, after the calibration")
+    wanted = "ScienceFrames are needed, after the calibration"
+    check_type("frames", frames, ScienceFrames, wanted, ParameterError)
     if hasattr(calibration, "datasets"):
         when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
         check_frames(calibration, frames.moments(), "the calibration", **when)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from astropolcal.exceptions import GapError, need_type
+from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
@@ -22,12 +22,11 @@ from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
-from astropolcal.observations import Observations
+from astropolcal.measurement.datasets import as_tables
 from astropolcal.words import counted, html
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
-_TABLES = "tables of fluxes are needed, after the calibration or the chain"
 # probabilities from which a cause is named, and from which it is located
 _SURE, _LIKELY = 0.9, 0.5
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
@@ -253,6 +252,8 @@ def diagnose(
         If the nominal fit does not converge, there are too few groups of frames
         to leave out, an effect is unknown, the same data are given twice, or changes
         are asked for where no two datasets have the same source.
+    ObservationError
+        If the observations are not tables of fluxes.
 
     Examples
     --------
@@ -273,7 +274,7 @@ def diagnose(
     """
     started = time.perf_counter()
     say = progress or (lambda line: None)
-    observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
+    observations = as_tables(observations)
     library = _library(effects)
     _check_instruments(observations)
     if changes and not cells:
@@ -370,8 +371,6 @@ def _library(effects):
 
 
 def _check_instruments(observations):
-    for one in observations:
-        need_type(one, Observations, "observations", _TABLES, GapError)
     named = {o.instrument for o in observations if o.instrument is not None}
     if len({name.lower() for name in named}) > 1:
         raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")

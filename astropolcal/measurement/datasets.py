@@ -14,27 +14,32 @@ from astropolcal.exceptions import (
     InstrumentError,
     ObservationError,
     WavelengthRangeError,
-    need_type,
 )
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator, splits
+from astropolcal.words import check_type
 
 __all__ = []
 
-_TABLES = "tables of fluxes are needed, such as Observations.read(file) gives"
-_CHAINS = 'chains of optics are needed, such as instruments.get("charis").chain() gives'
+
+def as_tables(observations):
+    """Return one or several tables of fluxes as a list; refuse what is of another type."""
+    tables = list(observations) if isinstance(observations, (list, tuple)) else [observations]
+    wanted = "tables of fluxes are needed, such as Observations.read(file) gives"
+    for table in tables:
+        check_type("observations", table, Observations, wanted, ObservationError)
+    return tables
 
 
 def as_pairs(chain, observations, positions):
     """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
-    observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
-    for one in observations:
-        need_type(one, Observations, "observations", _TABLES, ObservationError)
+    observations = as_tables(observations)
+    wanted = 'chains of optics are needed, such as instruments.get("charis").chain() gives'
     for one in chain if isinstance(chain, (list, tuple)) else [chain]:
-        need_type(one, (Model, Train), "chain", _CHAINS, ChainError)
+        check_type("chain", one, (Model, Train), wanted, ChainError)
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
     positions = [None] * len(observations) if positions is None else list(positions)
     if not observations or len(chains) != len(observations) or len(positions) != len(observations):

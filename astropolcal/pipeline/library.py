@@ -42,10 +42,11 @@ from astropolcal.calibration.result.calibration import (
 )
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
-from astropolcal.exceptions import CalibrationFileError, InstrumentError, need_type
+from astropolcal.exceptions import CalibrationFileError, InstrumentError
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
+from astropolcal.words import check_type
 
 __all__ = ["Entry", "Library"]
 
@@ -161,7 +162,8 @@ class Library:
     def __init__(self, source, context=None):
         one = isinstance(source, (str, Path)) or hasattr(source, "__fspath__")
         if not one:
-            need_type(source, Iterable, "source", "a folder, a file or several are needed")
+            wanted = "a folder, a file or several are needed"
+            check_type("the source of calibrations", source, Iterable, wanted, CalibrationFileError)
         self.source = Path(source) if one else None
         if context is not None:
             if not one or not self.source.is_dir():

@@ -24,9 +24,9 @@ from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError, need_type
+from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import shown, steps
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_type, did_you_mean
 
 __all__ = ["LogPosterior", "sample"]
 
@@ -477,7 +477,7 @@ def sample(
     """
     emcee = need("emcee", "sampling")
     wanted = "what `calibrate` returns is needed"
-    need_type(calibration, Calibration, "calibration", wanted, FitError)
+    check_type("calibration", calibration, Calibration, wanted, FitError)
     measurement = calibration.live_measurement()
     weights = "given" if noise is not None else weighting_of(calibration).choice
     log_posterior = LogPosterior(measurement, noise=noise, parameters=parameters)
