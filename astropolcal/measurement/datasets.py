@@ -37,7 +37,7 @@ def as_tables(observations):
 def as_pairs(chain, observations, positions):
     """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
     observations = as_tables(observations)
-    wanted = 'chains of optics are needed, such as instruments.get("charis").chain() gives'
+    wanted = "chains of optics are needed, such as instruments.get(name).chain() gives"
     for one in chain if isinstance(chain, (list, tuple)) else [chain]:
         check_type("chain", one, (Model, Train), wanted, ChainError)
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)

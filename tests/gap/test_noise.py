@@ -184,11 +184,13 @@ def test_settings_that_saturate_the_sums():
 
 def test_settings_hold_the_plate_but_not_the_derotator_alone():
     found = channels.settings(ANGLES, F)
-    basis = np.linalg.qr(found)[0]
     both = np.cos(4 * ANGLES["hwp"] - 2 * ANGLES["derotator"])
-    np.testing.assert_allclose(basis @ (basis.T @ both), both, atol=1e-8)
     alone = np.cos(2 * ANGLES["derotator"])
-    assert np.linalg.norm(alone - basis @ (basis.T @ alone)) > 0.5
+    wanted = np.stack([both, alone], axis=1)
+    # regular plate angles make some columns the same: least squares know their rank
+    left = wanted - found @ np.linalg.lstsq(found, wanted)[0]
+    np.testing.assert_allclose(left[:, 0], 0, atol=1e-8)
+    assert np.linalg.norm(left[:, 1]) > 0.05 * np.linalg.norm(alone)
 
 
 @settings(max_examples=15, deadline=None)
