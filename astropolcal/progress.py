@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-How far long work is: one line of the terminal with how much is done, and the time left.
+How long work is done: in one thread, and with how much is done and the time left in one line.
 
 The line is written over, and erased at the end. It needs a terminal, and is asked for: by a
 function with ``progress=True``, or the command line without ``--quiet``, see `shown`.
@@ -12,6 +12,7 @@ import time
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
+from functools import wraps
 
 __all__ = []
 
@@ -97,3 +98,22 @@ def steps(items, unit, total=None, done=0):
         for item in items:
             yield item
             add()
+
+
+def in_one_thread(function):
+    """
+    Let a function that solves many small problems do so in one thread of BLAS.
+
+    More gain nothing there, and where other work takes the cores they wait for each other: 30
+    times as long, measured.
+    """
+
+    @wraps(function)
+    def limited(*arguments, **options):
+        # not above: what only loads a calibration needs no such package
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api="blas"):
+            return function(*arguments, **options)
+
+    return limited

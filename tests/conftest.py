@@ -51,9 +51,9 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Examples of docstrings and pages are slow; without slow tests each law has few examples."""
+    """Examples and long tests are slow; without slow tests each law has few examples."""
     for item in items:
-        if isinstance(item, pytest.DoctestItem):
+        if isinstance(item, pytest.DoctestItem) or item.get_closest_marker("long"):
             item.add_marker(pytest.mark.slow)
     if config.option.markexpr == "not slow":
         for item in items:

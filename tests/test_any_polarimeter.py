@@ -237,7 +237,7 @@ def test_the_table_survives_a_file(kind, tmp_path):
     np.testing.assert_allclose(one.observed, other.observed)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @every
 def test_pulls_are_one(kind):
     pulls, truth = [], Measurement(kind.chain(), observed(kind)).vector()
@@ -251,7 +251,7 @@ def test_pulls_are_one(kind):
     assert np.mean(pulls) == pytest.approx(0, abs=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @every
 def test_a_planted_fault_is_found_and_none_without_one(kind):
     assert diagnose(kind.chain(), observed(kind, seed=3), cross_validate=False).verdict == "none"

@@ -117,7 +117,7 @@ def test_tutorial_runs(path, in_folder, tmp_path):
 
 
 # that frames of the warming lamp are masked is said by a warning
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*frames masked:astropolcal.exceptions.AstropolcalWarning")
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_tutorial_runs_on_real_tables(path, in_folder, tmp_path, monkeypatch, shared_data):

@@ -423,7 +423,7 @@ def ended(desk):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", REASONS)
 def test_commands_that_cannot_write(kind, ended):
     if kind not in ended:

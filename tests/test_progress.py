@@ -5,9 +5,11 @@ import io
 import itertools
 from types import SimpleNamespace
 
+import astropy.units as u
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from astropolcal import progress
+from astropolcal import diagnose, half_wave_plate_cycles, instruments, progress, simulate
 
 
 class Terminal(io.StringIO):
@@ -83,3 +85,27 @@ def test_short_work_and_unwanted_lines_and_files_get_nothing(terminal, monkeypat
     with progress.shown():
         progress.stage("fitting")
     assert terminal.getvalue() == ""
+
+
+def test_small_problems_are_solved_in_one_thread():
+    """Threads that wait for each other took 30 times as long beside other work."""
+
+    def threads():
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    charis, inside = instruments.get("charis"), set()
+    wavelength = charis.wavelength[::8]
+    chain = charis.chain(derotator="linear", wavelength=wavelength)
+    frames = half_wave_plate_cycles(derotator=[45, 70, 95] * u.deg)
+    observations = simulate(chain, wavelength, frames, seed=1)
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        diagnose(
+            chain,
+            observations,
+            effects="beam_gain",
+            cells=False,
+            progress=lambda line: inside.update(threads()),
+        )
+        assert threads() == before
+    assert inside <= {1}

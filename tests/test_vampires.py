@@ -263,7 +263,7 @@ def test_calibration_recovers_the_retardances():
     assert np.sqrt(np.mean(found.residuals**2)) < 2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_model_for_all_filters_of_the_real_data(shared_data):
     files = sorted((shared_data / "data" / "vampires").glob("*.ecsv"))
     if not files:

@@ -23,6 +23,7 @@ from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.measurement.datasets import as_tables
+from astropolcal.progress import in_one_thread
 from astropolcal.words import counted, html
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
@@ -203,6 +204,7 @@ def _gap_of_fit(model):
     return 100 * float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
 
 
+@in_one_thread
 def diagnose(
     calibration,
     observations,

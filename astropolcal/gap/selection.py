@@ -254,9 +254,10 @@ def _worse(best, steps, history, groups):
 
 def _worsens(after, before, scatter):
     """Whether frames that were left out of the fit contradict a cause."""
-    better = after.better_than(before)
-    # among noise the evidence is to be trusted; among structure it has to hold elsewhere too
-    return better < (-2.0 if scatter < _STRUCTURED else 0.0)
+    # among noise the evidence is to be trusted; among structure it has to hold elsewhere too, by
+    # one standard error (Breiman et al. 1984, Classification and Regression Trees, Sec. 3.4.3)
+    least = -2.0 if scatter < _STRUCTURED else 1.0
+    return after.better_than(before) < least
 
 
 def _growing(best):

@@ -16,6 +16,7 @@ from astropolcal.calibration.posterior.samples import (
 from astropolcal.exceptions import ParameterError
 
 pytest.importorskip("arviz_stats")
+pytestmark = pytest.mark.samplers
 
 
 def _ar1(memory, n_steps=6000, n_walkers=20, seed=1):

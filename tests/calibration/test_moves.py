@@ -21,6 +21,7 @@ from astropolcal.calibration.posterior.samples import autocorrelation_times
 from astropolcal.exceptions import AstropolcalWarning, FitError
 
 emcee = pytest.importorskip("emcee")
+pytestmark = pytest.mark.samplers
 
 
 class Normal:
@@ -63,7 +64,7 @@ def run(target, moves, n_steps, n_walkers=None, start=1.0, seed=1):
     return sampler.get_chain(discard=n_steps // 3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_default_moves_keep_a_normal_distribution():
     for n in [3, 10, 60]:
         target = Normal(n)
@@ -71,7 +72,7 @@ def test_default_moves_keep_a_normal_distribution():
         assert target.whitened(chain).std() == pytest.approx(1, abs=0.02), n
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_default_moves_find_the_distribution_though_the_fit_is_wrong():
     """The steps around the fit then hardly help, but do no harm."""
     for mistaken in [0.5, 2.0]:

@@ -11,6 +11,7 @@ from astropolcal.calibration.posterior import Posterior
 from astropolcal.calibration.posterior.samples import autocorrelation, autocorrelation_time
 from astropolcal.exceptions import AstropolcalError, ParameterError
 
+pytestmark = pytest.mark.samplers
 NAMES, UNITS = ["hwp.theta", "wollaston.efficiency[0]"], [u.deg, None]
 CONVERGENCE = {"n_steps": 100, "burn_in": 10, "n_draws": 90}
 CONVERGENCE |= {key: [1.0] for key in ("times", "median", "lower", "upper", "std")}

@@ -17,7 +17,7 @@ from astropolcal.calibration.uncertainty import derived_data, derived_retardance
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.parameters import FreeParameters
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 ONE_SIGMA, TWO_SIGMA = (norm.cdf(k) - norm.cdf(-k) for k in (1, 2))
 LAM = [1.25, 1.65, 2.15] * u.um
 GAUGE = {

@@ -87,7 +87,7 @@ def test_what_changed_is_named(course, angles):
         assert abs(value - angle) < 4 * std < 0.4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_are_as_large_as_the_deviations():
     pulls, wrong = [], 0
     for seed in range(12):

@@ -32,6 +32,7 @@ NOISE = 0.01
 WAVELENGTH = [1.2, 1.6] * u.um
 FRAMES = half_wave_plate_cycles(derotator=[45, 70] * u.deg)
 WITH_PACKAGES = [pytest.importorskip(name) for name in ("emcee", "h5py")]
+pytestmark = pytest.mark.samplers
 
 
 def make_chain(retardance_free=True, **priors):
@@ -264,7 +265,7 @@ def test_walkers_start_within_bounds_where_the_fit_is_at_one():
     assert np.ptp(posterior.chain[0, :, 0]) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sampled_errors_are_those_of_the_covariance(full_rank):
     names = ["calibration_polarizer.theta", "derotator.retardance"]
     assert full_rank.identifiability.rank == len(full_rank.covariance)
@@ -279,7 +280,7 @@ def test_sampled_errors_are_those_of_the_covariance(full_rank):
     assert np.abs(centre / expected).max() < 0.35
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parameters_held_have_no_share_in_the_errors(full_rank):
     """With all else known, the thicknesses are better known than in the fit of all."""
     names = ["hwp.w_sio2", "hwp.w_mgf2"]
@@ -293,7 +294,7 @@ def test_parameters_held_have_no_share_in_the_errors(full_rank):
     assert (posterior.covariance.stds < full_rank.covariance.stds[rows]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_undetermined_direction_is_filled_by_its_prior():
     """Polarizer and half-wave plate turned together: only the prior keeps them apart."""
     chain = make_chain(retardance_free=False)
@@ -559,7 +560,7 @@ def check_kills(n_kills, path, request, rng):
     return kills
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
     path = tmp_path / "chain.h5"
     assert check_kills(KILLS, path, request, random.Random(1)) >= 2

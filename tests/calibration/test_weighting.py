@@ -457,7 +457,7 @@ def walk(cal, n=16_000, share=0.3):
     return np.array(samples[n // 10 :]) @ half.T / stds
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_posterior_of_dataset_3_agrees_with_its_fit(dataset_3):
     """Medians within 0.3 sigma and widths within 20 %; measured: 0.1 sigma and 7 %."""
     for weights in [None, "wavelength"]:

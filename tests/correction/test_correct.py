@@ -141,7 +141,7 @@ def test_pulls_of_noise(disk_frames, sky, charis):
     assert np.median(errors["q"]) <= np.median(correct(sky, frames).fractional_errors()["q"]) * 1.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
     """Systematic errors alone, noise off: each true instrument differs from the calibrated."""
     from astropolcal.correction.rows import RowModel
@@ -574,7 +574,7 @@ def test_systematic_errors_against_those_of_double_differences(calibration, char
     np.testing.assert_allclose(ours["u"], theirs[:, 1], rtol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*unstable lamp")
 def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
     """

@@ -136,7 +136,7 @@ def pulls_on_sky(cal, sky, rng):
     return np.array(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_claims_on_sky_cover_what_is_wrong():
     pulls = []
     for seed in range(N_CALIBRATIONS):

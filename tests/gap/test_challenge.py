@@ -65,7 +65,7 @@ def test_light_goes_through_the_chain_as_the_package_says():
                 np.testing.assert_allclose(flux, expected[..., 0, 0], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_kind_of_fault_stands_out_as_asked():
     for kind in sorted(set(KINDS) - {"none", "absorbed", "frame", "mechanism"}):
         data, _, case = make_challenge(5, kind=kind, setup=SMALL, snr=20)

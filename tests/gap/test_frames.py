@@ -185,7 +185,7 @@ def found_of(chain, observations):
     return harmful(suspect_frames(data.fitted(observations, [chain])))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cases_of_another_simulator(shared_data):
     for folder in ["gap-cases-2"]:
         root = shared_data / folder

@@ -25,7 +25,7 @@ from astropolcal.gap.model import thinned
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 CHARIS = instruments.get("charis")
 PARITY = {"mirror_flip", "mirror_flip_before_plate", "beams_swapped"}
 # what the derotator's retardance is taken for where it is held, next to its true name

@@ -118,7 +118,7 @@ def test_nothing_changed_is_said_where_it_was_asked():
     assert "Nothing changed between" in summary(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_of_three_runs_differs():
     runs = [*pair(names=("a", "b")), data.observed(with_cell(BEHIND), seed=9, name="c")]
     content = to_dict(diagnose(data.chain(), runs, changes=True))
@@ -147,7 +147,7 @@ def test_a_gain_of_one_run_that_drifts():
     assert found.remainder_p_value > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_an_optic_of_one_run_brought():
     parts = list(leaves(data.chain()))
     dichroic = LinearRetarder(name="dichroic", fixed={"retardance": True})

@@ -115,7 +115,7 @@ def test_a_law_of_any_form_is_one_cause():
     np.testing.assert_allclose(sizes, true["gap_beam_gain"].imbalance.value, atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pairs_that_a_greedy_search_gets_wrong():
     """Two of three causes that are one, and one of much freedom in place of two simple ones."""
     for number in (27, 3):

@@ -69,7 +69,7 @@ def group(model):
     return [one.name for one in near if one.evidence > ENOUGH]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_is_found_at_a_significance_of_thirty():
     for name in NEW:
         chains, data = clean(name)

@@ -13,6 +13,7 @@ from astropolcal.plotting import plot_corner, plot_traces
 
 MINUS = "\N{MINUS SIGN}"
 NAMES = ["hwp.w_sio2", "hwp.w_mgf2", "calibration_polarizer.theta"]
+pytestmark = pytest.mark.samplers
 
 
 def make_posterior(n_steps=1500, names=NAMES):

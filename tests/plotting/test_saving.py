@@ -27,6 +27,7 @@ from astropolcal.plotting import (
 from astropolcal.plotting.parameters import other_parameters, plot_parameters
 from astropolcal.plotting.residuals import plot_residuals
 
+pytestmark = pytest.mark.samplers
 DRAW = [
     plot_accuracy,
     plot_double_differences,

@@ -507,7 +507,7 @@ def on_sky(n_cycles, q, u_):
     return charis, chain, frames
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_internal_source_comes_back_unbiased(tmp_path):
     charis = instruments.get("charis")
     # 1056 fluxes: the mean of their pulls is known to 0.03
@@ -524,7 +524,7 @@ def test_internal_source_comes_back_unbiased(tmp_path):
     np.testing.assert_allclose(observations.frames["derotator"], frames["derotator"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     q, u_ = 0.008, -0.006
     charis, chain, frames = on_sky(4, q, u_)
@@ -542,7 +542,7 @@ def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     _polarization_agrees(chain, observations, charis, q, u_)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_aperture_correction_recovers_the_wings_and_the_polarization(tmp_path):
     """A Moffat star with a halo, of whose light a tenth lies outside of the apertures."""
     q, u_ = 0.008, -0.006

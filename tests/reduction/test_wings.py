@@ -73,7 +73,7 @@ def test_what_is_left_without_noise_is_far_below_the_errors():
         assert abs(bias.mean()) < 5e-4, profile
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fluxes_are_unbiased_with_honest_errors():
     """The error of the correction is common to a frame, so frames are what counts."""
     # of noise-free images those without a halo are better, as the test above shows

@@ -23,7 +23,7 @@ from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
 
 HEADER = {"INSTRUME": "CHARIS", "OBJECT": "HD 1", "FILTNAME": "Broadband", "EXPTIME": 30.0}
-OPTIONS = ("--any-date", "--centre", "5,5", "--size", 7, "--workers", 2)
+OPTIONS = ("--any-date", "--centre", "5,5", "--size", 7, "--workers", 1)
 N = 4
 
 
@@ -347,7 +347,7 @@ def test_bad_input(lab, tmp_path, capsys):
         assert message in lines[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_that_is_killed_loses_nothing(tmp_path):
     """Eight sequences: what a cluster gives is to the last bit what one process gives."""
     pytest.importorskip("distributed", reason="distributed is not installed")

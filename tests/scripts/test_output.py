@@ -29,7 +29,10 @@ COLUMNS = 80
 PARSER = build_parser()
 (CHOICES,) = (a.choices for a in PARSER._actions if isinstance(a, argparse._SubParsersAction))
 # as for a user: warnings are printed
-pytestmark = pytest.mark.filterwarnings("default::astropolcal.exceptions.AstropolcalWarning")
+pytestmark = [
+    pytest.mark.samplers,
+    pytest.mark.filterwarnings("default::astropolcal.exceptions.AstropolcalWarning"),
+]
 NIGHT = "--site subaru --night 2025-11-03"
 
 OUTPUTS = {

@@ -26,6 +26,7 @@ LONG, RUN = ([*WHAT, "--steps", steps] for steps in ("2400", "60"))
 # as for a user: warnings are printed
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.samplers,
     pytest.mark.filterwarnings("default::astropolcal.exceptions.AstropolcalWarning"),
 ]
 

@@ -67,7 +67,7 @@ from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs
 from astropolcal.measurement.parameters import ROUNDING, with_own
-from astropolcal.progress import stage
+from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
 from astropolcal.words import check_choice
@@ -93,6 +93,7 @@ _FEW, _LONG = 256, 4
 _WORTH = 3.0
 
 
+@in_one_thread
 def calibrate(
     chain,
     observations,

@@ -44,7 +44,7 @@ from astropolcal.files import atomic_path
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import stated_date
-from astropolcal.progress import stage, steps
+from astropolcal.progress import in_one_thread, stage, steps
 from astropolcal.words import check_choice, counted
 
 __all__ = ["RunsCalibration", "calibrate_runs"]
@@ -54,6 +54,7 @@ _WORSE = 1.2
 _RANK = 1e-12
 
 
+@in_one_thread
 def calibrate_runs(
     chains,
     runs,

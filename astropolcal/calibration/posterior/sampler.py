@@ -25,7 +25,7 @@ from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
-from astropolcal.progress import shown, steps
+from astropolcal.progress import in_one_thread, shown, steps
 from astropolcal.words import check_type, did_you_mean
 
 __all__ = ["LogPosterior", "sample"]
@@ -371,6 +371,7 @@ _FEWEST_WALKERS = 24
 _PARAMETERS_A_STEP_KEPT = 20
 
 
+@in_one_thread
 def sample(
     calibration,
     *,
