@@ -110,7 +110,9 @@ def in_one_thread(function):
 
     @wraps(function)
     def limited(*arguments, **options):
-        # not above: what only loads a calibration needs no such package
+        # not above: what only loads a calibration needs neither. scipy brings a BLAS of its own,
+        # which has to be there
+        import scipy.linalg  # noqa: F401
         from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1, user_api="blas"):

@@ -3,6 +3,9 @@
 
 import io
 import itertools
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -109,3 +112,22 @@ def test_small_problems_are_solved_in_one_thread():
         )
         assert threads() == before
     assert inside <= {1}
+
+
+def test_one_thread_is_that_of_scipy_too():
+    """It has a library of its own, which is not there before scipy is."""
+    code = """
+import numpy, sys
+from threadpoolctl import threadpool_info, threadpool_limits
+from astropolcal.progress import in_one_thread
+
+@in_one_thread
+def inside():
+    import scipy.linalg
+    return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+with threadpool_limits(2, user_api="blas"):
+    sys.exit(set(inside()) != {1})
+"""
+    free = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    assert subprocess.run([sys.executable, "-c", code], env=free, check=False).returncode == 0

@@ -158,7 +158,7 @@ class Channels:
 
 
 class _Lamp:
-    """Brightness of the lamp: a scale a wavelength, a drift common to all, and flicker."""
+    """Brightness of the lamp: a scale per wavelength, a drift common to all, and flicker."""
 
     def __init__(self, residual, weight, sequence, saturating):
         centred = residual - _mean(residual, weight, axis=1)[:, None]

@@ -384,7 +384,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     if not (dof > 0).any():
         raise FitError(
             f"the null channel has no degree of freedom left by the {null_model} null model; "
-            "two plate angles a derotator angle (constant) or six derotator angles a plate "
+            "two plate angles per derotator angle (constant) or six derotator angles per plate "
             "angle (smooth) are needed"
         )
     per_datum = [
@@ -395,8 +395,8 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     ]
     sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
     words = (
-        f"scatter of the null channel about the chain's null and a {null_model} term, an upper "
-        "limit; it includes photon and read noise, flicker, and a null that the chain lacks"
+        f"how far the null channel scatters beyond the null of the chain and a {null_model} term; "
+        "this is an upper limit: photon and read noise, flicker and what the chain lacks are in it"
     )
     return noise_of_cells(measurement, sigma, dof, "null channel", words)
 
