@@ -40,6 +40,7 @@ _MOST_SCORES = 8
 # ---- for machines ------------------------------------------------------------------------
 
 
+@progress.in_one_thread
 def to_dict(diagnosis):
     """
     Return a diagnosis as plain numbers, lists and strings, ready for JSON.

@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.progress import in_one_thread
 from astropolcal.scripts._common import (
     check_suffix,
     edit_chains,
@@ -83,6 +84,7 @@ files FILE * Input  observation tables (ECSV)
 """
 
 
+@in_one_thread
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
     from astropolcal.calibration.result.summary import to_dict

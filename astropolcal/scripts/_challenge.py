@@ -8,6 +8,7 @@ import sys
 from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, GapError
+from astropolcal.progress import in_one_thread
 from astropolcal.scripts._common import is_quiet, show, wrapped, write_json
 from astropolcal.units import plain_number
 from astropolcal.words import counted
@@ -60,6 +61,7 @@ def _range(text):
 TYPES = {"range": _range, "kinds": lambda text: text.split(",")}
 
 
+@in_one_thread
 def run(arguments):
     """Make, run or score challenges, print how they went and write what was asked for."""
     from astropolcal.gap.challenge import make_cases, run_challenge, score_cases

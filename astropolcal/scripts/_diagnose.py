@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
-from astropolcal.progress import stage
+from astropolcal.progress import in_one_thread, stage
 from astropolcal.scripts._common import (
     MODEL,
     PAGES,
@@ -65,6 +65,7 @@ files FILE * Input  observation tables (ECSV); before them may stand a calibrati
 """
 
 
+@in_one_thread
 def run(arguments):
     """Diagnose, print what came out and write what was asked for."""
     from astropolcal.gap import diagnose

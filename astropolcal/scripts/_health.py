@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal health``: how an instrument does, from all its calibrations."""
 
+from astropolcal.progress import in_one_thread
 from astropolcal.scripts._common import PAGES, check_suffix, give, printer, say_written, wrapped
 from astropolcal.words import counted
 
@@ -26,6 +27,7 @@ library DIR Input  folder of calibrations
 """
 
 
+@in_one_thread
 def run(arguments):
     """Say how the instruments do, and write the page."""
     import astropy.units as u

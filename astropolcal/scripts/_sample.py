@@ -8,6 +8,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
+from astropolcal.progress import in_one_thread
 from astropolcal.scripts._common import (
     check_suffix,
     is_quiet,
@@ -71,6 +72,7 @@ def _burn_in(text):
 TYPES = {"burn_in": _burn_in}
 
 
+@in_one_thread
 def run(arguments):
     """Sample, print what came out and write what was asked for."""
     from astropolcal.calibration import Calibration

@@ -38,7 +38,7 @@ from astropolcal.calibration.uncertainty.covariance import (
     white_covariance,
 )
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.progress import counting, shown
+from astropolcal.progress import counting, in_one_thread, shown
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
 from astropolcal.words import check_choice, did_you_mean
@@ -163,6 +163,7 @@ def _crossing(values, root, rise):
     return float(values[i - 1] + share * (values[i] - values[i - 1]))
 
 
+@in_one_thread
 def profile(calibration, name, values=None, n=21):
     """
     Return chi-square along one parameter, with all others refitted.
@@ -360,6 +361,7 @@ class Resampled:
         )
 
 
+@in_one_thread
 def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     """
     Refit resampled data, drawn in blocks of frames with replacement.
