@@ -1,7 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""
-Simulated observations: beam fluxes of any chain, with photon and read noise.
-"""
+"""Simulated observations: beam fluxes of any chain, with photon and read noise."""
 
 import astropy.units as u
 import numpy as np

@@ -1,7 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""
-`Observations`, the table of beam fluxes from which everything is calibrated.
-"""
+"""`Observations`, the table of beam fluxes from which everything is calibrated."""
 
 import dataclasses
 import hashlib

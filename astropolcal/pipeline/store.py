@@ -236,7 +236,7 @@ def fetch(url, folder, *, sha256):
     Examples
     --------
     >>> from astropolcal.pipeline import fetch
-    >>> fetch("file:///tmp/night.zip", "calibrations", sha256="none")
+    >>> fetch("https://example.org/night.zip", "calibrations", sha256="none")
     Traceback (most recent call last):
     ...
     astropolcal.exceptions.CalibrationFileError: sha256 = 'none'; 64 hexadecimal digits are needed
