@@ -9,10 +9,10 @@ function with ``progress=True``, or the command line without ``--quiet``, see `s
 import shutil
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ContextDecorator, contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
-from functools import wraps
+from threading import Lock
 
 __all__ = []
 
@@ -100,22 +100,30 @@ def steps(items, unit, total=None, done=0):
             add()
 
 
-def in_one_thread(function):
-    """
-    Let a function that solves many small problems do so in one thread of BLAS.
+class _OneThread(ContextDecorator):
+    """The first of all that run at a time sets the limit, and the last lifts it."""
 
-    More gain nothing there, and where other work takes the cores they wait for each other: 30
-    times as long, measured.
-    """
+    def __init__(self):
+        self.count, self.lock, self.limit = 0, Lock(), None
 
-    @wraps(function)
-    def limited(*arguments, **options):
+    def __enter__(self):
         # not above: what only loads a calibration needs neither. scipy brings a BLAS of its own,
         # which has to be there
         import scipy.linalg  # noqa: F401
         from threadpoolctl import threadpool_limits
 
-        with threadpool_limits(1, user_api="blas"):
-            return function(*arguments, **options)
+        with self.lock:
+            if not self.count:
+                self.limit = threadpool_limits(1, user_api="blas")
+            self.count += 1
 
-    return limited
+    def __exit__(self, *error):
+        with self.lock:
+            self.count -= 1
+            if not self.count:
+                self.limit.restore_original_limits()
+
+
+#: Decorator of what solves many small problems: more threads of BLAS gain nothing there, and where
+#: other work takes the cores they wait for each other.
+in_one_thread = _OneThread()

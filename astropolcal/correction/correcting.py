@@ -22,7 +22,7 @@ from astropolcal.exceptions import (
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
 from astropolcal.pipeline.tasks import ended_tasks
-from astropolcal.progress import counting, in_one_thread, shown
+from astropolcal.progress import counting, shown
 from astropolcal.words import check_choice, check_type
 
 __all__ = ["correct"]
@@ -40,7 +40,6 @@ _WAYS = {
 }
 
 
-@in_one_thread
 def correct(
     calibration,
     frames,

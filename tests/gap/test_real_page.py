@@ -57,8 +57,8 @@ def test_text_is_that_of_the_record():
     assert f"The beam switcher is found ({100 * first['probability']:.0f} %)" in page
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("number", [1, 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.long), 3])
 def test_numbers_are_those_of_the_code(script, shared_data, number):
     """Of both datasets alone; the script writes the record of all in the same way."""
     record = RECORD[f"dataset {number}"]

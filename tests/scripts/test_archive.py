@@ -194,7 +194,7 @@ def entries(out):
 @pytest.mark.slow
 def test_an_archive_is_corrected_and_gone_on_with(lab, tmp_path, capsys):
     out = tmp_path / "out"
-    status, summary = archive(lab, out)
+    status, summary = archive(lab, out, "--workers", 2)
     assert (status, summary["n_done"], summary["n_worked_on"]) == (0, N, N)
     assert capsys.readouterr().out == ""
     first = entries(out)
