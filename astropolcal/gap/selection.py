@@ -50,6 +50,8 @@ _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
 _PROMISING = 0.8
 # but this, where the freedom of the best costs more (log evidence): two simple ones may do better
 _HALF, _DEAR = 0.5, 30.0
+# the evidence ranks sets of at most so many causes, if these leave more than noise
+_BY_EVIDENCE = 2
 # names are asked for beside so many causes
 _NAMES = 2
 # and so many times as many where all of these are impossible
@@ -134,32 +136,48 @@ class _State:
         return alone and self.chosen[0].cost(1.0) > _DEAR
 
 
+@dataclass
+class _Task:
+    """What is asked: the model that lacks causes, from which to choose, and how it is checked."""
+
+    base: object
+    library: list
+    cells: bool
+    groups: tuple | None
+    say: object
+
+    def fitted(self, chosen, like, **how):
+        """Return the base with causes, fitted in full."""
+        return self.base.with_effects([one.recipe for one in chosen], like=like, **how)
+
+
 def select(base, library, groups, say, *, cells=True, changes=False):
     """Choose the causes that a model lacks."""
+    task = _Task(base, library, cells, groups, say)
     first = _scanned(base, library, cells)
     runs = count_runs(base.problem)
     most = _MOST if runs < 2 or not cells else _MOST // 2
-    best = _search(base, _State(base), library, first, say, cells, most)
+    best = _search(task, _State(base), first, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
         best = _apart(base, first, say)
-        best = _search(base, best, [], first, say, cells, _MOST_TOGETHER * runs)
+        best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, 0.0, [_errors(base, groups)])
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
-    best = _merged(base, best, library, say, cells)
-    best, scans = _exchanged(base, best, library, first, say, cells)
+    best = _merged(task, best)
+    best, scans = _exchanged(task, best, first)
     best = replace(best, model=best.model.polished())
     if changes:
         shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
         own = [one for one in best.chosen if one not in shared]
         best = replace(best, chosen=[*own, *shared])
-    best = _possible(base, best, scans)
-    best, steps, history = _checked(base, best, groups, say)
+    best = _possible(task, best, scans)
+    best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     unlisted = _unlisted(base, best, stable)
-    found = _grouped(base, best, steps, scans, unlisted, stable)
+    found = _grouped(task, best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, unlisted, history)
 
 
@@ -167,17 +185,17 @@ def _errors(model, groups):
     return None if groups is None else foreseen(model, groups)
 
 
-def _merged(base, best, library, say, cells):
+def _merged(task, best):
     """Return the set with two causes exchanged for one that does what both do."""
     if not _MERGED[0] <= len(best.chosen) <= _MERGED[1]:
         return best
     temper, found = max(1.0, best.model.mean_square), best
     for pair in combinations(best.chosen, 2):
-        say(f"as one cause: {' and '.join(one.effect.title for one in pair)}")
+        task.say(f"as one cause: {' and '.join(one.effect.title for one in pair)}")
         others = [one for one in best.chosen if one not in pair]
-        recipes = [one.recipe for one in others]
-        beside = base.with_effects(recipes, like=best.model, **_QUICK)
-        for one in _best_of(scan(beside, library, cells=cells, temper=temper), _FITTED[-1]):
+        beside = task.fitted(others, best.model, **_QUICK)
+        seen = scan(beside, task.library, cells=task.cells, temper=temper)
+        for one in _best_of(seen, _FITTED[-1]):
             model = beside.with_effects([one.recipe], **_QUICK)
             lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
             gained = sum(o.cost(temper) for o in pair) - one.cost(temper) - lost
@@ -192,7 +210,7 @@ def _best_of(found, most):
     return [found.freer(one, best) for one in best]
 
 
-def _possible(base, best, scans):
+def _possible(task, best, scans):
     """Return the set with causes of impossible size exchanged for the best that are possible."""
     for one in best.chosen:
         if best.model.is_physical(one.name):
@@ -203,7 +221,7 @@ def _possible(base, best, scans):
             if rival.name in others or rival.evidence < ENOUGH:
                 continue
             chosen = [rival if other is one else other for other in best.chosen]
-            model = base.with_effects([o.recipe for o in chosen], like=best.model)
+            model = task.fitted(chosen, best.model)
             if model.is_physical(rival.name):
                 evidence = best.evidence + rival.evidence - one.evidence
                 found.append((model.fit.chi2, rival.name, _State(model, chosen, evidence)))
@@ -214,21 +232,21 @@ def _possible(base, best, scans):
     return best
 
 
-def _checked(base, best, groups, say):
+def _checked(task, best):
     """
     Return the set without causes that left-out frames contradict.
 
     With it, what is left with one cause more each, and the errors on left-out frames.
     """
     while True:
-        say("left-out frames")
-        steps = [base.without(()), *_growing(best)]
-        history = [_errors(step, groups) for step in progress.steps(steps, "models")]
-        worse = _worse(best, steps, history, groups)
+        task.say("left-out frames")
+        steps = [task.base.without(()), *_growing(best)]
+        history = [_errors(step, task.groups) for step in progress.steps(steps, "models")]
+        worse = _worse(best, steps, history, task.groups)
         if not worse:
             return best, steps, history
         chosen = [one for i, one in enumerate(best.chosen) if i not in worse]
-        model = base.with_effects([o.recipe for o in chosen], like=best.model)
+        model = task.fitted(chosen, best.model)
         best = _State(model, chosen, best.evidence - sum(best.chosen[i].evidence for i in worse))
 
 
@@ -311,7 +329,7 @@ def _apart(base, first, say):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
         seen = _scanned(alone, [], True)
-        state = _search(alone, _State(alone), [], seen, say, True, _MOST_ALONE)
+        state = _search(_Task(alone, [], True, None, say), _State(alone), seen, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     names = {one.name for one in chosen}
@@ -352,19 +370,19 @@ def _in_run(candidate, name, probes):
     return replace(candidate, cell=cell.in_run(name))
 
 
-def _search(base, best, library, first, say, cells, most_causes):
+def _search(task, best, first, most_causes):
     """Return the best set of causes."""
     states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
-        say(f"looking for cause {k + 1}, at most {most_causes}")
+        task.say(f"looking for cause {k + 1}, at most {most_causes}")
         # what takes many causes has no names; they are asked for once more at the end
-        names = library if k <= _NAMES or not cells else ()
+        names = task.library if k <= _NAMES or not task.cells else ()
         for state in states:
             if state.outline not in known:
-                known[state.outline] = _scanned(state.model, names, cells)
-        instead = partial(_in_place, base, names, cells)
+                known[state.outline] = _scanned(state.model, names, task.cells)
+        instead = partial(_in_place, replace(task, library=names))
         fitted = []
         for several in (most, _MORE * most):
             # what is impossible is passed over, and is not the end of the search
@@ -374,13 +392,29 @@ def _search(base, best, library, first, say, cells, most_causes):
             if fitted:
                 break
         fitted.sort(key=lambda state: -state.evidence)
-        if not fitted or fitted[0].evidence < best.evidence + ENOUGH:
+        least = best.evidence + ENOUGH
+        if not fitted or fitted[0].evidence < least:
             break
+        if task.groups and k >= _BY_EVIDENCE:
+            fitted = _by_left_out_frames(fitted, least, task.groups)
         best, states = fitted[0], fitted[:width]
         if best.model.p_value > REMAINDER and not best.is_dear:
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
     return best
+
+
+def _by_left_out_frames(states, least, groups):
+    """
+    Return sets of causes in the order in which they foresee frames that are left out.
+
+    Evidence counts where a set leaves no more than noise. Where several causes leave more, none of
+    them is what it seems, and a set is as good as what it says of other frames.
+    """
+    if any(state.model.mean_square < _STRUCTURED for state in states):
+        return states
+    enough = [state for state in states if state.evidence >= least]
+    return sorted(enough, key=lambda state: foreseen(state.model, groups).percent)
 
 
 def _fitted(grown, instead):
@@ -439,16 +473,16 @@ def _extended(evidence, state, added, instead):
     return instead(impossible[0], _State(model, chosen, evidence))
 
 
-def _in_place(base, library, cells, one, state):
+def _in_place(task, one, state):
     """Return a set with the best that is possible in place of a cause, None if nothing is."""
     temper = max(1.0, state.model.mean_square)
-    found = scan(state.model, library, cells=cells, temper=temper, without=one.name)
+    found = scan(state.model, task.library, cells=task.cells, temper=temper, without=one.name)
     taken = {other.name for other in state.chosen}
     for rival in _best_of(found, _FITTED[-1]):
         if rival.name in taken or rival.evidence < ENOUGH:
             continue
         chosen = [rival if other is one else other for other in state.chosen]
-        model = base.with_effects([o.recipe for o in chosen], like=state.model, **_QUICK)
+        model = task.fitted(chosen, state.model, **_QUICK)
         if all(model.is_physical(other.name) for other in chosen):
             lost = 0.5 * (model.fit.chi2 - state.model.fit.chi2) / temper
             dearer = rival.cost(temper) - one.cost(temper)
@@ -456,7 +490,7 @@ def _in_place(base, library, cells, one, state):
     return None
 
 
-def _exchanged(base, best, library, first, say, cells):
+def _exchanged(task, best, first):
     """
     Return the set with every cause the best beside all the others, and the scans beside these.
 
@@ -466,25 +500,25 @@ def _exchanged(base, best, library, first, say, cells):
     scans, like = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
-        say("each cause beside all the others")
+        task.say("each cause beside all the others")
         for one in progress.steps(best.chosen[::-1], "causes"):
             others = [other for other in best.chosen if other is not one]
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
             found, is_near = first, False
             if others:
-                found, is_near = _beside(base, best, one, library, cells, like)
+                found, is_near = _beside(task, best, one, like)
             like = like or (found.probes if is_near else None)
             scans[one.name] = (others, found)
             if len(best.chosen) > _MOST:
                 # so many that none is sure: what each can be told from is all that is asked
                 continue
-            rivals = _rivals_beside(found, one, library)
+            rivals = _rivals_beside(found, one, task.library)
             # of many causes none is sure: the best rival is enough, and all stay
             few = len(best.chosen) <= _MERGED[1]
             if few and others and (not rivals or rivals[0].evidence < ENOUGH):
                 # the others do what it did
-                model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
+                model = task.fitted(others, best.model, **_QUICK)
                 lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2)
                 if lost < ENOUGH * max(1.0, best.model.mean_square):
                     best, like = _State(model, others, best.evidence - one.evidence), None
@@ -495,7 +529,7 @@ def _exchanged(base, best, library, first, say, cells):
                 if fresh.name in {other.name for other in others}:
                     continue
                 chosen = [fresh if o is one else o for o in best.chosen]
-                model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
+                model = task.fitted(chosen, best.model, **_QUICK)
                 if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
                     scans[fresh.name], like = scans.pop(one.name), None
                     best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
@@ -505,18 +539,18 @@ def _exchanged(base, best, library, first, say, cells):
     return best, {name: found for name, (_, found) in scans.items()}
 
 
-def _beside(base, best, one, library, cells, like):
+def _beside(task, best, one, like):
     """Return the evidence beside all other causes, and whether it is of the derivatives of all."""
     model = best.model
     temper = max(1.0, model.mean_square)
-    found = scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
+    ask = partial(scan, effects=task.library, cells=task.cells, temper=temper)
+    found = ask(model, without=one.name, like=like)
     own = max((c.statistic for c in found.candidates if c.name == one.name), default=0.0)
-    if own <= base.fit.chi2 - model.fit.chi2:
+    if own <= task.base.fit.chi2 - model.fit.chi2:
         return found, True
     # no cause does more than all of them: along an open direction it went too far for derivatives
-    recipes = [other.recipe for other in best.chosen if other is not one]
-    model = base.with_effects(recipes, like=model, **_QUICK)
-    return scan(model, library, cells=cells, temper=temper), False
+    others = [other for other in best.chosen if other is not one]
+    return ask(task.fitted(others, model, **_QUICK)), False
 
 
 def _rivals_beside(found, own, library):
@@ -579,11 +613,11 @@ def _may_wander(cell):
     )
 
 
-def _grouped(base, best, steps, scans, unlisted, stable):
+def _grouped(task, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
-        members = _members(one, scans[one.name], _refits(base, best, one))
+        members = _members(one, scans[one.name], _refits(task, best, one))
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
@@ -593,15 +627,18 @@ def _grouped(base, best, steps, scans, unlisted, stable):
     return found
 
 
-def _refits(base, best, chosen):
+def _refits(task, best, chosen):
     """Return what gives the loss of chi-square of a full fit with another in place of a cause."""
+    if len(best.chosen) > _MERGED[1]:
+        # none of so many is sure: derivatives tell what they are like
+        return None
     taken = {one.name for one in best.chosen if one is not chosen}
 
     def loss(other):
         if other.name in taken:
             return np.inf
-        recipes = [(other if one is chosen else one).recipe for one in best.chosen]
-        return base.with_effects(recipes, like=best.model, **_QUICK).fit.chi2 - best.model.fit.chi2
+        new = [other if one is chosen else one for one in best.chosen]
+        return task.fitted(new, best.model, **_QUICK).fit.chi2 - best.model.fit.chi2
 
     return loss
 
@@ -624,7 +661,8 @@ def _members(chosen, beside, loss):
         # where nothing but the usual sizes tells two apart, the data do not
         is_same = one.rank <= own.rank and one.statistic >= (1 - _SAME) * promised
         is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
-        if is_bent or ((is_same or weight >= _ALIAS) and one.size > farthest):
+        is_far = (is_same or weight >= _ALIAS) and one.size > farthest
+        if loss is not None and (is_bent or is_far):
             # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
