@@ -126,8 +126,7 @@ def join(optics):
     Raises
     ------
     ChainError
-        If there is no optic, something else than an optic, or two optics
-        share a name.
+        If there is no optic, something else than an optic, or two optics share a name.
 
     Examples
     --------

@@ -98,8 +98,7 @@ def polarimetric_efficiency(
     chain : Optic or `~astropy.modeling.CompoundModel`
         A calibrated chain, from the sky or of an internal source, see ``sky_path``.
     wavelength : `~astropy.units.Quantity`
-        Shape (n_wavelengths,); that of the chain's parameters where these are given per
-        wavelength.
+        Shape (n_wavelengths,); that of the chain's parameters where these are given per wavelength.
     derotator : `~astropy.units.Quantity`, optional
         Angle of the derotator, regardless of the name of its stage; needed if there is one. The
         angles broadcast against each other.

@@ -144,8 +144,7 @@ class IsotropicMaterial(_Ranged):
     measured_range : `~astropy.units.Quantity`
         The two ends of the wavelengths of the measurements of the law.
     valid_range : `~astropy.units.Quantity`, optional
-        The two ends between which the law is evaluated; the measured range
-        if left out.
+        The two ends between which the law is evaluated; the measured range if left out.
     doi : str
         Source of the law.
     aliases : tuple of str
@@ -189,9 +188,8 @@ class UniaxialMaterial(_Ranged):
     measured_range : `~astropy.units.Quantity`
         The two ends of the wavelengths of the measurements of the laws.
     valid_range : `~astropy.units.Quantity`, optional
-        The two ends between which the laws are evaluated; the measured range
-        if left out. Where it is wider, the material's own documentation says
-        why and at what cost.
+        The two ends between which the laws are evaluated; the measured range if left out. Where it
+        is wider, the material's own documentation says why and at what cost.
     doi : str
         Source of the laws.
     aliases : tuple of str
@@ -260,9 +258,8 @@ class BrendelBormannLaw:
 
     .. math:: \epsilon(\omega) = 1 - \frac{f_0\,\omega_p^2}{\omega(\omega + i\Gamma_0)}
               + \sum_j \frac{i\sqrt\pi f_j\,\omega_p^2}{2\sqrt2\,a_j\sigma_j}
-              \left[w\!\left(\frac{a_j - \omega_j}{\sqrt2\,\sigma_j}\right)
-              + w\!\left(\frac{a_j + \omega_j}{\sqrt2\,\sigma_j}\right)\right],
-              \qquad a_j^2 = \omega^2 + i\omega\Gamma_j
+              \left[w\!\left(\frac{a_j - \omega_j}{\sqrt2\,\sigma_j}\right) + w\!\left(\frac{a_j +
+              \omega_j}{\sqrt2\,\sigma_j}\right)\right], \qquad a_j^2 = \omega^2 + i\omega\Gamma_j
 
     with the Faddeeva function w: each resonance is a Lorentz oscillator whose
     frequency is spread as a Gaussian.

@@ -140,8 +140,7 @@ def rotate(matrix, angle):
     Raises
     ------
     ParameterError
-        If the matrix is not (..., 4, 4), or a value is not finite or has the
-        wrong unit.
+        If the matrix is not (..., 4, 4), or a value is not finite or has the wrong unit.
 
     Examples
     --------
@@ -227,8 +226,7 @@ def elliptical_retarder(horizontal, diagonal, circular):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (..., 4, 4), the arguments broadcast; smooth where the
-        retardance goes through zero.
+        Shape (..., 4, 4), the arguments broadcast; smooth where the retardance goes through zero.
 
     Raises
     ------

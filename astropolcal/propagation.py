@@ -2,18 +2,16 @@
 """
 Fluxes of both beams and their derivatives, for many frames and wavelengths.
 
-One forward sweep carries the Stokes vectors of all frames and wavelengths
-through the chain; one backward sweep carries the analyser rows (the adjoint)
-towards the source. The derivative to any parameter is then a product of the
-two at its optic, so that all derivatives together cost about as much as a
-few evaluations. Everything is on canonical floats.
+One forward sweep carries the Stokes vectors of all frames and wavelengths through the chain; one
+backward sweep carries the analyser rows (the adjoint) towards the source. The derivative to any
+parameter is then a product of the two at its optic, so that all derivatives together cost about as
+much as a few evaluations. Everything is on canonical floats.
 
-Light has shape (n_wavelengths, n_columns, 4); a column is a frame, and an axis has
-length 1 as long as nothing has depended on it. Q and U of a column lie side by side, so
-that they are also the complex number Q + iU, which a rotation of the frame by an angle
-multiplies by exp(-2i angle). Light is kept in the frame of the optic that it enters. The
-matrix of an optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, n_columns, 4, 4)
-where it changes from frame to frame.
+Light has shape (n_wavelengths, n_columns, 4); a column is a frame, and an axis has length 1 as long
+as nothing has depended on it. Q and U of a column lie side by side, so that they are also the
+complex number Q + iU, which a rotation of the frame by an angle multiplies by exp(-2i angle). Light
+is kept in the frame of the optic that it enters. The matrix of an optic has shape (n_wavelengths,
+4, 4), or (n_wavelengths, n_columns, 4, 4) where it changes from frame to frame.
 """
 
 import numpy as np

@@ -31,8 +31,7 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     Parameters
     ----------
     hwp : `~astropy.units.Quantity`
-        Angles of one cycle, in the order taken; by default the eight of the
-        CHARIS calibrations.
+        Angles of one cycle, in the order taken; by default the eight of the CHARIS calibrations.
     derotator : `~astropy.units.Quantity`
         Derotator angles, one cycle at each.
 

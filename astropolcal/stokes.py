@@ -2,10 +2,9 @@
 """
 Degree and angle of linear polarization, their errors and their bias.
 
-A Stokes vector is (I, Q, U, V) with Q = vertical - horizontal,
-U = (+45) - (-45) and V = right - left, so that the angle of linear
-polarization runs counter-clockwise from vertical when looking into the beam.
-Lower-case q, u are Q / I and U / I.
+A Stokes vector is (I, Q, U, V) with Q = vertical - horizontal, U = (+45) - (-45) and V = right -
+left, so that the angle of linear polarization runs counter-clockwise from vertical when looking
+into the beam. Lower-case q, u are Q / I and U / I.
 
 Bad input (a NaN, an intensity that is not positive, a negative error) raises
 `~astropolcal.exceptions.ParameterError`; it never comes back as a number.
@@ -111,8 +110,7 @@ def debias_dolp(dolp, sigma, method="mas"):
     Parameters
     ----------
     dolp : float or array_like
-        Measured degree of linear polarization, zero or positive. Noise may
-        lift it above 1.
+        Measured degree of linear polarization, zero or positive. Noise may lift it above 1.
     sigma : float or array_like
         Error of q and u, across the direction of polarization where they differ.
     method : {"mas", "wardle-kronberg"}
@@ -157,9 +155,8 @@ def aolp_interval(dolp, sigma, probability=0.6827):
     """
     Return the half-width of the AoLP interval of given probability.
 
-    Unlike the error to first order it holds at any signal-to-noise ratio: it grows to
-    ``90 deg * probability`` where the light is unpolarized and any angle is
-    as likely as any other.
+    Unlike the error to first order it holds at any signal-to-noise ratio: it grows to ``90 deg *
+    probability`` where the light is unpolarized and any angle is as likely as any other.
 
     Parameters
     ----------

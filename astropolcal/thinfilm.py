@@ -2,10 +2,9 @@
 r"""
 Reflection by a surface and by a stack of films: Fresnel and the characteristic matrix.
 
-Fields vary as :math:`e^{i(kz - \omega t)}`, so that an absorbing index is n + ik
-with positive k. The directions of s, p and of the light are right-handed before
-and after the reflection; at normal incidence :math:`r_p = -r_s`, and an ideal
-mirror has a retardance of 180 deg. The retardance is
+Fields vary as :math:`e^{i(kz - \omega t)}`, so that an absorbing index is n + ik with positive k.
+The directions of s, p and of the light are right-handed before and after the reflection; at normal
+incidence :math:`r_p = -r_s`, and an ideal mirror has a retardance of 180 deg. The retardance is
 :math:`\Delta = \arg r_p - \arg r_s`, the diattenuation
 :math:`\epsilon = (R_s - R_p)/(R_s + R_p)`.
 """
@@ -258,13 +257,11 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
     r"""
     Return the reflection by a mirror with any number of films.
 
-    The characteristic matrix of each film relates the tangential fields on its
-    sides,
+    The characteristic matrix of each film relates the tangential fields on its sides,
 
     .. math:: \begin{pmatrix}\cos\delta & -i\sin\delta/\eta\\
-              -i\eta\sin\delta & \cos\delta\end{pmatrix}, \qquad
-              \delta = \frac{2\pi}{\lambda} q d, \quad
-              \eta_s = q, \quad \eta_p = n^2/q,
+              -i\eta\sin\delta & \cos\delta\end{pmatrix}, \qquad \delta = \frac{2\pi}{\lambda} q d,
+              \quad \eta_s = q, \quad \eta_p = n^2/q,
 
     and the substrate has the fields :math:`(1, \eta)`.
 
@@ -277,8 +274,7 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
     substrate : str, material, or complex
         Name (see `~astropolcal.materials.get_material`), material, or index n + ik.
     films : sequence of (material, `~astropy.units.Quantity`)
-        Material (as ``substrate``) and thickness of each film, the first where the
-        light arrives.
+        Material (as ``substrate``) and thickness of each film, the first where the light arrives.
     ambient : float
         Real index upstream of the films.
 
@@ -296,8 +292,7 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
 
     References
     ----------
-    Abelès 1950, Ann. Phys. 12, 596; Born & Wolf 1999, Principles of Optics,
-    Sec. 1.6.
+    Abelès 1950, Ann. Phys. 12, 596; Born & Wolf 1999, Principles of Optics, Sec. 1.6.
 
     Examples
     --------

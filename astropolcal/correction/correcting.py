@@ -77,12 +77,11 @@ def correct(
         instrumental polarization that the calibration predicts, and takes the instrument for
         ideal in everything else, as `~astropolcal.correction.ideal_chain` makes it; for comparison.
     observable : {"intensity", "single", "double"}, optional
-        What is fitted: the beams, or their single or double differences and sums. Single beams
-        are fitted by their intensities. The
-        last are blind to what is the same in both frames of a pair, such as a gain that differs
-        between the beams. By default what the calibration fitted: single differences, or double
-        ones. Frames that have no pairs are fitted by their intensities, with a warning; frames
-        that belong to no pair are left out, with a warning.
+        What is fitted: the beams, or their single or double differences and sums. Single beams are
+        fitted by their intensities. The last are blind to what is the same in both frames of a
+        pair, such as a gain that differs between the beams. By default what the calibration fitted:
+        single differences, or double ones. Frames that have no pairs are fitted by their
+        intensities, with a warning; frames that belong to no pair are left out, with a warning.
     brightness : {"measured", "given"}, optional
         How bright the frames were: as their light says, or ``frames.scale`` and else all the same.
         By default measured where there is no ``frames.scale``. It is also taken as given, with a

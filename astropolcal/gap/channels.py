@@ -2,13 +2,12 @@
 """
 The two channels in which a model is compared with every frame.
 
-Double differences throw away what the optics downstream of the half-wave plate and
-the detector leave in the data. Two numbers per frame and wavelength keep nearly
-all of it: the difference normalized by the frame's own sum, which knows no
-lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
-The lamp is common to all wavelengths of a frame: its drift is a smooth curve
-through the run and its flicker a random shift of all wavelengths of a frame
-together, so that neither counts as a gap.
+Double differences throw away what the optics downstream of the half-wave plate and the detector
+leave in the data. Two numbers per frame and wavelength keep nearly all of it: the difference
+normalized by the frame's own sum, which knows no lamp, and the logarithm of the sum, compared up to
+the brightness of the lamp. The lamp is common to all wavelengths of a frame: its drift is a smooth
+curve through the run and its flicker a random shift of all wavelengths of a frame together, so that
+neither counts as a gap.
 
 A single beam has the sum only, and of the lamp nothing is known but that the frames of a group
 share its brightness, a number for each wavelength.

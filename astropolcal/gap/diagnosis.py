@@ -222,8 +222,7 @@ def diagnose(
     Parameters
     ----------
     calibration : Calibration, `~astropy.modeling.CompoundModel` or sequence of them
-        The nominal model: a calibration, or the chain of each dataset, which is
-        then calibrated.
+        The nominal model: a calibration, or the chain of each dataset, which is then calibrated.
     observations : Observations or sequence of Observations
         The datasets, used together.
     effects : "all" or sequence of str or Effect
@@ -235,8 +234,7 @@ def diagnose(
         Whether to ask what changed between several runs of the same kind of source: causes
         of one run only come first.
     cross_validate : bool
-        Whether to check on left-out frames; without it the gaps are those of
-        the fit itself.
+        Whether to check on left-out frames; without it the gaps are those of the fit itself.
     nested : bool
         Whether to choose the causes again without each group of frames, and predict that with
         them: the one measure of the shrinkage in which the choice has no part. It takes as many

@@ -2,13 +2,12 @@
 """
 Single frames whose data are not what the table says of them.
 
-A wave plate that did not reach its angle, two frames whose files were exchanged,
-or a beam that was clipped once bends the whole fit, and an optic is blamed for it.
-So frames are looked at first: each is left out in turn, at the cost of one linear
-step (the deletion residual of Cook & Weisberg 1982), and what stands out from
-noise and from all other frames is named, taken out, and the search goes on. A gap
-that is in all frames is none of theirs: without the few frames that are named the
-fit must be down to the noise, or have lost nearly all of its excess.
+A wave plate that did not reach its angle, two frames whose files were exchanged, or a beam that was
+clipped once bends the whole fit, and an optic is blamed for it. So frames are looked at first: each
+is left out in turn, at the cost of one linear step (the deletion residual of Cook & Weisberg 1982),
+and what stands out from noise and from all other frames is named, taken out, and the search goes
+on. A gap that is in all frames is none of theirs: without the few frames that are named the fit
+must be down to the noise, or have lost nearly all of its excess.
 """
 
 import copy

@@ -55,9 +55,8 @@ def to_dict(diagnosis):
     dict
         Keys ``verdict``, ``sentences``, ``nominal``, ``n_free``, ``seconds``,
         ``noise_floor_percent``, ``gap_before_percent``, ``gap_after_percent``,
-        ``shrinkage_percent``, ``where``, ``causes``, ``accuracy_before``,
-        ``accuracy_after``, ``next_observations`` and others; what is not a number
-        is None.
+        ``shrinkage_percent``, ``where``, ``causes``, ``accuracy_before``, ``accuracy_after``,
+        ``next_observations`` and others; what is not a number is None.
 
     Examples
     --------
@@ -268,9 +267,8 @@ def summary(diagnosis, written=()):
     Returns
     -------
     str
-        The summary, of at most 24 lines: a few sentences, a table of the causes, what to
-        observe next, and what was written. Below it each cause with its sizes, and where the
-        gap lies.
+        The summary, of at most 24 lines: a few sentences, a table of the causes, what to observe
+        next, and what was written. Below it each cause with its sizes, and where the gap lies.
 
     Examples
     --------
@@ -303,8 +301,7 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None):
     path : path-like
         The file; an existing one is replaced.
     figures : dict of str to `~matplotlib.figure.Figure`, optional
-        Figures by caption, such as those of `astropolcal.plotting`. They
-        become part of the page.
+        Figures by caption, such as those of `astropolcal.plotting`. They become part of the page.
     size_figures : dict of str to `~matplotlib.figure.Figure`, optional
         Figures by the name of an effect, shown with that cause.
 

@@ -2,15 +2,14 @@
 """
 Where the gap lies: in which wavelengths, angles, frames, beam and dataset.
 
-The whitened residuals of a fitted model are noise of unit variance, less the
-directions that model and lamp have absorbed. What exceeds that is divided in
-two ways. *Patterns* are functions of an axis (a harmonic of an angle, a trend,
-a product of two), with a law in wavelength that is smooth or, as a pair with
-the wavelength, free: they are taken in one after the other, the most telling
-first, and each has the share that those before it have left. *Places* are sets
-of data (a range of wavelengths, a derotator angle, a dataset) in which the
-residuals are larger than elsewhere, found by a scan statistic (Kulldorff 1997,
-doi:10.1080/03610929708831995), and the null channel, which holds several patterns.
+The whitened residuals of a fitted model are noise of unit variance, less the directions that model
+and lamp have absorbed. What exceeds that is divided in two ways. *Patterns* are functions of an
+axis (a harmonic of an angle, a trend, a product of two), with a law in wavelength that is smooth
+or, as a pair with the wavelength, free: they are taken in one after the other, the most telling
+first, and each has the share that those before it have left. *Places* are sets of data (a range of
+wavelengths, a derotator angle, a dataset) in which the residuals are larger than elsewhere, found
+by a scan statistic (Kulldorff 1997, doi:10.1080/03610929708831995), and the null channel, which
+holds several patterns.
 """
 
 from dataclasses import dataclass, field

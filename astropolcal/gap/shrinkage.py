@@ -38,8 +38,7 @@ class HeldOut:
     labels : list of str
         What was left out.
     squares : `~numpy.ndarray`
-        Sum of squared prediction errors of the normalized single difference,
-        one per group.
+        Sum of squared prediction errors of the normalized single difference, one per group.
     whitened : `~numpy.ndarray`
         Half the sum of squares of the whitened prediction errors of both channels.
     counts : `~numpy.ndarray`

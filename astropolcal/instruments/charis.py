@@ -5,11 +5,10 @@ Subaru/SCExAO/CHARIS, near-infrared integral-field spectropolarimeter.
 The chain, its starting values and the bounds follow the recalibration of
 McIntosh et al. (2026), and 't Hart et al. (2021) for the half-wave plate.
 
-Signs: with positive thicknesses the equation of the two-layer half-wave plate
-gives a *negative* retardance, near -172 deg, and the derotator that belongs to
-it has a negative horizontal and 45 deg retardance. The published values have
-both signs turned, (H, 45, R) to (-H, -45, R): an exact mirror solution, with
-the same double differences.
+Signs: with positive thicknesses the equation of the two-layer half-wave plate gives a *negative*
+retardance, near -172 deg, and the derotator that belongs to it has a negative horizontal and 45 deg
+retardance. The published values have both signs turned, (H, 45, R) to (-H, -45, R): an exact mirror
+solution, with the same double differences.
 """
 
 import astropy.units as u
@@ -136,9 +135,8 @@ class CHARIS(SubaruPolarimeter):
             the telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
             q and u are free parameters for each wavelength, in the frame of the sky.
         optics_in : sequence of str
-            Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip)
-            and ``"dichroic"`` (YJH50, as a retarder of zero retardance that
-            is fixed until you free it).
+            Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip) and ``"dichroic"``
+            (YJH50, as a retarder of zero retardance that is fixed until you free it).
         wavelength : `~astropy.units.Quantity`, optional
             Grid, by default the 22 broadband bins.
         derotator : {"elliptical", "linear", "kmirror"}
@@ -146,10 +144,9 @@ class CHARIS(SubaruPolarimeter):
             mirrors with films of silica: their thickness and factors on n and k of silver are
             free, the factors with normal priors of 0.5 and 0.1 around 1.
         bounds : {"physical", "paper"}
-            Retardances within 360 deg of zero, or within the paper's
-            bounds (0 to 360 deg in the published signs). Either way
-            thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
-            within 5 deg, efficiencies between 0 and 1.
+            Retardances within 360 deg of zero, or within the paper's bounds (0 to 360 deg in the
+            published signs). Either way thicknesses are within 0.6 to 1.4 of 't Hart's,
+            misalignments within 5 deg, efficiencies between 0 and 1.
         m3 : {"free", "power law", "metal"}
             Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
             permittivity, or silver with a film.
@@ -227,9 +224,8 @@ class CHARIS(SubaruPolarimeter):
         Parameters
         ----------
         observations : Observations
-            Its meta holds ``source``, ``nasmyth_beam_switcher`` (``installed``
-            or ``not installed``; else it is taken from ``date``) and
-            ``yjh50_dichroic`` (``in`` or ``out``).
+            Its meta holds ``source``, ``nasmyth_beam_switcher`` (``installed`` or ``not
+            installed``; else it is taken from ``date``) and ``yjh50_dichroic`` (``in`` or ``out``).
 
         Returns
         -------

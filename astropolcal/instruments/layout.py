@@ -90,11 +90,10 @@ class FileLayout:
     Parameters
     ----------
     keywords : dict of str to str
-        Column of the observation table to FITS keyword. Besides the columns
-        of angles: ``hwp_true`` (position of the half-wave plate, tracking
-        included), ``exposure_time``, ``mjd``, ``date``, ``time`` (of day, both
-        UTC), ``right_ascension``, ``declination``, ``object``, ``instrument``,
-        ``filter`` and ``pickoff``.
+        Column of the observation table to FITS keyword. Besides the columns of angles: ``hwp_true``
+        (position of the half-wave plate, tracking included), ``exposure_time``, ``mjd``, ``date``,
+        ``time`` (of day, both UTC), ``right_ascension``, ``declination``, ``object``,
+        ``instrument``, ``filter`` and ``pickoff``.
     shape : tuple of int
         Of a cube: wavelengths, rows, columns.
     cube_extension : int
@@ -170,9 +169,8 @@ class FileLayout:
         Whether the star has been moved to the middle of each beam, so that a correction need not
         find it.
     optics : dict of str to (str, dict of str to str)
-        What headers say of optics in the beam: key of the table's meta to (column,
-        {regular expression: word}). The first expression found in the column's text
-        gives the word.
+        What headers say of optics in the beam: key of the table's meta to (column, {regular
+        expression: word}). The first expression found in the column's text gives the word.
 
     Raises
     ------

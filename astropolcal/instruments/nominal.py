@@ -35,10 +35,9 @@ angle of the plate of 13.2 deg off the header until autumn 2009; a measurement i
 (NACO manual, as the public pipeline PIPPIN reads it, https://github.com/samderegt/PIPPIN-NACO).
 ``ESO ADA POSANG`` is the position angle of the instrument.
 
-Not known, and assumed or nominal here: the signs of these angles, the retardance of the plate
-(178 deg), the efficiency of the prism (0.99). The mirrors downstream of M3, which do not turn
-against the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not
-included.
+Not known, and assumed or nominal here: the signs of these angles, the retardance of the plate (178
+deg), the efficiency of the prism (0.99). The mirrors downstream of M3, which do not turn against
+the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not included.
 
 Keck II/NIRC2, near-infrared dual-beam polarimetry downstream of the adaptive optics.
 

@@ -10,13 +10,12 @@ public code reads of its frames. Not known, and nominal here: the efficiency of 
 (0.985), and what the adaptive optics do to polarized light. A double Wollaston prism gave each
 polarization twice: add the fluxes of the two images.
 
-IRCS, imaging and spectropolarimetry with adaptive optics: plate and derotator are in the wave
-plate unit of the Nasmyth platform. Its plate for 2 to 5 um (described in a paper of the
-polarimetric mode of IRCS in the thermal infrared, with efficiencies of 90 to 98 %) is another one
-and not included. Not known, and nominal here: the efficiency of its Wollaston prism (0.985), what
-the adaptive optics and the camera do to polarized light, and what the Nasmyth beam switcher
-changed for it. The keywords are those of the same plate and derotator in CHARIS; headers of IRCS
-have not been seen.
+IRCS, imaging and spectropolarimetry with adaptive optics: plate and derotator are in the wave plate
+unit of the Nasmyth platform. Its plate for 2 to 5 um (described in a paper of the polarimetric mode
+of IRCS in the thermal infrared, with efficiencies of 90 to 98 %) is another one and not included.
+Not known, and nominal here: the efficiency of its Wollaston prism (0.985), what the adaptive optics
+and the camera do to polarized light, and what the Nasmyth beam switcher changed for it. The
+keywords are those of the same plate and derotator in CHARIS; headers of IRCS have not been seen.
 
 SCExAO/Fast-PDI, polarimetry with a fast camera: the public pipeline fastpdi_dpp,
 https://github.com/scexao-org/fastpdi_dpp, has a polarizing beam splitter, a liquid crystal that

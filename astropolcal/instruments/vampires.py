@@ -296,13 +296,12 @@ class VAMPIRES(SubaruPolarimeter):
         """
         Return the chain of the internal source or a star, ready to be calibrated.
 
-        Free for all wavelengths are the orientations of polarizer, half-wave plate, derotator
-        and liquid crystal and its switching angle; for each wavelength the retardances of all
-        optics, the diattenuation of the relay optics, the efficiency of the beam splitter and
-        the unequal gains of the cameras. Where the data cannot tell them apart, normal priors
-        hold the liquid crystal near half a wave and 43 deg, the cameras near equal gains, the
-        derotator near a linear retarder, the relay optics near no retardance, and the efficiency
-        near 0.95.
+        Free for all wavelengths are the orientations of polarizer, half-wave plate, derotator and
+        liquid crystal and its switching angle; for each wavelength the retardances of all optics,
+        the diattenuation of the relay optics, the efficiency of the beam splitter and the unequal
+        gains of the cameras. Where the data cannot tell them apart, normal priors hold the liquid
+        crystal near half a wave and 43 deg, the cameras near equal gains, the derotator near a
+        linear retarder, the relay optics near no retardance, and the efficiency near 0.95.
 
         Parameters
         ----------

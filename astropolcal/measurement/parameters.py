@@ -2,18 +2,16 @@
 """
 Free parameters of one or several chains as one flat vector.
 
-Chains name their parameters ``optic.parameter``; equal names in several
-chains are the same parameter. A parameter with one value per wavelength
-becomes one number per wavelength of the common grid. Ties are linear and are
-applied here, so that the Jacobian stays exact.
+Chains name their parameters ``optic.parameter``; equal names in several chains are the same
+parameter. A parameter with one value per wavelength becomes one number per wavelength of the common
+grid. Ties are linear and are applied here, so that the Jacobian stays exact.
 
 Prior knowledge of parameters, used by fits and samplers alike.
 
-A prior sits in astropy's place for it, ``parameter.prior``: `Normal` or
-``Uniform`` with units, or any frozen scipy distribution of the value in the
-parameter's unit. For a fit a prior is one more datum, whose residual r obeys
-``r**2 / 2 = -log density`` up to a constant; where the density is zero there
-is a bound.
+A prior sits in astropy's place for it, ``parameter.prior``: `Normal` or ``Uniform`` with units, or
+any frozen scipy distribution of the value in the parameter's unit. For a fit a prior is one more
+datum, whose residual r obeys ``r**2 / 2 = -log density`` up to a constant; where the density is
+zero there is a bound.
 """
 
 import copy

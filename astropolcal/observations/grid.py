@@ -2,15 +2,13 @@
 """
 From rows of a table to arrays of frame and wavelength.
 
-Rows may come in any order and some may be absent. Here they are checked
-against each other, sorted into a grid of shape (F, W), and cells that cannot be
-used are masked with a reason.
+Rows may come in any order and some may be absent. Here they are checked against each other, sorted
+into a grid of shape (F, W), and cells that cannot be used are masked with a reason.
 
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
-Nothing is dropped: a masked frame stays in the table with its reason, and one warning
-per reason says how many there are and which. Single cells are
-judged while a table is read.
+Nothing is dropped: a masked frame stays in the table with its reason, and one warning per reason
+says how many there are and which. Single cells are judged while a table is read.
 """
 
 import re

@@ -2,12 +2,11 @@
 """
 What is compared with the model: differences of the two beams, with derivatives.
 
-Every observable is a small strategy object. Fluxes come as two arrays of shape
-``(k, W, P)``: ``k`` frames per datum (index 0 the plus frame, index 1 the minus
-frame, whose half-wave plate is 45 degrees further; of four frames see
-`NormalizedTripleDifference`), ``W`` wavelengths and ``P`` data. The derivatives
-are analytic, because a fit evaluates them at every step. The names X and I
-follow Sec. 2.2 of the CHARIS recalibration paper.
+Every observable is a small strategy object. Fluxes come as two arrays of shape ``(k, W, P)``: ``k``
+frames per datum (index 0 the plus frame, index 1 the minus frame, whose half-wave plate is 45
+degrees further; of four frames see `NormalizedTripleDifference`), ``W`` wavelengths and ``P`` data.
+The derivatives are analytic, because a fit evaluates them at every step. The names X and I follow
+Sec. 2.2 of the CHARIS recalibration paper.
 
 Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ, or both.
 

@@ -32,9 +32,8 @@ class Observations:
     """
     Beam fluxes of a series of frames, validated.
 
-    Make one with `read` or `from_table`; an instance does not change, and
-    `with_mask` and `select` return new ones. The table has one row per frame and
-    wavelength, in any order:
+    Make one with `read` or `from_table`; an instance does not change, and `with_mask` and `select`
+    return new ones. The table has one row per frame and wavelength, in any order:
 
     ============================== ========= =========================================
     column                         unit      meaning
@@ -53,9 +52,8 @@ class Observations:
                                              flc_state), the same in all its rows
     ============================== ========= =========================================
 
-    A cell whose flux or error is not a positive number, or that has no row, is
-    masked with a reason and a warning. Everything worse is an
-    `~astropolcal.exceptions.ObservationError`.
+    A cell whose flux or error is not a positive number, or that has no row, is masked with a reason
+    and a warning. Everything worse is an `~astropolcal.exceptions.ObservationError`.
 
     Attributes
     ----------
@@ -332,20 +330,18 @@ class Observations:
         ----------
         column : str
             A column with the unit of an angle, such as ``"hwp"``; or one of
-            `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has
-            come, from 0 in the first frame to 1 in the last (by the column ``time``
-            if it gives the time of every frame, else by the order);
-            ``"frame"``, its number from 0; ``"hwp_direction"`` and ``"derotator_direction"``, 1
-            where the last move of that stage was backwards, ``"hwp_move"`` and
-            ``"derotator_move"``, how far it went, in radian;
-            ``"flc_state"``, 0 or 1 for the states A and B of a modulator;
-            ``"parallactic_rate"`` and ``"derotator_rate"``, by how much that angle
-            changes from one frame to the next, in radian; ``"flux"``, the
-            fluxes of the beams in the unit of the table, 0 where masked;
-            ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the
-            fluxes over those of the frame taken before, 1 for the
-            first and where one of the two is masked. For laws of parameters also ``"time"``, a
-            Modified Julian Date (UTC), and ``"x"`` and ``"y"``, the place in the field in arcsec.
+            `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has come, from 0 in
+            the first frame to 1 in the last (by the column ``time`` if it gives the time of every
+            frame, else by the order); ``"frame"``, its number from 0; ``"hwp_direction"`` and
+            ``"derotator_direction"``, 1 where the last move of that stage was backwards,
+            ``"hwp_move"`` and ``"derotator_move"``, how far it went, in radian; ``"flc_state"``, 0
+            or 1 for the states A and B of a modulator; ``"parallactic_rate"`` and
+            ``"derotator_rate"``, by how much that angle changes from one frame to the next, in
+            radian; ``"flux"``, the fluxes of the beams in the unit of the table, 0 where masked;
+            ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the fluxes over
+            those of the frame taken before, 1 for the first and where one of the two is masked. For
+            laws of parameters also ``"time"``, a Modified Julian Date (UTC), and ``"x"`` and
+            ``"y"``, the place in the field in arcsec.
 
         Returns
         -------

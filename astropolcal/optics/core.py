@@ -2,11 +2,10 @@
 """
 What every optic is: an astropy model that takes light and gives light.
 
-An optic's inputs and outputs are the light, ``wavelength, I, Q, U, V``. What
-belongs to the optic is a parameter with unit, bounds and description. Its
-orientation is ``theta``, the installed angle that a calibration finds, plus
-the position of the stage named by ``mount``, which comes from each frame's
-header and is never a parameter.
+An optic's inputs and outputs are the light, ``wavelength, I, Q, U, V``. What belongs to the optic
+is a parameter with unit, bounds and description. Its orientation is ``theta``, the installed angle
+that a calibration finds, plus the position of the stage named by ``mount``, which comes from each
+frame's header and is never a parameter.
 """
 
 import inspect
@@ -403,8 +402,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         Returns
         -------
         dict of str to `~astropy.units.Quantity`
-            Parameter name to derivative, shape (..., 4, 4), in one over the
-            parameter's unit.
+            Parameter name to derivative, shape (..., 4, 4), in one over the parameter's unit.
 
         Raises
         ------

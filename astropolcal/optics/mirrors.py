@@ -178,11 +178,10 @@ class PowerLawMirror(_Mirror):
 
     .. math:: \epsilon = -10^{b_1}\lambda^{m_1} + i\,10^{b_2}\lambda^{m_2}
 
-    with :math:`\lambda` in metre (paper, Eq. for the physical model of M3, after
-    't Hart et al. 2021): straight lines in log-log space. The index is the root
-    of :math:`\epsilon`, and the reflection that of Fresnel. Only what a metal
-    looks like fixes the four numbers: :math:`m_1` = 2 and :math:`m_2` = 3 are those
-    of free electrons.
+    with :math:`\lambda` in metre (paper, Eq. for the physical model of M3, after 't Hart et al.
+    2021): straight lines in log-log space. The index is the root of :math:`\epsilon`, and the
+    reflection that of Fresnel. Only what a metal looks like fixes the four numbers: :math:`m_1` = 2
+    and :math:`m_2` = 3 are those of free electrons.
 
     Parameters
     ----------
@@ -393,10 +392,9 @@ class KMirror(_Metallic):
 
     Light meets the first and the last mirror at the angle of incidence
     :math:`\alpha` and the middle one at :math:`2\alpha - 90^\circ`, so that it
-    leaves along the line on which it came: 60, 30, 60 deg by default. The
-    amplitudes of the three multiply; together they are one
-    diattenuator-retarder that turns with its mount ('t Hart et al. 2021, who fit
-    the film of that of Subaru).
+    leaves along the line on which it came: 60, 30, 60 deg by default. The amplitudes of the three
+    multiply; together they are one diattenuator-retarder that turns with its mount ('t Hart et al.
+    2021, who fit the film of that of Subaru).
 
     Parameters
     ----------

@@ -2,10 +2,9 @@
 """
 Optics whose Mueller matrix changes from frame to frame.
 
-Their ``mount`` names what the matrix depends on: the angle of a stage
-(``"hwp"``), or how far the run has come (``"sequence"``, 0 to 1). At zero parameters each is
-the identity, so that it adds to a chain one way in which a real instrument
-departs from an ideal one.
+Their ``mount`` names what the matrix depends on: the angle of a stage (``"hwp"``), or how far the
+run has come (``"sequence"``, 0 to 1). At zero parameters each is the identity, so that it adds to a
+chain one way in which a real instrument departs from an ideal one.
 
 Optics that act in one state of a device, or on one beam of several.
 
@@ -59,10 +58,9 @@ class FrameOptic(Optic):
     """
     An optic whose matrix depends on the position of its mount.
 
-    A subclass gives ``_matrix(coordinate, *values)`` and ``_derivatives``. The
-    coordinate is the position of the mount (radian or a number, with the sign
-    of the mount); values and coordinate broadcast against each other. Without a
-    mount the coordinate is zero.
+    A subclass gives ``_matrix(coordinate, *values)`` and ``_derivatives``. The coordinate is the
+    position of the mount (radian or a number, with the sign of the mount); values and coordinate
+    broadcast against each other. Without a mount the coordinate is zero.
 
     See Also
     --------
@@ -204,10 +202,9 @@ class DriftRetarder(FrameOptic):
     r"""
     Linear retarder of any orientation whose retardance changes through the run.
 
-    The retardance vector is :math:`(h + \dot h x,\; d + \dot d x,\; 0)`, with x
-    from 0 in the first to 1 in the last frame. Fringes whose phase drifts with the
-    temperature are one, with a cosine and a sine of the wavenumber for each
-    parameter.
+    The retardance vector is :math:`(h + \dot h x,\; d + \dot d x,\; 0)`, with x from 0 in the first
+    to 1 in the last frame. Fringes whose phase drifts with the temperature are one, with a cosine
+    and a sine of the wavenumber for each parameter.
 
     Parameters
     ----------
@@ -299,9 +296,8 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     Transmission of the beams that varies with the position of a stage.
 
     :math:`1 \pm (a\cos nx + b\sin nx)`: dust or a wedge that turns with the
-    plate. Both beams alike, or (``differential``) with opposite signs, as where
-    the beams wander over a detector that is not flat (Tinyanont et al. 2019,
-    arXiv:1908.10409).
+    plate. Both beams alike, or (``differential``) with opposite signs, as where the beams wander
+    over a detector that is not flat (Tinyanont et al. 2019, arXiv:1908.10409).
 
     Parameters
     ----------
@@ -377,10 +373,9 @@ class FerroelectricLiquidCrystal(FrameOptic):
 
     .. math:: M_s = T(-s\alpha)\, R(\delta)\, T(s\alpha)
 
-    with the state s from the frame (``mount="flc_state"``): 0 in state A, 1 in state B
-    (Norris et al. 2015,
-    doi:10.1093/mnras/stu2529). A half-wave retarder with a switching angle
-    of 45 deg exchanges the two beams.
+    with the state s from the frame (``mount="flc_state"``): 0 in state A, 1 in state B (Norris et
+    al. 2015, doi:10.1093/mnras/stu2529). A half-wave retarder with a switching angle of 45 deg
+    exchanges the two beams.
 
     Parameters
     ----------

@@ -62,8 +62,7 @@ class Dependence:
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
     stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
     ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"dataset:NAME"``, in one
-    dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset
-    only.
+    dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset only.
     """
 
     text: str

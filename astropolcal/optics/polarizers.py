@@ -76,8 +76,7 @@ class Diattenuator(Optic):
     diattenuation : float or array_like
         :math:`\epsilon`, between -1 and 1.
     theta : `~astropy.units.Quantity`
-        Orientation of the axis of higher transmission (for positive
-        diattenuation).
+        Orientation of the axis of higher transmission (for positive diattenuation).
 
     Examples
     --------

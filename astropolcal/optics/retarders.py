@@ -140,19 +140,16 @@ class EllipticalRetarder(Optic):
     Elliptical retarder (paper, :math:`M_\mathrm{ER}`; Chipman et al. 2018).
 
     .. math:: M = \begin{pmatrix}1&0&0&0\\
-              0&C + T\Delta_H^2&T\Delta_H\Delta_{45} + S\Delta_R&
-              T\Delta_H\Delta_R - S\Delta_{45}\\
-              0&T\Delta_H\Delta_{45} - S\Delta_R&C + T\Delta_{45}^2&
-              T\Delta_{45}\Delta_R + S\Delta_H\\
-              0&T\Delta_H\Delta_R + S\Delta_{45}&T\Delta_{45}\Delta_R - S\Delta_H&
-              C + T\Delta_R^2\end{pmatrix}
+              0&C + T\Delta_H^2&T\Delta_H\Delta_{45} + S\Delta_R& T\Delta_H\Delta_R - S\Delta_{45}\\
+              0&T\Delta_H\Delta_{45} - S\Delta_R&C + T\Delta_{45}^2& T\Delta_{45}\Delta_R +
+              S\Delta_H\\ 0&T\Delta_H\Delta_R + S\Delta_{45}&T\Delta_{45}\Delta_R - S\Delta_H& C +
+              T\Delta_R^2\end{pmatrix}
 
     with :math:`\Delta^2 = \Delta_H^2 + \Delta_{45}^2 + \Delta_R^2`,
     :math:`C = \cos\Delta`, :math:`S = \sin\Delta/\Delta` and
     :math:`T = (1 - \cos\Delta)/\Delta^2`. The retardance vector
     :math:`d = (\Delta_H, \Delta_{45}, \Delta_R)` turns (Q, U, V) by :math:`|d|` about
-    its own direction. Written with S and T it is exact and smooth through zero
-    retardance.
+    its own direction. Written with S and T it is exact and smooth through zero retardance.
 
     Parameters
     ----------
@@ -263,9 +260,8 @@ class Rotator(Optic):
     .. math:: T(\Theta) = \begin{pmatrix}1&0&0&0\\0&\cos2\Theta&\sin2\Theta&0\\
               0&-\sin2\Theta&\cos2\Theta&0\\0&0&0&1\end{pmatrix}
 
-    with :math:`\Theta` = ``theta`` + position of the mount (paper, Sec. 4.1).
-    The sky chain of CHARIS is ``Rotator(mount="parallactic") | m3 |
-    Rotator(mount="-altitude")``.
+    with :math:`\Theta` = ``theta`` + position of the mount (paper, Sec. 4.1). The sky chain of
+    CHARIS is ``Rotator(mount="parallactic") | m3 | Rotator(mount="-altitude")``.
 
     Parameters
     ----------

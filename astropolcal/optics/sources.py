@@ -69,11 +69,10 @@ class PolarizedSource(Optic):
 
     .. math:: M = \begin{pmatrix}1&0&0&0\\q&0&0&0\\u&0&0&0\\0&0&0&0\end{pmatrix}
 
-    Light of any polarization leaves with the same intensity and the
-    normalized Stokes parameters q and u: an ideal depolarizer, then a source of that
-    polarization. It stands first in the chain of a star. Its frame is that
-    of what follows; before ``Rotator(mount="parallactic")`` q and u are those of the
-    sky, with angles from north through east.
+    Light of any polarization leaves with the same intensity and the normalized Stokes parameters q
+    and u: an ideal depolarizer, then a source of that polarization. It stands first in the chain of
+    a star. Its frame is that of what follows; before ``Rotator(mount="parallactic")`` q and u are
+    those of the sky, with angles from north through east.
 
     Parameters
     ----------

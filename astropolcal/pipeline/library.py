@@ -5,9 +5,8 @@ A library is a folder of calibration files, or some files. Each says for which
 instrument, mode, optics in the beam and dates it holds, and of those that hold
 the newest is taken. What is ambiguous is an error, never a choice.
 
-An index beside the files of a folder tells what each holds for, so that a look-up
-reads one file of many. It only proposes: what is chosen is read, and has to be what
-the index says.
+An index beside the files of a folder tells what each holds for, so that a look-up reads one file of
+many. It only proposes: what is chosen is read, and has to be what the index says.
 """
 
 import errno

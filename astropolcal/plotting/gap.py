@@ -57,9 +57,8 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     """
     Draw the gap by wavelength, before and after, with the noise floor.
 
-    One row per dataset, the difference of the beams at the left and the sum at
-    the right, less the lamp's drift and flicker; of the fits, not of left-out
-    frames.
+    One row per dataset, the difference of the beams at the left and the sum at the right, less the
+    lamp's drift and flicker; of the fits, not of left-out frames.
 
     Parameters
     ----------

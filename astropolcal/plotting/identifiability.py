@@ -58,20 +58,18 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     r"""
     Draw what the data determine, and along which directions they determine little.
 
-    (a) The singular values of the whitened derivative of the data, with parameters in
-    steps of a degree, a micrometre or a percent; those below the threshold of the
-    rank are open directions. On the right stands the standard error along each
-    direction. (b) What takes part in each open direction and in the most
-    weakly determined ones; a direction has length 1, and parameters given
-    per wavelength are summed in squares. (c) How well the half-wave-plate angles tell
-    harmonics apart.
+    (a) The singular values of the whitened derivative of the data, with parameters in steps of a
+    degree, a micrometre or a percent; those below the threshold of the rank are open directions. On
+    the right stands the standard error along each direction. (b) What takes part in each open
+    direction and in the most weakly determined ones; a direction has length 1, and parameters given
+    per wavelength are summed in squares. (c) How well the half-wave-plate angles tell harmonics
+    apart.
 
     Parameters
     ----------
     calibration : Calibration or Identifiability
         What was found. A calibration that was read from a file has no angles, and an
-        ``Identifiability`` alone has no
-        errors: panels then show what there is.
+        ``Identifiability`` alone has no errors: panels then show what there is.
     weakest : int
         How many of the determined directions to show, those with the largest errors; more
         where more are called badly determined.
@@ -385,10 +383,9 @@ def plot_correlations(calibration, *, figure=None):
     """
     Draw the correlation matrix of the free parameters.
 
-    Parameters given per wavelength form a block, short wavelengths first;
-    those common to all wavelengths are drawn wider. Parameters without an error,
-    because the data do not determine them or because they sit at a bound, have no
-    correlations: they are listed below the matrix.
+    Parameters given per wavelength form a block, short wavelengths first; those common to all
+    wavelengths are drawn wider. Parameters without an error, because the data do not determine them
+    or because they sit at a bound, have no correlations: they are listed below the matrix.
 
     Parameters
     ----------

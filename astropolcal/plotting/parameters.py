@@ -194,11 +194,10 @@ def plot_retardances(calibration, *, figure=None):
     """
     Draw the retardances of every retarder against wavelength.
 
-    Parameters given per wavelength are points: filled with an error bar where
-    the data determine them alone, hollow where they trade off with others,
-    squared where they sit at a bound. A law in wavelength is a line with its
-    1 sigma band; where the calibration has two-step stages, the retardances
-    fitted for each wavelength are dots beside it.
+    Parameters given per wavelength are points: filled with an error bar where the data determine
+    them alone, hollow where they trade off with others, squared where they sit at a bound. A law in
+    wavelength is a line with its 1 sigma band; where the calibration has two-step stages, the
+    retardances fitted for each wavelength are dots beside it.
 
     Parameters
     ----------
@@ -219,8 +218,7 @@ def plot_retardances(calibration, *, figure=None):
 
     Notes
     -----
-    The figures of the derotator's and the half-wave plate's retardance of
-    McIntosh et al. (2026).
+    The figures of the derotator's and the half-wave plate's retardance of McIntosh et al. (2026).
 
     Examples
     --------

@@ -52,10 +52,9 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
 
     Notes
     -----
-    Contours hold 39, 86 and 99 % of the samples, 1, 2 and 3 sigma of a normal
-    distribution of two parameters; dashed lines are the quantiles 0.16, 0.5 and
-    0.84. Given are the autocorrelation time of each parameter, in steps, and the
-    correlation coefficient r of each pair.
+    Contours hold 39, 86 and 99 % of the samples, 1, 2 and 3 sigma of a normal distribution of two
+    parameters; dashed lines are the quantiles 0.16, 0.5 and 0.84. Given are the autocorrelation
+    time of each parameter, in steps, and the correlation coefficient r of each pair.
 
     Examples
     --------

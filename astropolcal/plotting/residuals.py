@@ -178,11 +178,10 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     """
     Draw observed and modelled differences against the derotator angle, or a star's altitude.
 
-    One pair of panels per wavelength: above the observed data and the model,
-    evaluated between the data too; below their difference in percent. Stars are drawn
-    against their altitude, by the commanded angle of the half-wave plate. Where
-    another stage than the derotator moves within a series, the model is drawn
-    at the data only.
+    One pair of panels per wavelength: above the observed data and the model, evaluated between the
+    data too; below their difference in percent. Stars are drawn against their altitude, by the
+    commanded angle of the half-wave plate. Where another stage than the derotator moves within a
+    series, the model is drawn at the data only.
 
     Parameters
     ----------

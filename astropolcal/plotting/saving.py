@@ -36,9 +36,8 @@ def save_all(calibration, folder):
     """
     Write every figure that a calibration allows as PNG files.
 
-    Figures for which the chain has no such optic, or the calibration no data
-    (when it was read from a file), are left out. Each file appears complete
-    or not at all; existing ones are replaced.
+    Figures for which the chain has no such optic, or the calibration no data (when it was read from
+    a file), are left out. Each file appears complete or not at all; existing ones are replaced.
 
     Where the calibration has a posterior, ``corner.png`` shows the parameters
     common to all wavelengths, and ``traces.png`` these and, as far as there is
@@ -54,19 +53,16 @@ def save_all(calibration, folder):
     Returns
     -------
     list of `~pathlib.Path`
-        The files: of ``double_differences.png`` (``double_differences_2.png``
-        for the second dataset, and so on), ``residuals.png``,
-        ``accuracy.png``, ``targets.png``, ``mirrors.png``, ``star.png`` (one per star that
-        was checked), ``retardances.png``, ``efficiency.png``,
-        ``correlations.png``, ``identifiability.png``,
-        ``other_parameters.png``, ``traces.png`` and ``corner.png`` those that
-        could be drawn.
+        The files: of ``double_differences.png`` (``double_differences_2.png`` for the second
+        dataset, and so on), ``residuals.png``, ``accuracy.png``, ``targets.png``, ``mirrors.png``,
+        ``star.png`` (one per star that was checked), ``retardances.png``, ``efficiency.png``,
+        ``correlations.png``, ``identifiability.png``, ``other_parameters.png``, ``traces.png`` and
+        ``corner.png`` those that could be drawn.
 
     Warns
     -----
     AstropolcalWarning
-        If a figure of the posterior cannot be drawn, for instance as corner is
-        not installed.
+        If a figure of the posterior cannot be drawn, for instance as corner is not installed.
 
     Raises
     ------

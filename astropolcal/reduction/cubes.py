@@ -67,8 +67,7 @@ class ImageModel:
     halo_fwhm : float or `~astropy.units.Quantity`
         Full width of the halo at half maximum.
     centre : (float, float), optional
-        Place of the star in the left beam, 0-based x and y; by default the
-        middle of the field.
+        Place of the star in the left beam, 0-based x and y; by default the middle of the field.
     motion : float or `~astropy.units.Quantity`
         Standard deviation of the place from frame to frame, in x and in y.
     seeing : float
@@ -242,8 +241,7 @@ def simulate_cubes(
     Parameters
     ----------
     directory : path-like
-        Folder for the cubes, made if only it is absent; raw headers go to its
-        folder ``raw``.
+        Folder for the cubes, made if only it is absent; raw headers go to its folder ``raw``.
     chain : `~astropy.modeling.CompoundModel`
         The true chain, with a beam splitter.
     instrument : Instrument
@@ -261,10 +259,9 @@ def simulate_cubes(
     stokes : sequence of float
         Stokes vector of the light that enters the chain.
     flux : float or array_like
-        Flux that enters the chain, in adu; scalar or one value per wavelength. Of
-        the internal source, what enters through an area as large as an aperture of
-        the layout. By default 1e7, or what lights the brightest pixel to half of the
-        saturation where that is less.
+        Flux that enters the chain, in adu; scalar or one value per wavelength. Of the internal
+        source, what enters through an area as large as an aperture of the layout. By default 1e7,
+        or what lights the brightest pixel to half of the saturation where that is less.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
     image : ImageModel, optional

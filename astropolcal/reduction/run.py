@@ -186,8 +186,7 @@ def reduce_run(
     """
     Measure both beams in the cubes of a run, and keep what was found on the way.
 
-    A file that cannot be used never stops the run: it is left out, and listed
-    with the reason.
+    A file that cannot be used never stops the run: it is left out, and listed with the reason.
 
     Parameters
     ----------
@@ -196,10 +195,9 @@ def reduce_run(
     instrument : Instrument or str
         Or its name.
     source : str
-        ``"internal"`` or ``"star"`` choose the photometry. What the table says of
-        the source may be given at once: ``"polarized"``, ``"unpolarized"``,
-        ``"unpolarized standard star"``. With ``"internal"`` it is ``polarized`` or
-        ``unpolarized`` where the fluxes leave no doubt.
+        ``"internal"`` or ``"star"`` choose the photometry. What the table says of the source may be
+        given at once: ``"polarized"``, ``"unpolarized"``, ``"unpolarized standard star"``. With
+        ``"internal"`` it is ``polarized`` or ``unpolarized`` where the fluxes leave no doubt.
     raw : path-like, optional
         Folder of raw frames, whose headers are looked into by frame number.
     dark, flat : path-like, optional

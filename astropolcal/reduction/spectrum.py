@@ -32,11 +32,10 @@ def spectra_from_table(table):
     Parameters
     ----------
     table : `~astropy.table.QTable`
-        Columns ``wavelength``, ``intensity``, ``q``, ``u``, optionally ``v``, and
-        their standard deviations (``intensity_err``, ...); optionally
-        ``covariance_qu``, ``intensity_systematic``, ... and ``mask``. Or the table of
-        a correction (`astropolcal.correction`), with ``I``, ``q_statistical``, ...;
-        rows that are not ``determined`` are masked.
+        Columns ``wavelength``, ``intensity``, ``q``, ``u``, optionally ``v``, and their standard
+        deviations (``intensity_err``, ...); optionally ``covariance_qu``, ``intensity_systematic``,
+        ... and ``mask``. Or the table of a correction (`astropolcal.correction`), with ``I``,
+        ``q_statistical``, ...; rows that are not ``determined`` are masked.
 
     Returns
     -------

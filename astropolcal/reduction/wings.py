@@ -2,10 +2,9 @@
 """
 The light of a star outside of its apertures, from the profile of its image.
 
-What an aperture measures lacks the wings beyond it, and the wings in the ring
-are taken for background. A field stop cuts them before they reach the
-detector. So the light outside cannot be summed; a profile is fitted to the
-part that is seen, and integrated.
+What an aperture measures lacks the wings beyond it, and the wings in the ring are taken for
+background. A field stop cuts them before they reach the detector. So the light outside cannot be
+summed; a profile is fitted to the part that is seen, and integrated.
 
 References
 ----------

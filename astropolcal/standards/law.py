@@ -72,9 +72,8 @@ class SerkowskiLaw(Fittable1DModel):
               \exp\left[-K \ln^2(\lambda_\mathrm{max} / \lambda)\right], \qquad
               \theta(\lambda) = \theta + \rho\,(\lambda - \lambda_\mathrm{max})
 
-    The model returns the degree; `q`, `u` and `stokes` also use the angle.
-    ``theta`` and ``rotation`` are fixed by default, because a fit to degrees
-    does not constrain them.
+    The model returns the degree; `q`, `u` and `stokes` also use the angle. ``theta`` and
+    ``rotation`` are fixed by default, because a fit to degrees does not constrain them.
 
     Parameters
     ----------
@@ -102,9 +101,8 @@ class SerkowskiLaw(Fittable1DModel):
 
     References
     ----------
-    Serkowski, Mathewson & Ford 1975, ApJ 196, 261, doi:10.1086/153410;
-    Wilking et al. 1980, ApJ 235, 905; Whittet et al. 1992, ApJ 386, 562,
-    doi:10.1086/171039.
+    Serkowski, Mathewson & Ford 1975, ApJ 196, 261, doi:10.1086/153410; Wilking et al. 1980, ApJ
+    235, 905; Whittet et al. 1992, ApJ 386, 562, doi:10.1086/171039.
 
     Examples
     --------
@@ -228,10 +226,9 @@ class SerkowskiLaw(Fittable1DModel):
         wavelength : `~astropy.units.Quantity`
             Any shape.
         covariance : mapping or array-like, optional
-            Standard errors by the names of parameters, as quantities where the
-            parameter has a unit; or a covariance matrix in the parameters' units,
-            of all five in the order of ``param_names`` or of those that are
-            neither fixed nor tied, as a fitter returns it.
+            Standard errors by the names of parameters, as quantities where the parameter has a
+            unit; or a covariance matrix in the parameters' units, of all five in the order of
+            ``param_names`` or of those that are neither fixed nor tied, as a fitter returns it.
 
         Returns
         -------

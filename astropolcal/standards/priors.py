@@ -407,9 +407,8 @@ class StandardStar:
         Measurements: ``band, wavelength, p, p_err, theta, theta_err, reference,
         doi, via, checked``.
     law : SerkowskiLaw or None
-        For a polarized star whose parameters are published; `interstellar` has one for
-        every polarized star. A law published without its angle has that of the
-        measurements.
+        For a polarized star whose parameters are published; `interstellar` has one for every
+        polarized star. A law published without its angle has that of the measurements.
     law_errors : dict
         Standard errors of the law's parameters, all five or none.
     spectral_type, law_reference, law_doi, note : str
@@ -511,11 +510,10 @@ class StandardStar:
 
         Notes
         -----
-        What is published of the star counts first. What is not is that of the
-        interstellar medium on average: lambda_max = 0.545 +- 0.08 um, K = 0.01 + 1.66
-        lambda_max / um +- 0.1, an angle that turns by 0 +- 3 deg/um. The law goes
-        through the measurements by weighted least squares, and errors are never
-        smaller than the scatter of bands and sources.
+        What is published of the star counts first. What is not is that of the interstellar medium
+        on average: lambda_max = 0.545 +- 0.08 um, K = 0.01 + 1.66 lambda_max / um +- 0.1, an angle
+        that turns by 0 +- 3 deg/um. The law goes through the measurements by weighted least
+        squares, and errors are never smaller than the scatter of bands and sources.
 
         References
         ----------
@@ -547,12 +545,11 @@ class StandardStar:
         r"""
         Return how far q and u of an unpolarized star may be from zero, and why: ``value, words``.
 
-        A measured degree overestimates the true one, :math:`E[p^2] = P^2 + 2\sigma^2`, and P has
-        an unknown direction, so that q and u have the variance :math:`P^2/2 + \sigma^2 =
-        \max(p^2/2, \sigma^2)` each. Of several measurements the best gives :math:`\sigma`, and all
-        together give P. It is at least 0.01 %, and 0.1 % where no source states an error.
-        Interstellar polarization is smaller in the near infrared; that of a circumstellar disk
-        need not be.
+        A measured degree overestimates the true one, :math:`E[p^2] = P^2 + 2\sigma^2`, and P has an
+        unknown direction, so that q and u have the variance :math:`P^2/2 + \sigma^2 = \max(p^2/2,
+        \sigma^2)` each. Of several measurements the best gives :math:`\sigma`, and all together
+        give P. It is at least 0.01 %, and 0.1 % where no source states an error. Interstellar
+        polarization is smaller in the near infrared; that of a circumstellar disk need not be.
         """
         return unpolarized_error(self)
 

@@ -122,11 +122,9 @@ class TelescopeInformation:
     Parameters
     ----------
     names : tuple of str
-        ``star_q``, ``star_u``, ``diattenuation``; with an offset also
-        ``offset_q``, ``offset_u``.
+        ``star_q``, ``star_u``, ``diattenuation``; with an offset also ``offset_q``, ``offset_u``.
     covariance : `~numpy.ndarray`
-        In the order of ``names``; rows and columns of what the frames cannot
-        separate are infinite.
+        In the order of ``names``; rows and columns of what the frames cannot separate are infinite.
 
     Examples
     --------
@@ -163,21 +161,18 @@ def telescope_information(
     :math:`\psi`, while the diattenuation :math:`D` of the mirror stays along q:
 
     .. math::
-        q' = q \cos 2\psi + u \sin 2\psi + D, \qquad
-        u' = -q \sin 2\psi + u \cos 2\psi .
+        q' = q \cos 2\psi + u \sin 2\psi + D, \qquad u' = -q \sin 2\psi + u \cos 2\psi .
 
-    With an offset, the instrument adds a constant in its own frame, which
-    is turned by minus the altitude as in the chain of an alt-azimuth telescope's
-    Nasmyth focus. Each frame is taken to measure q' and u' with the same
-    error; the covariance is that of linear least squares. For a star that is not
-    known and without an offset,
+    With an offset, the instrument adds a constant in its own frame, which is turned by minus the
+    altitude as in the chain of an alt-azimuth telescope's Nasmyth focus. Each frame is taken to
+    measure q' and u' with the same error; the covariance is that of linear least squares. For a
+    star that is not known and without an offset,
 
     .. math:: \sigma_D = \sigma_\mathrm{frame} \big/ \sqrt{n (1 - R^2)}, \qquad
               R = \left|\frac1n \sum e^{2 i \psi}\right| ,
 
-    so only the spread of the parallactic angle counts: a half turn of the double
-    angle is all that one can wish for, and a star that barely rotates does
-    not constrain it.
+    so only the spread of the parallactic angle counts: a half turn of the double angle is all that
+    one can wish for, and a star that barely rotates does not constrain it.
 
     Parameters
     ----------
@@ -186,11 +181,9 @@ def telescope_information(
     altitude : `~astropy.units.Quantity`, optional
         One per frame; needed with ``offset``.
     frame_error : float
-        Standard error of q and of u in one frame. The default of 1 gives errors
-        in units of it.
+        Standard error of q and of u in one frame. The default of 1 gives errors in units of it.
     star_error : float, optional
-        Standard error of the star's q and u in a catalogue; by default the star
-        is not known.
+        Standard error of the star's q and u in a catalogue; by default the star is not known.
     offset : bool
         Whether an offset of the instrument is determined as well.
 
@@ -483,12 +476,11 @@ def search(
     Returns
     -------
     `~astropy.table.QTable`
-        ``name, kind, ra, dec, magnitude, magnitude_band, p, p_err`` (p in ``band``
-        or in the band nearest to V, from the law for a star without measurement),
-        with a center ``separation``, with a night ``altitude_min,
-        altitude_max, parallactic_min, parallactic_max, hours, transit, m3_error,
-        m3_score``. The order is that of the score, else of the separation, else of
-        right ascension. It may be empty.
+        ``name, kind, ra, dec, magnitude, magnitude_band, p, p_err`` (p in ``band`` or in the band
+        nearest to V, from the law for a star without measurement), with a center ``separation``,
+        with a night ``altitude_min, altitude_max, parallactic_min, parallactic_max, hours, transit,
+        m3_error, m3_score``. The order is that of the score, else of the separation, else of right
+        ascension. It may be empty.
 
     Raises
     ------
@@ -497,12 +489,11 @@ def search(
 
     Notes
     -----
-    ``m3_error`` is the standard error of a telescope's diattenuation, in units
-    of the error of one frame, from 32 frames spread over the observable hours, the
-    star's polarization unknown (`telescope_information`). ``m3_score`` multiplies
-    it by :math:`10^{0.2 (m - 10)}`, how much the photon noise exceeds that of
-    a star of magnitude 10. The smaller it is, the better the star fixes the
-    diattenuation, provided that it does not saturate the detector.
+    ``m3_error`` is the standard error of a telescope's diattenuation, in units of the error of one
+    frame, from 32 frames spread over the observable hours, the star's polarization unknown
+    (`telescope_information`). ``m3_score`` multiplies it by :math:`10^{0.2 (m - 10)}`, how much the
+    photon noise exceeds that of a star of magnitude 10. The smaller it is, the better the star
+    fixes the diattenuation, provided that it does not saturate the detector.
 
     Examples
     --------

@@ -135,13 +135,12 @@ def calibrate(
         differences, of tables without a column ``hwp`` single ones, and of single beams the
         intensity.
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
-        Noise of the data, which sets their weights and the scale of all
-        errors. None: one level for all data, from the residuals (the default,
-        as the errors of real tables are rarely complete). ``"wavelength"``: one
-        level for each wavelength of each dataset, from the residuals, with the
-        fit repeated until both agree. ``"errors"``: the errors of the tables.
-        Or the noise itself, its standard deviation as one value, one
-        per wavelength or one per datum.
+        Noise of the data, which sets their weights and the scale of all errors. None: one level for
+        all data, from the residuals (the default, as the errors of real tables are rarely
+        complete). ``"wavelength"``: one level for each wavelength of each dataset, from the
+        residuals, with the fit repeated until both agree. ``"errors"``: the errors of the tables.
+        Or the noise itself, its standard deviation as one value, one per wavelength or one per
+        datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
     own : sequence of str, or dict of str to sequence
@@ -150,8 +149,7 @@ def calibrate(
         shared. In all groups but the first the name of the group is added to that of the optic. The
         full summary says which of them really differ.
     positions : sequence of dict, optional
-        Position of every stage for each dataset, see
-        `~astropolcal.measurement.Measurement`.
+        Position of every stage for each dataset, see `~astropolcal.measurement.Measurement`.
     wavelength : `~astropy.units.Quantity`, optional
         Grid of the parameters given per wavelength.
     search : bool, optional
@@ -186,13 +184,11 @@ def calibrate(
     Raises
     ------
     FitError
-        If there is nothing to fit, fewer data than free parameters, the
-        weights are asked for where the table has no errors, the residuals of a
-        wavelength tell no noise, a parameter starts outside its bounds, or the two-step
-        strategy has no polarized source.
+        If there is nothing to fit, fewer data than free parameters, the weights are asked for where
+        the table has no errors, the residuals of a wavelength tell no noise, a parameter starts
+        outside its bounds, or the two-step strategy has no polarized source.
     ChainError, ObservationError, ParameterError
-        If chain and observations do not fit together, or a noise given is not
-        a possible one.
+        If chain and observations do not fit together, or a noise given is not a possible one.
 
     Examples
     --------

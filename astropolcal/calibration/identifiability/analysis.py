@@ -81,11 +81,10 @@ class Identifiability:
         Discrete mirror solutions within the bounds; and the other hand of the whole instrument,
         which bounds may exclude but no datum does, where it matters on sky.
     near_null : list of dict
-        Directions that are determined so badly that it hardly counts: at the
-        noise of the fit some parameter is uncertain by more than 5 deg, 0.05 mm
-        or 5 %, or the singular value is more than 1e4 times below the largest.
-        ``words``, the ``parameters`` with their change at one standard error,
-        and what that is on ``sky`` for the worst six. Priors count as data here.
+        Directions that are determined so badly that it hardly counts: at the noise of the fit some
+        parameter is uncertain by more than 5 deg, 0.05 mm or 5 %, or the singular value is more
+        than 1e4 times below the largest. ``words``, the ``parameters`` with their change at one
+        standard error, and what that is on ``sky`` for the worst six. Priors count as data here.
     branches : list of dict
         Of each of ``mirrors`` the ``words``, and what it does on ``sky``, or None.
 

@@ -133,8 +133,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
         Electrons per unit of flux. With it the errors of the table, if any, are
         left aside: the variance of a flux F is F / gain + (read_noise / gain)^2.
     read_noise : float
-        Standard deviation per beam and frame in electrons, all pixels of the
-        aperture together.
+        Standard deviation per beam and frame in electrons, all pixels of the aperture together.
 
     Returns
     -------
@@ -234,9 +233,8 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     Returns
     -------
     ``NoiseEstimate``
-        It includes all that differs between repeated data: photon and read noise,
-        flicker, repeatability of the stages, drifts; but nothing that is the same
-        in all of them.
+        It includes all that differs between repeated data: photon and read noise, flicker,
+        repeatability of the stages, drifts; but nothing that is the same in all of them.
 
     Raises
     ------
@@ -327,13 +325,12 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     r"""
     Return the noise from the double sum of normalized differences.
 
-    With :math:`x = (R - L)/(R + L)` of the frames of a pair, 45 deg of
-    half-wave plate apart, the double difference is :math:`(x^+ - x^-)/2` and the
-    null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
-    the null has next to none, while independent noise of the frames is the same
-    in both. Taken away from z are what the chain predicts of it (a plate that is not
-    exactly half a wave, with a retarder downstream of it, leaves some signal there),
-    a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
+    With :math:`x = (R - L)/(R + L)` of the frames of a pair, 45 deg of half-wave plate apart, the
+    double difference is :math:`(x^+ - x^-)/2` and the null :math:`z = (x^+ + x^-)/2`. The plate
+    turns the sign of the signal, so the null has next to none, while independent noise of the
+    frames is the same in both. Taken away from z are what the chain predicts of it (a plate that is
+    not exactly half a wave, with a retarder downstream of it, leaves some signal there), a multiple
+    of :math:`x^2` at each wavelength (what beams unequal by e add,
     :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
     :math:`\sqrt2` times the scatter of what is left.
 
@@ -351,11 +348,10 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     Returns
     -------
     ``NoiseEstimate``
-        An upper limit: besides photon and read noise and flicker that changes
-        the ratio of the beams it includes anything else makes the null change
-        with the plate and is not in the chain, such as diattenuation. For strongly
-        polarized light that exceeds the noise; the smooth null model takes
-        away most of it. A change of the source's brightness cancels in x.
+        An upper limit: besides photon and read noise and flicker that changes the ratio of the
+        beams it includes anything else makes the null change with the plate and is not in the
+        chain, such as diattenuation. For strongly polarized light that exceeds the noise; the
+        smooth null model takes away most of it. A change of the source's brightness cancels in x.
 
     Raises
     ------

@@ -1,15 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Checkpoints of a sampler: one HDF5 file that a kill at any moment leaves usable.
 
-Everything in the file is allocated when it is made (under a temporary name),
-so that a run writes raw numbers in place and never touches the structure of
-the file. First the new rows of the chain go out and are synced, then a record
-that counts them, in one of two places in turn; a torn record does not match
-its CRC and the other one holds.
+Everything in the file is allocated when it is made (under a temporary name), so that a run writes
+raw numbers in place and never touches the structure of the file. First the new rows of the chain go
+out and are synced, then a record that counts them, in one of two places in turn; a torn record does
+not match its CRC and the other one holds.
 
-HDF5 writes nothing to a disk itself: where that fails it cannot close the file
-any more, and takes the process with it. It makes the structure in memory, and
-says at which bytes the numbers are.
+HDF5 writes nothing to a disk itself: where that fails it cannot close the file any more, and takes
+the process with it. It makes the structure in memory, and says at which bytes the numbers are.
 """
 
 import errno

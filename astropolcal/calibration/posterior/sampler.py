@@ -51,9 +51,8 @@ class LogPosterior:
     noise : float, `~astropy.units.Quantity` or array_like, optional
         Noise to use instead: one value, one per wavelength, or one per datum.
     parameters : sequence of str, optional
-        What varies, ``"hwp.w_sio2"`` (all its values) or
-        ``"derotator.horizontal[3]"``; all others keep their fitted values. By
-        default everything varies.
+        What varies, ``"hwp.w_sio2"`` (all its values) or ``"derotator.horizontal[3]"``; all others
+        keep their fitted values. By default everything varies.
 
     Raises
     ------
@@ -398,34 +397,28 @@ def sample(
     parameters : sequence of str, optional
         What varies, see ``LogPosterior``; by default all free parameters.
     noise : float, `~astropy.units.Quantity` or array_like, optional
-        Noise of the data, see ``LogPosterior``; by default the noise that the
-        fit assumed.
+        Noise of the data, see ``LogPosterior``; by default the noise that the fit assumed.
     n_walkers : int, optional
         At least twice the number of parameters (the default, or 24 if more).
     n_steps : int
         Steps of each walker, in total: a run that resumes does what is left.
     thin : int, optional
-        Every how many steps one is kept, by default a twentieth of the number
-        of parameters.
+        Every how many steps one is kept, by default a twentieth of the number of parameters.
     burn_in : int, optional
-        Steps to leave out at the start; by default 5 autocorrelation times, at
-        most half of all.
+        Steps to leave out at the start; by default 5 autocorrelation times, at most half of all.
     seed : int, optional
         Makes the run repeatable.
     checkpoint : path-like, optional
         HDF5 file that the run is written to.
     checkpoint_every : int
-        Number of kept steps between two writes, which is the most that a
-        killed run loses.
+        Number of kept steps between two writes, which is the most that a killed run loses.
     resume : bool
-        Whether to go on from a checkpoint that exists; otherwise it is
-        replaced.
+        Whether to go on from a checkpoint that exists; otherwise it is replaced.
     progress : bool
         Whether to show how far it is; on a terminal only.
     moves : object or list, optional
-        Moves of emcee. By default a mixture of preconditioned Crank-Nicolson
-        steps around the fit, which are large where the posterior is nearly
-        normal, and of differential evolution.
+        Moves of emcee. By default a mixture of preconditioned Crank-Nicolson steps around the fit,
+        which are large where the posterior is nearly normal, and of differential evolution.
 
     Returns
     -------
@@ -434,8 +427,7 @@ def sample(
     Warns
     -----
     AstropolcalWarning
-        If the chain is shorter than 50 autocorrelation times, or the walkers
-        do not agree.
+        If the chain is shorter than 50 autocorrelation times, or the walkers do not agree.
 
     Raises
     ------
@@ -451,13 +443,11 @@ def sample(
 
     Notes
     -----
-    The walkers start in a normal ball around the fit, with the covariance of
-    the data and priors where these determine it to 5 deg, micrometre or
-    percent, and 0.3 of these wide where they do not. Method: Foreman-Mackey
-    et al. (2013), doi:10.1086/670067; moves: Goodman & Weare (2010),
-    doi:10.2140/camcos.2010.5.65, Nelson et al. (2014),
-    doi:10.1088/0067-0049/210/1/11, and Cotter et al. (2013),
-    doi:10.1214/13-STS421.
+    The walkers start in a normal ball around the fit, with the covariance of the data and priors
+    where these determine it to 5 deg, micrometre or percent, and 0.3 of these wide where they do
+    not. Method: Foreman-Mackey et al. (2013), doi:10.1086/670067; moves: Goodman & Weare (2010),
+    doi:10.2140/camcos.2010.5.65, Nelson et al. (2014), doi:10.1088/0067-0049/210/1/11, and Cotter
+    et al. (2013), doi:10.1214/13-STS421.
 
     Examples
     --------

@@ -259,8 +259,7 @@ class Posterior:
         Kept steps to leave out at the start, by default 5 autocorrelation
         times, at most half of all.
     convergence : Convergence, optional
-        What the whole run says of itself, where the chain is a part of it
-        after the burn-in.
+        What the whole run says of itself, where the chain is a part of it after the burn-in.
 
     Raises
     ------
@@ -528,10 +527,9 @@ class Posterior:
         Returns
         -------
         `~astropy.table.QTable`
-            ``name``, ``unit``, ``median``, 16 % quantile ``lower``, 84 %
-            quantile ``upper``, ``std``, autocorrelation time ``tau`` in steps,
-            rank-normalized split ``r_hat`` over the walkers, and effective
-            sample sizes ``ess_bulk`` and ``ess_tail``.
+            ``name``, ``unit``, ``median``, 16 % quantile ``lower``, 84 % quantile ``upper``,
+            ``std``, autocorrelation time ``tau`` in steps, rank-normalized split ``r_hat`` over the
+            walkers, and effective sample sizes ``ess_bulk`` and ``ess_tail``.
 
         Raises
         ------
@@ -555,12 +553,11 @@ class Posterior:
         Returns
         -------
         dict
-            ``converged``, ``words``, ``n_steps``, ``n_walkers``, ``burn_in``
-            (in steps), ``n_samples`` (after the burn-in), ``acceptance``
-            (least and largest), ``seed``, ``settings``, and for each of
-            ``parameters`` its ``unit``, ``fitted`` value, ``median``,
-            ``lower``, ``upper``, ``std``, ``autocorrelation_time``,
-            ``r_hat``, ``ess_bulk`` and ``ess_tail``; not-a-number as None.
+            ``converged``, ``words``, ``n_steps``, ``n_walkers``, ``burn_in`` (in steps),
+            ``n_samples`` (after the burn-in), ``acceptance`` (least and largest), ``seed``,
+            ``settings``, and for each of ``parameters`` its ``unit``, ``fitted`` value, ``median``,
+            ``lower``, ``upper``, ``std``, ``autocorrelation_time``, ``r_hat``, ``ess_bulk`` and
+            ``ess_tail``; not-a-number as None.
         """
         found = self.convergence
         columns = {"fitted": self.fitted, "autocorrelation_time": found.times}

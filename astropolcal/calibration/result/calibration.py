@@ -200,9 +200,8 @@ class Calibration:
             All of its datasets, in any order. They are recognized by their
             content, not by their names.
         positions : dict or sequence of dict, optional
-            Position of every stage for each of them, see
-            `~astropolcal.measurement.Measurement`; by default as the
-            calibration's instrument reads it, or the columns of the tables.
+            Position of every stage for each of them, see `~astropolcal.measurement.Measurement`; by
+            default as the calibration's instrument reads it, or the columns of the tables.
 
         Returns
         -------
@@ -282,9 +281,8 @@ class Calibration:
         Parameters
         ----------
         groups : `~numpy.ndarray` or str, optional
-            Group of each datum, or what makes a group, ``"derotator"``,
-            ``"cycle"`` (of the half-wave plate) or ``"dataset"``; by
-            default its derotator angle.
+            Group of each datum, or what makes a group, ``"derotator"``, ``"cycle"`` (of the
+            half-wave plate) or ``"dataset"``; by default its derotator angle.
 
         Returns
         -------
@@ -325,15 +323,13 @@ class Calibration:
         Returns
         -------
         dict of str to dict
-            ``"optic.parameter"`` to ``value``, ``std`` (NaN where not
-            determined), ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
-            ``identifiable``; ``status`` (``"determined"``, ``"by priors"``,
-            ``"conditional"``, ``"badly determined"``, ``"open"``,
-            ``"at bound"``, ``"tied"`` or ``"fixed"``); ``std_inward``, how far
-            what is at a bound may go inward at one sigma; and for errors that
-            depend on such a bound ``conditional_on``, the names of what is at
-            it, and ``std_released``, the error without it. Arrays for
-            parameters given per wavelength.
+            ``"optic.parameter"`` to ``value``, ``std`` (NaN where not determined), ``unit``,
+            ``bounds``, ``fixed``, ``tied``, ``at_bound``, ``identifiable``; ``status``
+            (``"determined"``, ``"by priors"``, ``"conditional"``, ``"badly determined"``,
+            ``"open"``, ``"at bound"``, ``"tied"`` or ``"fixed"``); ``std_inward``, how far what is
+            at a bound may go inward at one sigma; and for errors that depend on such a bound
+            ``conditional_on``, the names of what is at it, and ``std_released``, the error without
+            it. Arrays for parameters given per wavelength.
         """
         result = {}
         for chain in self.chains:

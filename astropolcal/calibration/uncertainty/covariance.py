@@ -47,8 +47,7 @@ class Covariance:
     units : sequence of `~astropy.units.Unit` or None
         Unit of each.
     matrix : array_like
-        Shape (n, n); NaN in the rows and columns of parameters that the data
-        do not determine.
+        Shape (n, n); NaN in the rows and columns of parameters that the data do not determine.
     factor : array_like, optional
         Directions that the data determine, each as long as its standard
         error, shape (rank, n); ``factor.T @ factor`` is the covariance as far
@@ -189,10 +188,9 @@ class Covariance:
         Returns
         -------
         `~numpy.ndarray`
-            Shape (n_quantities, n_quantities), or a scalar for one quantity.
-            On the diagonal infinity for what moves along an open direction,
-            NaN for what depends on parameters at a bound alone, or on
-            undetermined ones where ``factor`` is not known; outside of the
+            Shape (n_quantities, n_quantities), or a scalar for one quantity. On the diagonal
+            infinity for what moves along an open direction, NaN for what depends on parameters at a
+            bound alone, or on undetermined ones where ``factor`` is not known; outside of the
             diagonal NaN in the rows and columns of both.
 
         Raises

@@ -77,9 +77,8 @@ class Derived:
         Called without arguments, the covariance of the flattened quantity in
         squares of its unit, shape (size, size).
     open_directions : dict of str to array
-        For each open direction that moves the quantity, named by its leading
-        parameter, the change of the quantity for +1 degree (micrometre,
-        percent) of that parameter.
+        For each open direction that moves the quantity, named by its leading parameter, the change
+        of the quantity for +1 degree (micrometre, percent) of that parameter.
     wavelength : `~astropy.units.Quantity`, optional
         Wavelengths of the values, where there is one value per wavelength.
 
@@ -146,10 +145,9 @@ def propagate(calibration, function, derivatives=None):
         Takes the chain of each dataset as one argument, returns a number, an
         array or a `~astropy.units.Quantity`. Smooth near the solution.
     derivatives : callable, optional
-        Takes the same; returns a dict of ``"optic.parameter"`` to the
-        derivative of the function per unit of that parameter, as plain
-        numbers of the shape of the function's value, with one more axis at the
-        end for a parameter given per wavelength. Without it central differences
+        Takes the same; returns a dict of ``"optic.parameter"`` to the derivative of the function
+        per unit of that parameter, as plain numbers of the shape of the function's value, with one
+        more axis at the end for a parameter given per wavelength. Without it central differences
         are taken along the directions of the covariance.
 
     Returns
@@ -261,9 +259,8 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     calibration : Calibration
         The calibration.
     optic : str
-        Name of a retarder: one that follows a law, a linear, or an elliptical
-        one, whose total retardance :math:`\sqrt{\Delta_H^2+\Delta_{45}^2+\Delta_R^2}`
-        is meant.
+        Name of a retarder: one that follows a law, a linear, or an elliptical one, whose total
+        retardance :math:`\sqrt{\Delta_H^2+\Delta_{45}^2+\Delta_R^2}` is meant.
     wavelength : `~astropy.units.Quantity`, optional
         By default the calibration's grid; between its points, parameters given
         per wavelength are interpolated linearly.
@@ -427,8 +424,7 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     Returns
     -------
     Derived
-        Shape (n_frames, n_wavelengths, 4, 4), see
-        `~astropolcal.chain.system_mueller`.
+        Shape (n_frames, n_wavelengths, 4, 4), see `~astropolcal.chain.system_mueller`.
 
     Raises
     ------
@@ -535,10 +531,9 @@ def derived_sky(
     """
     Return the Stokes parameters recovered for a source, with the calibration's error.
 
-    A source of known q and u gives normalized double differences, which are
-    linearized and inverted with the calibrated chain by least squares; the
-    error is what a wrong calibration does to the result. Noise of the frames
-    is not included.
+    A source of known q and u gives normalized double differences, which are linearized and inverted
+    with the calibrated chain by least squares; the error is what a wrong calibration does to the
+    result. Noise of the frames is not included.
 
     Parameters
     ----------
@@ -563,8 +558,7 @@ def derived_sky(
     Returns
     -------
     Derived
-        q and u for each wavelength, shape (n_wavelengths, 2), or (2,) for a
-        scalar wavelength.
+        q and u for each wavelength, shape (n_wavelengths, 2), or (2,) for a scalar wavelength.
 
     Raises
     ------

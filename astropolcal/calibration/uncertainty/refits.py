@@ -106,8 +106,7 @@ class Profile:
         Returns
         -------
         low, high : `~astropy.units.Quantity` or float
-            Infinite on a side where the profile stays below ``rise`` as far
-            as it was followed.
+            Infinite on a side where the profile stays below ``rise`` as far as it was followed.
         """
         values = np.asarray(getattr(self.values, "value", self.values))
         unit = getattr(self.values, "unit", None)
@@ -176,9 +175,8 @@ def profile(calibration, name, values=None, n=21):
         One of ``calibration.covariance.names``, such as ``"hwp.w_sio2"`` or
         ``"derotator.horizontal[3]"``.
     values : `~astropy.units.Quantity` or array_like, optional
-        Where to hold it; by default three standard errors to either side, of what
-        is at a bound one-sided ones, or 1 degree (micrometre, percent) where it has
-        none, within its bounds.
+        Where to hold it; by default three standard errors to either side, of what is at a bound
+        one-sided ones, or 1 degree (micrometre, percent) where it has none, within its bounds.
     n : int
         Number of values if none are given.
 
@@ -189,8 +187,7 @@ def profile(calibration, name, values=None, n=21):
     Raises
     ------
     ParameterError
-        If there is no such parameter, or a value has the wrong unit or is
-        outside the bounds.
+        If there is no such parameter, or a value has the wrong unit or is outside the bounds.
     FitError
         If ``n`` is below 3.
     CalibrationFileError
@@ -500,9 +497,8 @@ def standard_errors(calibration, method=None, groups=None):
     correlated. ``"white"`` takes them to be independent, with the noise of its weights.
     ``"robust"`` lets groups of residuals be correlated in any way, see `robust_covariance`.
     ``"van-holstein"`` is the error that calibrations of SPHERE/IRDIS and CHARIS quote (van Holstein
-    et al. 2020, A&A 633, A64,
-    Appendix E): each wavelength is a fit of its own in which the parameters
-    common to all wavelengths are known, with covariance
+    et al. 2020, A&A 633, A64, Appendix E): each wavelength is a fit of its own in which the
+    parameters common to all wavelengths are known, with covariance
 
     .. math:: s_\mathrm{res}^2 (J^T J)^{-1}, \qquad
               s_\mathrm{res}^2 = \frac{\sum_i r_i^2}{n - k},
@@ -523,10 +519,9 @@ def standard_errors(calibration, method=None, groups=None):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``name``, ``std`` and ``unit``, one row per parameter; NaN for
-        those at a bound, that the data do not determine, or (van Holstein) that are
-        common to all wavelengths. ``meta`` has ``method``, ``held`` and, for
-        ``"robust"``, ``groups``.
+        Columns ``name``, ``std`` and ``unit``, one row per parameter; NaN for those at a bound,
+        that the data do not determine, or (van Holstein) that are common to all wavelengths.
+        ``meta`` has ``method``, ``held`` and, for ``"robust"``, ``groups``.
 
     Raises
     ------
@@ -591,14 +586,12 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
 
     .. math:: B \left(\sum_g J_g^T A_g e_g e_g^T A_g^T J_g\right) B
 
-    (White 1980 [1]_ for groups of one datum, Liang & Zeger 1986 [2]_ for any).
-    Nothing is assumed of the residuals of a group but that they are
-    independent of other groups', which takes many groups. As the fit follows its
-    data, residuals are too small, and few groups more so. ``"leverage"`` undoes it
-    with :math:`A_g = (1 - J_g B J_g^T)^{-1/2}`, which is exact for independent
-    residuals (Bell & McCaffrey 2002 [3]_); ``"number"`` multiplies the
-    whole by :math:`\frac{G}{G-1}\frac{n-1}{n-k}` for G groups, n data and k
-    parameters.
+    (White 1980 [1]_ for groups of one datum, Liang & Zeger 1986 [2]_ for any). Nothing is assumed
+    of the residuals of a group but that they are independent of other groups', which takes many
+    groups. As the fit follows its data, residuals are too small, and few groups more so.
+    ``"leverage"`` undoes it with :math:`A_g = (1 - J_g B J_g^T)^{-1/2}`, which is exact for
+    independent residuals (Bell & McCaffrey 2002 [3]_); ``"number"`` multiplies the whole by
+    :math:`\frac{G}{G-1}\frac{n-1}{n-k}` for G groups, n data and k parameters.
 
     Parameters
     ----------
@@ -613,9 +606,8 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Returns
     -------
     Covariance
-        In the gauge of the calibration's. It has no more independent
-        directions than groups: for a combination of many parameters take a
-        ``bootstrap``.
+        In the gauge of the calibration's. It has no more independent directions than groups: for a
+        combination of many parameters take a ``bootstrap``.
 
     Raises
     ------

@@ -220,11 +220,9 @@ class LackOfFit:
         Columns ``dataset``, ``wavelength``, ``n``, ``chi2``, ``expected``, ``dof``,
         ``chi2_reduced``, ``dof_noise`` and ``p_value``.
     chi2, expected : float
-        Of all data and priors together, and what it is on average if the model
-        is true.
+        Of all data and priors together, and what it is on average if the model is true.
     p_value : float
-        Probability of residuals at least as large, were the model true and the
-        noise right.
+        Probability of residuals at least as large, were the model true and the noise right.
     words : str
         The verdict in a sentence, and what the noise includes.
     priors : dict or None
@@ -256,23 +254,21 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     :math:`A\epsilon`, :math:`A = S^{-1}(1 - J (J^TWJ)^+ J^TW)S`, and with
     :math:`C = AA^T` restricted to a wavelength chi-square has the mean
     :math:`\operatorname{tr} C` and the variance :math:`2\operatorname{tr} C^2`
-    (Satterthwaite 1946, Biometrics Bull. 2, 110, doi:10.2307/3002019). So
-    parameters shared by all wavelengths and a fit whose weights are not those of
-    the noise are accounted for. Where the noise is estimated, the ratio follows F;
-    where it comes from replicates of the same data, their scatter is taken out of
-    the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are data
-    like any other: a row each of r, :math:`\sigma` and J. So a prior that the data
-    overrule adds to chi-square, one that decides what the data do not determine adds
-    nothing, and one that a fit heeds leaves more freedom to the data.
+    (Satterthwaite 1946, Biometrics Bull. 2, 110, doi:10.2307/3002019). So parameters shared by all
+    wavelengths and a fit whose weights are not those of the noise are accounted for. Where the
+    noise is estimated, the ratio follows F; where it comes from replicates of the same data, their
+    scatter is taken out of the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are
+    data like any other: a row each of r, :math:`\sigma` and J. So a prior that the data overrule
+    adds to chi-square, one that decides what the data do not determine adds nothing, and one that a
+    fit heeds leaves more freedom to the data.
 
     Parameters
     ----------
     measurement : Measurement
         The measurement.
     vector : array_like or Calibration, optional
-        Fitted parameters, by default the current ones. A calibration made from this
-        very measurement brings its weights along; with another one
-        the data count as not fitted.
+        Fitted parameters, by default the current ones. A calibration made from this very
+        measurement brings its weights along; with another one the data count as not fitted.
     noise : NoiseEstimate, optional
         By default ``noise_from_errors``.
     weights : array_like, optional

@@ -310,12 +310,11 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     Returns
     -------
     `~astropy.table.QTable`
-        The columns of `~astropolcal.calibration.validation.star_stokes` and
-        ``star_accuracy``; ``dolp_sys_err`` and ``aolp_sys_err``, what the
-        calibration claims of such light, see `~astropolcal.calibration.target_accuracies`; and
-        ``q_known``, ``u_known``, ``dolp_known``,
-        ``aolp_known`` of the catalogue with ``dolp_known_err`` and ``aolp_known_err``, NaN
-        where no errors are published. Meta ``star``, ``name`` and ``words``.
+        The columns of `~astropolcal.calibration.validation.star_stokes` and ``star_accuracy``;
+        ``dolp_sys_err`` and ``aolp_sys_err``, what the calibration claims of such light, see
+        `~astropolcal.calibration.target_accuracies`; and ``q_known``, ``u_known``, ``dolp_known``,
+        ``aolp_known`` of the catalogue with ``dolp_known_err`` and ``aolp_known_err``, NaN where no
+        errors are published. Meta ``star``, ``name`` and ``words``.
 
     Raises
     ------

@@ -275,10 +275,9 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     aolp : `~astropy.units.Quantity`
         Its angle of linear polarization; scalar or one per wavelength.
     polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
-        Accuracies of the calibrations with the internal source polarized
-        (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
-        (s_sky), such as ``Calibration.accuracy``. What is missing counts as
-        zero; its column is NaN and ``meta["words"]`` names it.
+        Accuracies of the calibrations with the internal source polarized (s_rel) and unpolarized
+        (s_unpol) and on an unpolarized standard star (s_sky), such as ``Calibration.accuracy``.
+        What is missing counts as zero; its column is NaN and ``meta["words"]`` names it.
     column : {"s_mean", "s_res", "s_cv"}
         Which accuracy to take: the paper's is ``s_mean``, the error of a
         prediction at one setting is ``s_cv``.
@@ -377,9 +376,8 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     calibration : Calibration
         The calibration; one read from a file will do.
     targets : sequence of (dolp, aolp)
-        Degree and angle of linear polarization of each, as for `target_accuracy`. An
-        angle of None stands for any: the accuracies are then the largest over all
-        angles.
+        Degree and angle of linear polarization of each, as for `target_accuracy`. An angle of None
+        stands for any: the accuracies are then the largest over all angles.
     column : {"s_mean", "s_res", "s_cv"}
         Which accuracy of the calibration to take.
 
@@ -497,10 +495,9 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     """
     Return s_res, s_mean, s_cv and s_standard at each wavelength, side by side.
 
-    They answer four questions: how well the model follows the data it was fitted
-    to; how well the mean residual would be known, were residuals independent
-    (the paper's s_rel); how well settings left out of the fit are predicted; and
-    how well a dataset is predicted that no fit has seen.
+    They answer four questions: how well the model follows the data it was fitted to; how well the
+    mean residual would be known, were residuals independent (the paper's s_rel); how well settings
+    left out of the fit are predicted; and how well a dataset is predicted that no fit has seen.
 
     Parameters
     ----------
@@ -508,10 +505,9 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         The calibration; one that was read from a file has its data no more, so
         ``groups`` cannot be chosen.
     standard : Observations or Measurement, optional
-        The dataset the fit did not use: observations with the set-up of
-        ``dataset``, or a measurement with a chain of its own, at its current
-        parameters. By default those that the calibration remembers, see
-        `~astropolcal.calibration.add_standard`.
+        The dataset the fit did not use: observations with the set-up of ``dataset``, or a
+        measurement with a chain of its own, at its current parameters. By default those that the
+        calibration remembers, see `~astropolcal.calibration.add_standard`.
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
@@ -527,8 +523,7 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     Raises
     ------
     FitError
-        If the standard was part of the fit, or groups are too few or have a
-        single member.
+        If the standard was part of the fit, or groups are too few or have a single member.
 
     Examples
     --------

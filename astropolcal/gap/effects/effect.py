@@ -170,8 +170,7 @@ class Context:
         Degree of the laws in wavelength, None for one value per wavelength, or
         "default" for that of each effect.
     tracking : tuple of (float, float)
-        Law by which the half-wave plate of each dataset follows the sky, see
-        ``tracking_laws``.
+        Law by which the half-wave plate of each dataset follows the sky, see ``tracking_laws``.
     datasets : tuple of str
         Names of the datasets.
 
