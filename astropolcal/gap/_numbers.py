@@ -2,6 +2,8 @@
 """Numbers of a report: sizes of causes, what they do to the data, accuracies of a model."""
 
 import warnings
+from copy import copy
+from dataclasses import replace
 from functools import cached_property
 
 import astropy.units as u
@@ -233,7 +235,14 @@ def accuracies(model, cross_validate=True):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AstropolcalWarning)
-            calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
+            made = model.calibration
+            calibration = (
+                with_causes(model, cross_validate=False, instrument=instrument)
+                if made is None
+                else replace(made, fit=dict(made.fit), datasets=list(map(copy, made.datasets)))
+            )
+            if cross_validate:
+                calibration.cross_validate()
             targets = target_accuracies(calibration)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
                 targets = target_accuracies(calibration, open_directions="ignore")
@@ -265,7 +274,8 @@ def with_causes(model, **options):
     """
     Calibrate the chains of a model, the sizes of its causes held.
 
-    Their sizes are what was found: fitting them again, to double differences, could move them.
+    Their sizes are what was found: fitting them again, to double differences, could move them, and
+    so could another mirror branch.
     """
     held = {p.name for parameters in model.added.values() for p in parameters}
     ties = model.problem.ties
@@ -274,6 +284,7 @@ def with_causes(model, **options):
         model.chains,
         model.observations,
         fix=dict.fromkeys(sorted(held)) or None,
+        search=False if held else None,
         ties={name: tie for name, tie in ties.items() if name not in held},
         **options,
     )

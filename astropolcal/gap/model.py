@@ -26,6 +26,9 @@ from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 __all__ = []
 
 _ROUNDS, _MORE = 3, 3
+# a fit whose last round lowered chi-square by less than this share is as good as at the bottom: of
+# what it leaves, causes will take far more
+_FLAT = 0.02
 # a size so near to its limit, in units of that, is at it; the share of the wavelengths at
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
@@ -60,6 +63,8 @@ class Model:
     fit: object
     #: Effects in the chains, with the parameters that they added.
     added: dict = field(default_factory=dict)
+    #: The calibration that was made for it, None where it began with another one.
+    calibration: Calibration | None = None
 
     @property
     def chains(self):
@@ -350,11 +355,16 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
         found = problem.fit(found.coefficients)
+    before = np.inf
     for _ in range(_MORE):
         # along the flat valleys of a model that lacks much, a fit takes its time
-        found = found if found.converged else problem.fit(found.coefficients)
-    if not (found.converged and np.isfinite(found.chi2)):
-        raise _no_convergence()
+        if not found.converged:
+            before, found = found.chi2, problem.fit(found.coefficients)
+    if not (np.isfinite(found.chi2) and (found.converged or found.chi2 > (1 - _FLAT) * before)):
+        raise GapError(
+            "the nominal fit did not converge: nothing can be said of missing effects; "
+            "check the angles, the optics in the beam and the starting values"
+        )
     return Model(problem, found)
 
 
@@ -372,13 +382,6 @@ def _lowest(problem, chains):
     return other if other.converged and other.chi2 < found.chi2 else found
 
 
-def _no_convergence():
-    return GapError(
-        "the nominal fit did not converge: nothing can be said of missing effects; "
-        "check the angles, the optics in the beam and the starting values"
-    )
-
-
 def nominal_calibration(chains, observations):
     """
     Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
@@ -390,7 +393,9 @@ def nominal_calibration(chains, observations):
     with warnings.catch_warnings():
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
-        return calibrate(list(chains), list(observations), cross_validate=False)
+        instrument = next((o.instrument for o in observations if o.instrument), None)
+        options = {"cross_validate": False, "instrument": instrument}
+        return calibrate(list(chains), list(observations), **options)
 
 
 def starting_model(calibration, observations, library, say):
@@ -405,8 +410,9 @@ def starting_model(calibration, observations, library, say):
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    made = None
     if given is None:
-        given = nominal_calibration(chains, observations)
+        given = made = nominal_calibration(chains, observations)
     elif given.measurement is None:
         given = given.with_observations(observations)
     if _may_be_wrong(given):
@@ -419,6 +425,7 @@ def starting_model(calibration, observations, library, say):
             if _misfit(best) < _FAR_BETTER * _misfit(given):
                 return _with_alternative(chains, observations, given, best, found)
     nominal = nominal_model(chains, observations, calibration=given)
+    nominal.calibration = made if isinstance(made, Calibration) else None
     return nominal, nominal, []
 
 

@@ -45,7 +45,7 @@ _MOST_ALONE, _MOST_TOGETHER = 6, 10
 _OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
-_WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
+_WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
 # but this, where the freedom of the best costs more (log evidence): two simple ones may do better
@@ -145,6 +145,7 @@ class _Task:
     cells: bool
     groups: tuple | None
     say: object
+    has_runs: bool = False
 
     def fitted(self, chosen, like, **how):
         """Return the base with causes, fitted in full."""
@@ -153,9 +154,8 @@ class _Task:
 
 def select(base, library, groups, say, *, cells=True, changes=False):
     """Choose the causes that a model lacks."""
-    task = _Task(base, library, cells, groups, say)
-    first = _scanned(base, library, cells)
-    runs = count_runs(base.problem)
+    first, runs = _scanned(base, library, cells), count_runs(base.problem)
+    task = _Task(base, library, cells, groups, say, has_runs=runs > 1)
     most = _MOST if runs < 2 or not cells else _MOST // 2
     best = _search(task, _State(base), first, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
@@ -329,7 +329,9 @@ def _apart(base, first, say):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
         seen = _scanned(alone, [], True)
-        state = _search(_Task(alone, [], True, None, say), _State(alone), seen, _MOST_ALONE)
+        state = _search(
+            _Task(alone, [], True, None, say, has_runs=True), _State(alone), seen, _MOST_ALONE
+        )
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     names = {one.name for one in chosen}
@@ -372,36 +374,47 @@ def _in_run(candidate, name, probes):
 
 def _search(task, best, first, most_causes):
     """Return the best set of causes."""
-    states, known = [best], {} if best.chosen else {best.outline: first}
+    states, spare, known = [best], [], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
-        width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
         task.say(f"looking for cause {k + 1}, at most {most_causes}")
-        # what takes many causes has no names; they are asked for once more at the end
-        names = task.library if k <= _NAMES or not task.cells else ()
-        for state in states:
-            if state.outline not in known:
-                known[state.outline] = _scanned(state.model, names, task.cells)
-        instead = partial(_in_place, replace(task, library=names))
-        fitted = []
-        for several in (most, _MORE * most):
-            # what is impossible is passed over, and is not the end of the search
-            grown = _grown(states, known, several)
-            tried = grown[:most] if several == most else grown[most:]
-            fitted = _fitted(tried, instead)
-            if fitted:
-                break
-        fitted.sort(key=lambda state: -state.evidence)
+        # of several runs, whose causes are many, the sets are fewer one step earlier
+        step = k + (task.has_runs and k > 1)
+        width, most = (part[min(step, len(part) - 1)] for part in (_WIDTH, _FITTED))
         least = best.evidence + ENOUGH
-        if not fitted or fitted[0].evidence < least:
+        fitted = _extensions(task, states, known, most, least)
+        # what led may be at its end where another set is not
+        fitted = fitted or _extensions(task, spare, known, most, least)
+        if not fitted:
             break
-        if task.groups and k >= _BY_EVIDENCE:
-            fitted = _by_left_out_frames(fitted, least, task.groups)
-        best, states = fitted[0], fitted[:width]
+        is_doubtful = task.groups and k >= _BY_EVIDENCE
+        fitted = _by_left_out_frames(fitted, least, task.groups) if is_doubtful else fitted
+        best, states, spare = fitted[0], fitted[:width], fitted[width:] if is_doubtful else []
         if best.model.p_value > REMAINDER and not best.is_dear:
             # what is left may be noise: one look beside the best set will tell
-            states = states[:1]
+            states, spare = states[:1], []
     return best
+
+
+def _extensions(task, states, known, most, least):
+    """Return sets with one cause more that have enough evidence, fitted in full, best first."""
+    if not states:
+        return []
+    k = len(states[0].chosen)
+    # what takes many causes has no names; they are asked for once more at the end
+    names = task.library if k <= _NAMES or not task.cells else ()
+    for state in states:
+        if state.outline not in known:
+            known[state.outline] = _scanned(state.model, names, task.cells)
+    instead, fitted = partial(_in_place, replace(task, library=names)), []
+    for several in (most, _MORE * most):
+        # what is impossible is passed over, and is not the end of the search
+        grown = _grown(states, known, several)
+        fitted = _fitted(grown[:most] if several == most else grown[most:], instead)
+        if fitted:
+            break
+    fitted.sort(key=lambda state: -state.evidence)
+    return fitted if fitted and fitted[0].evidence >= least else []
 
 
 def _by_left_out_frames(states, least, groups):
@@ -414,7 +427,7 @@ def _by_left_out_frames(states, least, groups):
     if any(state.model.mean_square < _STRUCTURED for state in states):
         return states
     enough = [state for state in states if state.evidence >= least]
-    return sorted(enough, key=lambda state: foreseen(state.model, groups).percent)
+    return sorted(enough, key=lambda state: foreseen(state.model, groups).typical_percent)
 
 
 def _fitted(grown, instead):

@@ -56,6 +56,11 @@ class HeldOut:
         return 100 * float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
     @property
+    def typical_percent(self):
+        """Mean over the groups of the root mean square error in each: no one decides alone."""
+        return 100 * float(np.mean(np.sqrt(self.squares / self.counts)))
+
+    @property
     def chi2(self):
         """Mean square over the variances."""
         return float(self.whitened.sum() / self.counts.sum())
