@@ -236,6 +236,27 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         diagnose(chain, observed)
 
 
+def test_a_nominal_fit_ends_where_its_last_steps_gain_next_to_nothing(monkeypatch):
+    observed = [data.observed(data.chain())]
+
+    def creeping(share):
+        """Return a fit that never converges, and lowers chi-square by a share each time."""
+        chi2 = 1e6
+
+        def fit(self, *args, **kwargs):
+            nonlocal chi2
+            chi2 *= 1 - share
+            return problem.Fit(self.start, chi2, False)
+
+        return fit
+
+    monkeypatch.setattr(problem.GapProblem, "fit", creeping(0.01))
+    assert not model.nominal_model([data.chain()], observed).fit.converged
+    monkeypatch.setattr(problem.GapProblem, "fit", creeping(0.1))
+    with pytest.raises(GapError, match="the nominal fit did not converge"):
+        model.nominal_model([data.chain()], observed)
+
+
 # ---- model ------------------------------------------------------------------------------
 
 

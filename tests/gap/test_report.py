@@ -118,6 +118,10 @@ def test_gap_is_that_of_left_out_frames(found, content):
     assert content["gap_after_percent"] < 1.3 * content["noise_floor_percent"]
     shrunk = content["shrinkage_percent"]
     assert shrunk["low"] <= shrunk["value"] <= shrunk["high"]
+    # that of the nominal model is what calibrate says
+    known = calibrate(chain(), data(SIZE), instrument="charis").accuracy["s_cv"].value
+    stated = content["accuracy_before"]["datasets"][0]["s_cv_percent"]
+    assert stated == pytest.approx(np.median(known), rel=1e-3)
     fit = to_dict(replace(found, held_out=[]))
     assert not fit["cross_validated"]
     assert fit["gap_after_percent"] < fit["gap_before_percent"]

@@ -74,6 +74,13 @@ def test_better_is_counted_in_standard_errors():
     assert before.better_than(after) == pytest.approx(-2 * np.sqrt(3))
 
 
+def test_typical_error_is_the_mean_of_those_of_the_groups():
+    found = errors([1.0, 4.0, 9.0])
+    each = 100 * np.sqrt(found.squares / found.counts)
+    assert found.typical_percent == pytest.approx(each.mean())
+    assert found.typical_percent < found.percent
+
+
 def test_a_difference_without_scatter_is_certain():
     for change, expected in [(-1.0, np.inf), (0.0, 0.0), (1.0, -np.inf)]:
         before = errors([3.0, 3.0])
