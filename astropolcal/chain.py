@@ -8,6 +8,7 @@ light travels. Nothing here depends on which optics they are.
 
 import math
 import warnings
+from itertools import accumulate
 
 import astropy.units as u
 import numpy as np
@@ -614,7 +615,7 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
     positions, shape = _check_axes(wavelength, positions)
     nodes = list(_oriented_leaves(chain, wavelength, positions))
     matrices = [leaf._oriented(*rest) for leaf, *rest in nodes]
-    before = _running_products(matrices)
+    before = list(accumulate(matrices[:-1], lambda product, m: m @ product, initial=np.eye(4)))
     after = np.eye(4)
     result = {}
     for (leaf, *rest), matrix, upstream in zip(
@@ -628,11 +629,3 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
             result[f"{leaf.name}.{key}"] = leaf._per_unit(key, value)
         after = after @ matrix
     return result
-
-
-def _running_products(matrices):
-    """Return, for every matrix, the product of those before it."""
-    products = [np.eye(4)]
-    for matrix in matrices[:-1]:
-        products.append(matrix @ products[-1])
-    return products

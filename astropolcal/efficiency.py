@@ -157,7 +157,9 @@ def polarimetric_efficiency(
             "the chain has no cycle of a half-wave plate with two beams (stage hwp); "
             "astropolcal.efficiency.demodulation gives the efficiencies of its frames"
         )
-    law = _plate_law(path, instrument, mode) if law is None else law
+    if law is None:
+        # it only counts on sky
+        law = _law_of(instrument).plate_law(mode) if _SKY & set(stages(path)) else (0.0, 0.0)
     positions = _positions(path, derotator, altitude, parallactic, law)
     lam = np.atleast_1d(u.Quantity(wavelength))
     shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
@@ -190,13 +192,6 @@ def _law_of(instrument):
     if instrument is None:
         return SkyLaw()
     return (instruments.get(instrument) if isinstance(instrument, str) else instrument).sky_law
-
-
-def _plate_law(path, instrument, mode):
-    """Return the law of the plate, which only counts on sky."""
-    if not _SKY & set(stages(path)):
-        return 0.0, 0.0
-    return _law_of(instrument).plate_law(mode)
 
 
 def _derotator_stage(path):

@@ -195,7 +195,10 @@ def estimator(
         rows = rows * scale[None, :, :, None]
     combined = channels.combine(np.moveaxis(rows, 1, 2))
     combined = np.moveaxis(combined, 2, 1)
-    inverse = _inverse_variances(channels, weights)
+    with np.errstate(divide="ignore"):
+        # a weight of zero is an infinite variance, and stays a weight of zero in its pair
+        variances = channels.variances(np.moveaxis(1 / weights, 1, 2))
+        inverse = np.moveaxis(1 / variances, 2, 1)
     solved = [
         _solve(combined[:, w].reshape(-1, 4), inverse[:, w].ravel(), components, max_condition)
         for w in range(shape[0])
@@ -284,14 +287,6 @@ def _positive(name, value, shape, beams=False):
             f"{name} = {value.min():g} must be finite and {'not negative' if beams else 'positive'}"
         )
     return np.broadcast_to(value, shape if value.ndim < 3 else value.shape)
-
-
-def _inverse_variances(channels, weights):
-    """Return the weights of the channels, (2, n_wavelengths, n_units)."""
-    with np.errstate(divide="ignore"):
-        # a weight of zero is an infinite variance, and stays a weight of zero in its pair
-        variances = channels.variances(np.moveaxis(1 / weights, 1, 2))
-        return np.moveaxis(1 / variances, 2, 1)
 
 
 def _refuse_undetermined(found, labels):

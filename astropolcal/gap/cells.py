@@ -287,18 +287,12 @@ def _waves(dependence, dataset):
         return np.ones((1, observations.n_frames))
     given = dataset._given.get(dependence.driver)
     if given is None:
-        known = (
-            dependence.driver in COORDINATES or dependence.driver in observations.frames.colnames
-        )
-        if not known or not _has_stage(dependence, observations):
+        there = observations.frames.colnames
+        known = dependence.driver in COORDINATES or dependence.driver in there
+        if not known or (dependence.kind in _MOVED and dependence.parts[1] not in there):
             return np.zeros((dependence.count, observations.n_frames))
         given = observations.position(dependence.driver)
     return dependence.waves(given.mean(axis=0) if given.ndim == 2 else given)
-
-
-def _has_stage(dependence, observations):
-    stage = dependence.parts[1] if dependence.kind in _MOVED else None
-    return stage is None or stage in observations.frames.colnames
 
 
 def _steps(problem, most):
@@ -431,7 +425,7 @@ class Probes:
                     retardance=0 * u.deg,
                     theta=place.theta * u.rad,
                     mount=place.mount,
-                    name=_probe(place),
+                    name=_PROBE + place.name,
                 )
                 chain = place.insert(chain, probe)
                 where.setdefault(place.name, None)
@@ -534,10 +528,6 @@ def _frames_first(basis, shape):
 
 
 _PROBE = "gap_probe_"
-
-
-def _probe(place):
-    return _PROBE + place.name
 
 
 def _bilinear(row, light, generator):

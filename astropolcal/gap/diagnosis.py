@@ -294,7 +294,10 @@ def diagnose(
     elif wrong:
         say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
         kept = without_frames(observations, wrong)
-        again, groups = _refitted(base, kept), frame_groups(kept) if cross_validate else None
+        fresh = nominal_model(base.chains, kept)
+        groups = frame_groups(kept) if cross_validate else None
+        # with noise and effects of its own
+        again = Model(fresh.problem, fresh.fit, base.added)
         nominal, base = (again if nominal is base else nominal), again
     say("looking for causes")
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
@@ -353,12 +356,6 @@ def _nested(base, smooth, groups, say, cells):
     keep = counts > 0
     labels = [label for label, there in zip(labels, keep, strict=True) if there]
     return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
-
-
-def _refitted(model, observations):
-    """Return a model fitted to some of the frames, with noise and effects of its own."""
-    fresh = nominal_model(model.chains, observations)
-    return Model(fresh.problem, fresh.fit, model.added)
 
 
 def _library(effects):

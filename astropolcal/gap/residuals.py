@@ -214,7 +214,10 @@ def _sequence(data, terms, null):
             break
         one = tested[best]
         taken.append((terms[best], one))
-        gram, target = _swept(gram, target, slices[best], one)
+        # the normal equations of the others beside it
+        along = gram[:, slices[best]] @ one.inverse_root
+        target = target - along @ (one.inverse_root.T @ target[slices[best]])
+        gram = gram - along @ along.T
         total, freedom = total - one.statistic, freedom - one.rank
         left.remove(best)
     # what a few patterns explain is a better measure of a small gap than the sum of squares
@@ -307,12 +310,6 @@ def _test(gram, target, where, total, freedom):
     log_p = stats.chi2.logsf(statistic / scatter, rank)
     evidence = statistic / scatter - rank * np.log(max(freedom, 2))
     return _Tested(statistic, rank, root, log_p, evidence)
-
-
-def _swept(gram, target, where, tested):
-    """Return the normal equations with one term taken out of all others."""
-    along = gram[:, where] @ tested.inverse_root
-    return gram - along @ along.T, target - along @ (tested.inverse_root.T @ target[where])
 
 
 def _row(term, tested, scale):

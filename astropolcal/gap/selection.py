@@ -240,7 +240,10 @@ def _checked(task, best):
     """
     while True:
         task.say("left-out frames")
-        steps = [task.base.without(()), *_growing(best)]
+        names = [one.name for one in best.chosen]
+        # with the first cause, the first two and so on, to first order
+        steps = [best.model.without(names[i + 1 :]) for i in range(len(names))]
+        steps = [task.base.without(()), *steps]
         history = [_errors(step, task.groups) for step in progress.steps(steps, "models")]
         worse = _worse(best, steps, history, task.groups)
         if not worse:
@@ -276,12 +279,6 @@ def _worsens(after, before, scatter):
     # one standard error (Breiman et al. 1984, Classification and Regression Trees, Sec. 3.4.3)
     least = -2.0 if scatter < _STRUCTURED else 1.0
     return after.better_than(before) < least
-
-
-def _growing(best):
-    """Yield the model with the first cause, the first two, and so on, to first order."""
-    names = [one.name for one in best.chosen]
-    return [best.model.without(names[i + 1 :]) for i in range(len(names))]
 
 
 def explained_by_one(model, library, *, cells=True):
@@ -332,7 +329,12 @@ def _apart(base, first, say):
         state = _search(
             _Task(alone, [], True, None, say, has_runs=True), _State(alone), seen, _MOST_ALONE
         )
-        chosen += [_in_run(one, name, first.probes) for one in state.chosen]
+        chosen += [
+            replace(one, cell=one.cell.in_run(name))
+            if first.probes.run_of(one.cell) is None
+            else one
+            for one in state.chosen
+        ]
     say("all runs together")
     names = {one.name for one in chosen}
     nominal = [one for one in _nominal_changes(first) if one.name not in names]
@@ -362,14 +364,6 @@ def _nominal_changes(first):
         cells = [(Cell(place, kind, f"dataset:{run}"), degree) for place, kind, degree in kinds]
         found += [first.of_cell(*each) for each in cells]
     return [one for one in found if one is not None]
-
-
-def _in_run(candidate, name, probes):
-    """Return the same cause in one run only."""
-    cell = candidate.cell
-    if probes.run_of(cell) is not None:
-        return candidate
-    return replace(candidate, cell=cell.in_run(name))
 
 
 def _search(task, best, first, most_causes):

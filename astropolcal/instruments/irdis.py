@@ -98,7 +98,8 @@ def frame_table(headers, location, filters, law):
     if len(set(stars)) > 1:
         raise ObservationError(f"frame {stars.index(False)}: no keyword {_PARALLACTIC}")
     bands = {_filter(frame, filters) for frame in frames}
-    trackings = {_tracking(frame, stars[0]) for frame in frames}
+    kinds = ("FIELD", "PUPIL")
+    trackings = {frame.text(_ROTATION, kinds).lower() if stars[0] else None for frame in frames}
     for what, found in (("filters", bands), ("kinds of tracking", trackings)):
         if len(found) > 1:
             names = ", ".join(sorted(map(str, found)))
@@ -122,10 +123,6 @@ def _filter(frame, filters):
             f"{', '.join(f'FILT_BBF_{known}' for known in filters)}"
         )
     return band
-
-
-def _tracking(frame, star):
-    return frame.text(_ROTATION, ("FIELD", "PUPIL")).lower() if star else None
 
 
 def _row(frame, tracking, location):

@@ -87,7 +87,10 @@ class Dataset:
         n_nodes = self._node_weights.size
         # node after node, each with all columns: (n_nodes *
         # n_columns,) is the frame axis of a sweep
-        placed = {stage: _at_nodes(angle, columns, n_nodes) for stage, angle in self._given.items()}
+        placed = {
+            stage: (a[:, columns].ravel() if a.ndim == 2 else np.tile(a[..., columns], n_nodes))
+            for stage, a in self._given.items()
+        }
         # where nothing moves all frames are alike, but there are as many
         placed = placed or {"frame": np.zeros(n_nodes * columns.size)}
         obs = self.observations
@@ -297,10 +300,3 @@ def _node_weights(positions, observations):
     _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
     # Gauss-Legendre weights on (-1, 1) sum to 2, the length of that interval
     return weights / 2
-
-
-def _at_nodes(angle, columns, n_nodes):
-    """Return positions of all columns, node after node."""
-    if angle.ndim == 2:
-        return angle[:, columns].ravel()
-    return np.tile(angle[..., columns], n_nodes)

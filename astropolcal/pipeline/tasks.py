@@ -191,15 +191,13 @@ def _on_processes(function, tasks, workers, timeout, preload):
                 elif worker.attempts < _ATTEMPTS:
                     again.append((worker.task, worker.attempts))
                 else:
-                    yield Ended(worker.task, reason=_died(worker.process.exitcode))
+                    code = worker.process.exitcode
+                    how = f"signal {-code}" if (code or 0) < 0 else f"exit status {code}"
+                    why = f"the process that worked on it died {_ATTEMPTS} times ({how})"
+                    yield Ended(worker.task, reason=why)
     finally:
         for worker in (*busy, *idle):
             worker.end()
-
-
-def _died(code):
-    how = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
-    return f"the process that worked on it died {_ATTEMPTS} times ({how})"
 
 
 # ---- a cluster -----------------------------------------------------------------------------------

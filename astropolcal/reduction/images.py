@@ -187,20 +187,17 @@ class Detector:
         variance = (self.excess_noise**2 * electrons + self.read_noise**2) / self.gain**2
         check_electrons(electrons)
         if self.noise:
-            electrons = self._multiplied(rng.poisson(electrons), rng)
+            electrons = rng.poisson(electrons)
+            # each becomes an exponentially distributed number of them; F^2 = 1 + the variance of
+            # what one becomes, in units of the gain squared
+            extra = self.excess_noise**2 - 1
+            electrons = extra * rng.gamma(electrons / extra) if extra > 0 else electrons
             electrons = electrons + self.read_noise * rng.standard_normal(light.shape)
         # in adu, as the layout gives it
         image = np.minimum(electrons / self.gain, self.saturation)
         with np.errstate(divide="ignore"):
             weight = np.where(variance > 0, 1 / variance, 0.0)
         return image.astype(np.float32), weight.astype(np.float32)
-
-    def _multiplied(self, electrons, rng):
-        """Return electrons with the scatter of a multiplication, over its gain."""
-        # F^2 = 1 + variance of what one electron becomes, in units of the gain squared
-        extra = self.excess_noise**2 - 1
-        # each electron becomes an exponentially distributed number of them
-        return extra * rng.gamma(electrons / extra) if extra > 0 else electrons
 
 
 # ---- arguments -----------------------------------------------------------------------------------

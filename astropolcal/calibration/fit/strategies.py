@@ -248,7 +248,11 @@ def other_laws(problem, vector, origin):
     tried around those of ``origin``, beside the other common parameters of ``vector``, with each
     bin roughly in its best valley, and in that of the origin.
     """
-    slots = [s for s in problem.measurement.free.slots if not s.per_wavelength and _is_length(s)]
+    slots = [
+        slot
+        for slot in problem.measurement.free.slots
+        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m)
+    ]
     slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
     low, high = problem.measurement.free.bounds()
     base = vector.copy()
@@ -268,10 +272,6 @@ def other_laws(problem, vector, origin):
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
-
-
-def _is_length(slot):
-    return slot.unit is not None and slot.unit.is_equivalent(u.m)
 
 
 def _data_of_bins(measurement, n_bins):

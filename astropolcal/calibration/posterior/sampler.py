@@ -133,7 +133,10 @@ class LogPosterior:
         vectors = np.tile(self.fitted, (int(inside.sum()), 1))
         vectors[:, self.sampled] = rows[inside]
         likelihood = np.array([self._log_likelihood(vector) for vector in vectors])
-        total = likelihood + self._log_prior(vectors)
+        total = likelihood + sum(
+            prior.log_densities(vectors[:, slot.slice]).sum(axis=1)
+            for slot, prior in self.measurement.free.priors
+        )
         # emcee stops at NaN; a model that fails somewhere makes that place impossible
         found[inside] = np.where(np.isnan(total), -np.inf, total)
         return found
@@ -148,13 +151,6 @@ class LogPosterior:
             residual /= self.sigma[segment]
             chi2 += residual @ residual
         return -0.5 * chi2
-
-    def _log_prior(self, vectors):
-        """Return the log density of the priors for each vector, each prior called once."""
-        total = np.zeros(len(vectors))
-        for slot, prior in self.measurement.free.priors:
-            total += prior.log_densities(vectors[:, slot.slice]).sum(axis=1)
-        return total
 
     def whitened_jacobian(self):
         """Return derivatives of data and priors over their noise, (n, n_data + n_priors)."""
