@@ -119,7 +119,7 @@ def test_a_forgotten_mount_leaves_nothing_to_fit(example):
     assert "unknown" in lines[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_real_data_fit_a_terminal(shared_data):
     for name, patterns, first in (
         ("charis", ["charis/dataset3*", "charis/dataset4*", "charis/hd293396*"], "Usable: "),

@@ -298,7 +298,7 @@ def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.slow
+@pytest.mark.long
 def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
     odd = "\x1b[31m\r\x07\u202eodd\nastropolcal: error: forged"
     calls = [
@@ -375,7 +375,7 @@ def call(folder, words):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.slow
+@pytest.mark.long
 def test_quiet_commands_print_nothing(desk, capsys):
     for words in [
         "simulate -o again.ecsv --derotator 45",

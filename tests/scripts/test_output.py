@@ -225,7 +225,7 @@ def test_nothing_moves_the_cursor_of_a_pipe():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of a group of processes")
-@pytest.mark.slow
+@pytest.mark.long
 def test_interruption_of_several_processes_is_one_line():
     call("simulate --cubes many --source star --hwp 0,45,22.5,67.5 --derotator 50,60,70,80,90"
          " --altitude 70 --parallactic 20 --flux 2e6")  # fmt: skip
