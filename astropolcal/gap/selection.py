@@ -329,11 +329,10 @@ def _apart(base, first, say):
         state = _search(
             _Task(alone, [], True, None, say, has_runs=True), _State(alone), seen, _MOST_ALONE
         )
+        of_all = [first.probes.run_of(one.cell) is None for one in state.chosen]
         chosen += [
-            replace(one, cell=one.cell.in_run(name))
-            if first.probes.run_of(one.cell) is None
-            else one
-            for one in state.chosen
+            replace(one, cell=one.cell.in_run(name)) if everywhere else one
+            for one, everywhere in zip(state.chosen, of_all, strict=True)
         ]
     say("all runs together")
     names = {one.name for one in chosen}
