@@ -64,9 +64,9 @@ class Window:
         await self.send("Page.navigate", url=page.resolve().as_uri())
         if "Page.loadEventFired" not in self.events:
             await self._until(lambda message: message.get("method") == "Page.loadEventFired")
-        if 'class="math' in page.read_text(encoding="utf-8"):
-            # formulae are drawn after the page is loaded
-            await asyncio.sleep(0.6)
+        # formulae are drawn after the page is loaded
+        drawn = {"expression": "window.MathJax?.startup.promise.then(() => 0)"}
+        await self.send("Runtime.evaluate", awaitPromise=True, **drawn)
         answer = await self.send("Runtime.evaluate", expression=STICKS_OUT, returnByValue=True)
         return answer["result"]["result"]["value"]
 
