@@ -90,6 +90,8 @@ def test_error_of_a_stated_value_is_along_and_across_it(scene_with_star):
     light = result["I"]
     np.testing.assert_allclose(result.error("Q", "systematic"), 0.001 * light)
     np.testing.assert_allclose(result.error("U", "systematic"), 0.04 * np.deg2rad(3) * light)
+    known = corrected(stokes).without_star(dolp=2 * u.percent, aolp=0 * u.deg)
+    assert not known.error("Q", "systematic").any()
     # one star at all wavelengths
     between = result.systematic.between(light[None, :, 10, 10] * np.array([[1], [0], [0]]))
     assert between[1, 0, 1, 2] == pytest.approx(0.001**2 * light[0, 10, 10] * light[2, 10, 10])
