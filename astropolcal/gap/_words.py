@@ -340,7 +340,8 @@ def _how_large(content):
 
     def gaps(before, after, noise):
         more = f", with {them} by {percent(after)} %" if content["causes"] else ""
-        return f"{percent(before)} %{more} (noise {percent(noise)} %)"
+        worse = ", which is worse" if more and after > before else ""
+        return f"{percent(before)} %{more}{worse} (noise {percent(noise)} %)"
 
     keys, double = ("before_percent", "after_percent"), content["double_difference"]
     single = content["accuracy_before"]["observable"] == "intensity"

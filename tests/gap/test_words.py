@@ -271,6 +271,10 @@ def test_double_differences_lead_and_single_ones_follow():
     assert places == sorted(places)
     alone = " ".join(content(double_difference=None)["sentences"])
     assert "In single differences the model is off by 2.00 %" in alone
+    # nobody overlooks that causes make it worse
+    worse = " ".join(content(gap_after_percent=2.5)["sentences"])
+    assert "2.50 %, which is worse" in worse
+    assert "worse" not in text
 
 
 def test_the_sky_is_spoken_of_where_the_improved_model_is_worth_saving():
