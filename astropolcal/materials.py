@@ -258,8 +258,9 @@ class BrendelBormannLaw:
 
     .. math:: \epsilon(\omega) = 1 - \frac{f_0\,\omega_p^2}{\omega(\omega + i\Gamma_0)}
               + \sum_j \frac{i\sqrt\pi f_j\,\omega_p^2}{2\sqrt2\,a_j\sigma_j}
-              \left[w\!\left(\frac{a_j - \omega_j}{\sqrt2\,\sigma_j}\right) + w\!\left(\frac{a_j +
-              \omega_j}{\sqrt2\,\sigma_j}\right)\right], \qquad a_j^2 = \omega^2 + i\omega\Gamma_j
+              \left[w\!\left(\frac{a_j - \omega_j}{\sqrt2\,\sigma_j}\right)
+              + w\!\left(\frac{a_j + \omega_j}{\sqrt2\,\sigma_j}\right)\right],
+              \qquad a_j^2 = \omega^2 + i\omega\Gamma_j
 
     with the Faddeeva function w: each resonance is a Lorentz oscillator whose
     frequency is spread as a Gaussian.

@@ -260,8 +260,9 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
     The characteristic matrix of each film relates the tangential fields on its sides,
 
     .. math:: \begin{pmatrix}\cos\delta & -i\sin\delta/\eta\\
-              -i\eta\sin\delta & \cos\delta\end{pmatrix}, \qquad \delta = \frac{2\pi}{\lambda} q d,
-              \quad \eta_s = q, \quad \eta_p = n^2/q,
+              -i\eta\sin\delta & \cos\delta\end{pmatrix}, \qquad
+              \delta = \frac{2\pi}{\lambda} q d, \quad
+              \eta_s = q, \quad \eta_p = n^2/q,
 
     and the substrate has the fields :math:`(1, \eta)`.
 

@@ -140,10 +140,12 @@ class EllipticalRetarder(Optic):
     Elliptical retarder (paper, :math:`M_\mathrm{ER}`; Chipman et al. 2018).
 
     .. math:: M = \begin{pmatrix}1&0&0&0\\
-              0&C + T\Delta_H^2&T\Delta_H\Delta_{45} + S\Delta_R& T\Delta_H\Delta_R - S\Delta_{45}\\
-              0&T\Delta_H\Delta_{45} - S\Delta_R&C + T\Delta_{45}^2& T\Delta_{45}\Delta_R +
-              S\Delta_H\\ 0&T\Delta_H\Delta_R + S\Delta_{45}&T\Delta_{45}\Delta_R - S\Delta_H& C +
-              T\Delta_R^2\end{pmatrix}
+              0&C + T\Delta_H^2&T\Delta_H\Delta_{45} + S\Delta_R&
+              T\Delta_H\Delta_R - S\Delta_{45}\\
+              0&T\Delta_H\Delta_{45} - S\Delta_R&C + T\Delta_{45}^2&
+              T\Delta_{45}\Delta_R + S\Delta_H\\
+              0&T\Delta_H\Delta_R + S\Delta_{45}&T\Delta_{45}\Delta_R - S\Delta_H&
+              C + T\Delta_R^2\end{pmatrix}
 
     with :math:`\Delta^2 = \Delta_H^2 + \Delta_{45}^2 + \Delta_R^2`,
     :math:`C = \cos\Delta`, :math:`S = \sin\Delta/\Delta` and

@@ -161,7 +161,8 @@ def telescope_information(
     :math:`\psi`, while the diattenuation :math:`D` of the mirror stays along q:
 
     .. math::
-        q' = q \cos 2\psi + u \sin 2\psi + D, \qquad u' = -q \sin 2\psi + u \cos 2\psi .
+        q' = q \cos 2\psi + u \sin 2\psi + D, \qquad
+        u' = -q \sin 2\psi + u \cos 2\psi .
 
     With an offset, the instrument adds a constant in its own frame, which is turned by minus the
     altitude as in the chain of an alt-azimuth telescope's Nasmyth focus. Each frame is taken to
