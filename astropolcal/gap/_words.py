@@ -353,6 +353,8 @@ def _how_large(content):
     text += gaps(*(content[f"gap_{key}"] for key in keys), content["noise_floor_percent"])
     frames = "frames left out of the fit" if content["cross_validated"] else "the frames of the fit"
     text += f": percent of polarization, {'the frames' if content['exchanged'] else frames}."
+    if not content["converged"]:
+        text += " The nominal fit did not converge; its last steps gained less than 2 %."
     if content["verdict"] == "none":
         return text
     chance = content["gap_p_value"]

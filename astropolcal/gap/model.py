@@ -26,8 +26,8 @@ from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 __all__ = []
 
 _ROUNDS, _MORE = 3, 3
-# a fit whose last round lowered chi-square by less than this share is as good as at the bottom: of
-# what it leaves, causes will take far more
+# a fit whose last round lowered chi-square by less than this share is used, and said not to have
+# converged
 _FLAT = 0.02
 # a size so near to its limit, in units of that, is at it; the share of the wavelengths at
 # which the data may leave a size there

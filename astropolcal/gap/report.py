@@ -103,6 +103,8 @@ def _worked_out(diagnosis):
         "n_data": int(diagnosis.nominal.problem.n_data),
         "seconds": diagnosis.seconds,
         "exchanged": exchanged,
+        # the model that an alternative has beaten is not fitted
+        "converged": bool(exchanged or diagnosis.nominal.fit.converged),
         "cross_validated": crossed,
         "noise_floor_percent": diagnosis.noise_floor_percent,
         "gap_before_percent": diagnosis.gap_before_percent,

@@ -64,6 +64,7 @@ def content(*causes, **changes):
         "causes": list(causes) or [entry()],
         "cross_validated": True,
         "exchanged": False,
+        "converged": True,
         "gap_p_value": 1e-9,
         "remainder_p_value": 0.4,
         "gap_before_percent": 2.0,
@@ -258,6 +259,7 @@ def test_every_verdict_has_its_sentence():
         (left, "What is left, 30 % of the gap, is more than noise (p < 1e-6): 20 % of it"),
         ({}, "What is left is noise (p = 0.4)."),
         ({"cross_validated": False}, "the frames of the fit"),
+        ({"converged": False}, "The nominal fit did not converge"),
         ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),
         ({"gap_p_value": 0.0}, "The gap is real (p < 1e-6)."),
     ):
