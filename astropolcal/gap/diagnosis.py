@@ -330,8 +330,7 @@ def _with_noise_of(base, selection):
 def _nested(base, smooth, groups, say, cells):
     """Return the errors on frames of groups that took no part in the choice of the causes."""
     labels, numbers = groups
-    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
-    problem = base.problem
+    found = []
     for k, label in enumerate(labels):
         say(f"without {label}, {k + 1} of {len(labels)}")
         seen = [number == k for number in numbers]
@@ -347,15 +346,8 @@ def _nested(base, smooth, groups, say, cells):
         recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
         whole = base.with_effects(recipes, like=chosen.model, steps=0)
         start = chosen.model.start_of(whole.problem)
-        gaps = whole.problem.differences(start.coefficients)
-        for channel, gap, here in zip(problem.channels, gaps, seen, strict=True):
-            mine = channel.valid & here
-            squares[k] += np.sum(channel.gap(gap)[mine] ** 2)
-            whitened[k] += np.sum(channel.whiten(gap)[:, mine] ** 2) / channel.count
-            counts[k] += mine.sum()
-    keep = counts > 0
-    labels = [label for label, there in zip(labels, keep, strict=True) if there]
-    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
+        found.append(whole.problem.differences(start.coefficients))
+    return HeldOut.of_predictions(base.problem, groups, found)
 
 
 def _library(effects):

@@ -122,8 +122,12 @@ class Model:
     @cached_property
     def p_value(self):
         """Probability of the residuals by noise alone."""
-        tangent = self.problem.tangent(self.fit.coefficients, self.jacobian)
-        return float(stats.chi2.sf(self.fit.chi2, self.problem.n_data - tangent.shape[1]))
+        return float(stats.chi2.sf(self.fit.chi2, self.linear.freedom))
+
+    @cached_property
+    def linear(self):
+        """The model with all of its effects, to first order."""
+        return self._linear(())
 
     def edited(self, *recipes):
         """
@@ -183,6 +187,9 @@ class Model:
 
     def without(self, names):
         """Return the model without some of its effects, to first order."""
+        return self._linear(names) if names else self.linear
+
+    def _linear(self, names):
         problem, q = self.problem, self.fit.coefficients
         kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
         residual = self.residual
@@ -334,8 +341,12 @@ class Linear:
     @property
     def mean_square(self):
         """Mean square of the residuals: 1 where noise is all that is left."""
-        freedom = self.model.problem.n_data - self.tangent.shape[1]
-        return self.chi2 / max(freedom, 1)
+        return self.chi2 / max(self.freedom, 1)
+
+    @cached_property
+    def freedom(self):
+        """Number of data less that of the parameters, of which a prior determines a part."""
+        return self.model.problem.n_data - float(np.sum(self.tangent**2))
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):

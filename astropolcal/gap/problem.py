@@ -10,7 +10,7 @@ from copy import copy as copied
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import null_space, qr, solve_triangular
+from scipy.linalg import LinAlgError, cholesky, null_space, solve, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
 from astropolcal.chain import Train, leaves
@@ -30,6 +30,8 @@ _MAX_STEPS = 40
 _ARRIVED, _ARRIVED_SHARE = 1e-4, 1e-5
 # keeps what the data do not determine where it is
 _HOLD = 1e-6
+# and this where rounding takes normal equations for negative
+_ROUNDED = 1e-9
 # Marquardt's damping, of columns of unit length: where it begins, below what it is dropped,
 # below what it does not count, and above what no step leads down
 _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
@@ -316,9 +318,9 @@ class GapProblem:
         for _ in range(steps):
             if converged:
                 break
-            reduced, growth = self._reduced(q, residual, take, live), 2
+            normal, growth = self._normal(q, residual, take, live), 2
             while damping < _STUCK:
-                step, promised = self._step(q, live, *reduced, damping)
+                step, promised = self._step(q, live, *normal, damping)
                 trial = np.clip(q + step, self.low, self.high)
                 there, new = self._cost(trial, take)
                 if np.isfinite(new) and new <= cost * (1 + 1e-12):
@@ -350,20 +352,19 @@ class GapProblem:
             residual = self.residual(q)[take]
         return residual, residual @ residual + np.sum(((q - self.centre) * self.tight) ** 2)
 
-    def _reduced(self, q, residual, take, live):
-        """Return the least-squares problem of a step with as many rows as coefficients."""
-        slopes = self.jacobian(q)[take][:, live]
-        scale = np.sqrt(np.sum(slopes**2, axis=0) + self.tight[live] ** 2)
+    def _normal(self, q, residual, take, live):
+        """Return the normal equations of a step in columns of unit length, and their lengths."""
+        slopes, tight = self.jacobian(q)[take][:, live], self.tight[live]
+        gram = slopes.T @ slopes + np.diag(tight**2)
+        target = slopes.T @ residual + tight**2 * (self.centre - q)[live]
+        scale = np.sqrt(np.diag(gram))
         scale = np.where(scale > 0, scale, 1.0)
-        matrix, target = _triangle(slopes / scale, residual)
-        offset = (self.centre - q)[live] * self.tight[live]
-        matrix = np.concatenate([matrix, np.diag(self.tight[live] / scale)])
-        return scale, matrix, np.concatenate([target, offset])
+        return gram / np.outer(scale, scale), target / scale, scale
 
-    def _step(self, q, live, scale, matrix, target, damping):
+    def _step(self, q, live, gram, target, scale, damping):
         n = len(scale)
-        held = np.concatenate([matrix, np.sqrt(damping + _HOLD**2) * np.eye(n)])
-        triangle, wanted = _triangle(held, np.concatenate([target, np.zeros(n)]))
+        triangle = _root(gram + (damping + _HOLD**2) * np.eye(n))
+        wanted = solve_triangular(triangle, target, trans="T", check_finite=False) if n else target
         low = (self.low[live] - q[live]) * scale
         high = (self.high[live] - q[live]) * scale
         found = solve_triangular(triangle, wanted, check_finite=False) if n else wanted
@@ -373,10 +374,9 @@ class GapProblem:
         if np.any(rows @ found > room + _AT_WALL):
             rows = np.concatenate([rows, np.eye(n), -np.eye(n)])
             found = _behind_walls(triangle, wanted, rows, np.concatenate([room, high, -low]))
-        left = matrix @ found - target
         step = np.zeros(self.size)
         step[live] = found / scale
-        return step, target @ target - left @ left
+        return step, found @ (2 * target - gram @ found)
 
     # ---- what follows from a fit --------------------------------------------------------
 
@@ -436,14 +436,15 @@ def _within(triangle, wanted, low, high, found):
     2,000 random problems, scipy finds them one by one.
     """
     held = (found < low) | (found > high)
+    gram, target = triangle.T @ triangle, triangle.T @ wanted
     tiny = _ROUNDING * np.linalg.norm(wanted)
     for _ in range(_GUESSES):
         found = np.clip(found, low, high)
         if not held.all():
-            factors, rest = _triangle(triangle[:, ~held], wanted - triangle[:, held] @ found[held])
-            found[~held] = solve_triangular(factors, rest, check_finite=False)
+            rest = target[~held] - gram[np.ix_(~held, held)] @ found[held]
+            found[~held] = solve(gram[np.ix_(~held, ~held)], rest, assume_a="pos")
         # where a bound holds, the sum of squares falls outwards only
-        inwards = triangle.T @ (wanted - triangle @ found) * np.where(found > low, -1.0, 1.0)
+        inwards = (target - gram @ found) * np.where(found > low, -1.0, 1.0)
         wrong = np.where(held, (inwards > tiny) & (low < high), (found < low) | (found > high))
         if not wrong.any():
             return found
@@ -476,12 +477,12 @@ def _behind_walls(triangle, wanted, rows, room):
     return found * max(0.0, np.min(slack[far > slack] / far[far > slack], initial=1.0))
 
 
-def _triangle(matrix, target):
-    """Return the same least-squares problem with a triangle for its matrix."""
-    n = matrix.shape[1]
-    table = np.concatenate([matrix, target[:, None]], axis=1)
-    factors = qr(table, mode="raw", check_finite=False, overwrite_a=True)[0][0][:n]
-    return np.triu(factors[:, :n]), factors[:, n].copy()
+def _root(gram):
+    """Return the upper triangle whose square is a matrix, as near to it as rounding allows."""
+    try:
+        return cholesky(gram, check_finite=False)
+    except LinAlgError:
+        return cholesky(gram + _ROUNDED * np.eye(len(gram)), check_finite=False)
 
 
 class Fit:

@@ -243,7 +243,7 @@ def _checked(task, best):
         names = [one.name for one in best.chosen]
         # with the first cause, the first two and so on, to first order
         steps = [best.model.without(names[i + 1 :]) for i in range(len(names))]
-        steps = [task.base.without(()), *steps]
+        steps = [task.base.linear, *steps]
         history = [_errors(step, task.groups) for step in progress.steps(steps, "models")]
         worse = _worse(best, steps, history, task.groups)
         if not worse:

@@ -18,8 +18,6 @@ from astropolcal.observations.grid import clusters, runs_of_frames
 
 __all__ = []
 
-# next to the solution of all frames the fit to most of them takes few steps
-_STEPS, _SHARE = 8, 1e-5
 # singular values below this share of the largest belong to directions that are open
 _OPEN = 1e-12
 # so many parts of the data are left out in turn
@@ -49,6 +47,31 @@ class HeldOut:
     squares: np.ndarray
     whitened: np.ndarray
     counts: np.ndarray
+
+    @classmethod
+    def of_rows(cls, labels, rows):
+        """Return the errors from squares, whitened squares and number of data of each group."""
+        kept = [(label, row) for label, row in zip(labels, rows, strict=True) if row[2]]
+        return cls([label for label, _ in kept], *np.array([row for _, row in kept]).T)
+
+    @classmethod
+    def of_predictions(cls, problem, groups, gaps):
+        """Return the errors of a prediction for each group: differences of all data each."""
+        labels, numbers = groups
+        rows = []
+        for i, gap in enumerate(gaps):
+            parts = [
+                # mostly two channels a datum: half, so that noise gives 1 a datum
+                (
+                    np.sum(channel.gap(one)[seen] ** 2),
+                    np.sum(channel.whiten(one)[:, seen] ** 2) / channel.count,
+                    seen.sum(),
+                )
+                for number, channel, one in zip(numbers, problem.channels, gap, strict=True)
+                for seen in [channel.valid & (number == i)]
+            ]
+            rows.append(np.sum(parts, axis=0))
+        return cls.of_rows(labels, rows)
 
     @property
     def percent(self):
@@ -121,25 +144,6 @@ def _blocks(observations, count=8):
     return labels, [runs_of_frames(o.n_frames, count) for o in observations]
 
 
-def held_out(model, groups):
-    """Return the prediction errors of a model on frames left out in groups."""
-    labels, numbers = groups
-    problem = model.problem
-    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
-    for i, fit in enumerate(left_out_fits(model, labels, numbers)):
-        for number, channel, gap in zip(
-            numbers, problem.channels, problem.differences(fit.coefficients), strict=True
-        ):
-            seen = channel.valid & (number == i)
-            squares[i] += np.sum(channel.gap(gap)[seen] ** 2)
-            # mostly two channels a datum: half, so that noise gives 1 a datum
-            whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / channel.count
-            counts[i] += seen.sum()
-    keep = counts > 0
-    labels = [label for label, here in zip(labels, keep, strict=True) if here]
-    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
-
-
 def foreseen(model, groups):
     """
     Return the prediction errors on left-out frames to first order, without a fit for each group.
@@ -149,12 +153,12 @@ def foreseen(model, groups):
     model (Cook & Weisberg 1982, Residuals and Influence in Regression, Sec. 2.2).
     """
     labels, numbers = groups
-    linear = model if isinstance(model, Linear) else model.without(())
+    linear = model if isinstance(model, Linear) else model.linear
     problem, tangent, residual = linear.model.problem, linear.tangent, linear.residual
     sizes = [c.shape for c in problem.channels]
-    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
+    found = []
     for i in range(len(labels)):
-        rows, scale = [], []
+        rows, scale, count = [], [], 0
         for number, channel, shape, segment in zip(
             numbers, problem.channels, sizes, problem.segments, strict=True
         ):
@@ -165,10 +169,8 @@ def foreseen(model, groups):
             size = np.zeros(shape)
             size[channel.told] = channel.sigma[channel.told]
             scale.append(size[seen])
-            counts[i] += seen[0].sum()
+            count += seen[0].sum()
         rows, scale = np.concatenate(rows), np.concatenate(scale)
-        if not rows.size:
-            continue
         here = tangent[rows]
         # there are fewer parameters than data of a group
         lever, along = np.linalg.eigh(here.T @ here)
@@ -177,11 +179,10 @@ def foreseen(model, groups):
         pull = (here @ along).T @ residual[rows]
         # N (1 - N^T N)^-1 N^T r is what (1 - N N^T)^-1 r has beyond r
         gap = residual[rows] + here @ (along @ pull)
-        squares[i] = np.sum((gap * scale) ** 2)
-        whitened[i] = np.sum(gap**2) / problem.channels[0].count
-    keep = counts > 0
-    labels = [label for label, here in zip(labels, keep, strict=True) if here]
-    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
+        found.append(
+            (np.sum((gap * scale) ** 2), np.sum(gap**2) / problem.channels[0].count, count)
+        )
+    return HeldOut.of_rows(labels, found)
 
 
 def stability(model, groups, temper):
@@ -234,10 +235,3 @@ def _parts(problem, groups):
         out = problem.rows([bundle[number] == k for number in numbers])
         # what is known is no part of the frames
         yield False, out & (np.arange(len(out)) < len(out) - len(problem.known))
-
-
-def left_out_fits(model, labels, numbers):
-    """Yield the fit of a model without each group of frames."""
-    for i in range(len(labels)):
-        rows = model.problem.rows([number != i for number in numbers])
-        yield model.problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)

@@ -149,6 +149,15 @@ def split_run(text):
     return head, name or None
 
 
+_ROTATING = ("retardance_h", "retardance_d", "rotation")
+# by kind: how often a turn goes round, the generator over that, and the square of this
+_POWERS = {
+    kind: (rate, generator / rate, generator @ generator / rate**2)
+    for kind, generator in GENERATORS.items()
+    for rate in [2.0 if kind == "rotation" else 1.0]
+}
+
+
 class Perturbation(_BeamOptic, FrameOptic):
     r"""
     A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
@@ -233,24 +242,28 @@ class Perturbation(_BeamOptic, FrameOptic):
 
     def _exponential(self, x):
         """Return exp(x G); G G G is G, -G (4 times that for rotations), or G is diagonal."""
-        generator = GENERATORS[self._kind]
         x = np.asarray(x)[..., None, None]
         if self._kind == "gain":
             return (1 + BEAMS[self._beam] * x) * np.eye(4)
-        if self._kind in ("retardance_h", "retardance_d", "rotation"):
-            rate = 2.0 if self._kind == "rotation" else 1.0
-            unit = generator / rate
-            return np.eye(4) + np.sin(rate * x) * unit + (1 - np.cos(rate * x)) * unit @ unit
-        square = generator @ generator
+        rate, unit, square = _POWERS[self._kind]
+        if self._kind in _ROTATING:
+            return np.eye(4) + np.sin(rate * x) * unit + (1 - np.cos(rate * x)) * square
         # for a projector and its negative, sinh and cosh are those of the exponential as well
-        return np.eye(4) + np.sinh(x) * generator + (np.cosh(x) - 1) * square
+        return np.eye(4) + np.sinh(x) * unit + (np.cosh(x) - 1) * square
+
+    def _slope(self, x):
+        """Return the derivative of the exponential."""
+        x = np.asarray(x)[..., None, None]
+        if self._kind == "gain":
+            return np.broadcast_to(BEAMS[self._beam] * np.eye(4), (*x.shape[:-2], 4, 4))
+        rate, unit, square = _POWERS[self._kind]
+        if self._kind in _ROTATING:
+            return rate * (np.cos(rate * x) * unit + np.sin(rate * x) * square)
+        return np.cosh(x) * unit + np.sinh(x) * square
 
     def _derivatives(self, coordinate, amplitude, quadrature):
         x = self._exponent(coordinate, amplitude, quadrature)
-        if self._kind == "gain":
-            slope = np.broadcast_to(BEAMS[self._beam] * np.eye(4), (*np.shape(x), 4, 4))
-        else:
-            slope = GENERATORS[self._kind] @ self._exponential(x)
+        slope = self._slope(x)
         return tuple(
             np.broadcast_to(wave, np.shape(x))[..., None, None] * slope
             for wave in self._waves(coordinate)
