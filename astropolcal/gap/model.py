@@ -43,7 +43,7 @@ _WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
 _FAR_BETTER, _ALIKE = 0.5, 1.1
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
-_FEW = 5
+_FEW = 3
 #: A fit whose residuals are less probable than this may sit in a wrong minimum
 NOISE = 1e-3
 # a second difference above this share of the first one is tried at finite size
