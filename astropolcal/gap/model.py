@@ -155,12 +155,8 @@ class Model:
         return Model(problem, Fit(problem.start, np.inf, False), self.added | added)
 
     def with_effect(self, effect, context=None, **settings):
-        """Return the model with an effect added and everything fitted again."""
-        model = self.edited((effect, context))
-        problem, added = model.problem, model.added
-        starts = off_extremum(problem, problem.start, added[effect.name])
-        fits = [problem.fit(start, **settings) for start in starts]
-        return Model(problem, min(fits, key=lambda one: one.chi2), added)
+        """Return the model with one effect, see `with_effects`."""
+        return self.with_effects([(effect, context)], **settings)
 
     def with_effects(self, effects, like=None, **settings):
         """

@@ -28,8 +28,6 @@ _RETEMPERED = 400
 _QUICK = {"steps": 24, "share": 1e-3}
 # of so many causes two may be one that was not seen while the others were missing
 _MERGED = (3, 4)
-# causes are looked at beside all the others so many times
-_TURNS = 1
 # log evidence by which a name may be behind its cell, and a rival has to be ahead
 _AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
@@ -211,24 +209,13 @@ def _best_of(found, most):
 
 
 def _possible(task, best, scans):
-    """Return the set with causes of impossible size exchanged for the best that are possible."""
+    """Return the set with what is possible in place of causes of impossible size."""
     for one in best.chosen:
-        if best.model.is_physical(one.name):
-            continue
-        others = {other.name for other in best.chosen}
-        found = []
-        for rival in _distinct(scans[one.name].candidates, _FITTED[0]):
-            if rival.name in others or rival.evidence < ENOUGH:
-                continue
-            chosen = [rival if other is one else other for other in best.chosen]
-            model = task.fitted(chosen, best.model)
-            if model.is_physical(rival.name):
-                evidence = best.evidence + rival.evidence - one.evidence
-                found.append((model.fit.chi2, rival.name, _State(model, chosen, evidence)))
-        if found:
-            # derivatives promise little where a cause was impossible: the fits tell which is best
-            _, name, best = min(found, key=lambda item: item[0])
-            scans[name] = scans[one.name]
+        other = None if best.model.is_physical(one.name) else _in_place(task, one, best)
+        if other is not None:
+            fresh = [new.name for new in other.chosen if new.name not in scans]
+            scans |= dict.fromkeys(fresh, scans[one.name])
+            best = other
     return best
 
 
@@ -489,7 +476,8 @@ def _in_place(task, one, state):
             continue
         chosen = [rival if other is one else other for other in state.chosen]
         model = task.fitted(chosen, state.model, **_QUICK)
-        if all(model.is_physical(other.name) for other in chosen):
+        asked = [o for o in chosen if o is rival or state.model.is_physical(o.name)]
+        if all(model.is_physical(other.name) for other in asked):
             lost = 0.5 * (model.fit.chi2 - state.model.fit.chi2) / temper
             dearer = rival.cost(temper) - one.cost(temper)
             return _State(model, chosen, state.evidence - lost - dearer)
@@ -504,45 +492,37 @@ def _exchanged(task, best, first):
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
     scans, like = {}, None
-    for turn in range(_TURNS if best.chosen else 0):
-        before = best
-        task.say("each cause beside all the others")
-        for one in progress.steps(best.chosen[::-1], "causes"):
-            others = [other for other in best.chosen if other is not one]
-            if turn and others == scans.get(one.name, (None,))[0]:
+    task.say("each cause beside all the others")
+    for one in progress.steps(best.chosen[::-1], "causes"):
+        others = [other for other in best.chosen if other is not one]
+        found, is_near = _beside(task, best, one, like) if others else (first, False)
+        like = like or (found.probes if is_near else None)
+        scans[one.name] = found
+        if len(best.chosen) > _MOST:
+            # so many that none is sure: what each can be told from is all that is asked
+            continue
+        rivals = _rivals_beside(found, one, task.library)
+        # of many causes none is sure: the best rival is enough, and all stay
+        few = len(best.chosen) <= _MERGED[1]
+        if few and others and (not rivals or rivals[0].evidence < ENOUGH):
+            # the others do what it did
+            model = task.fitted(others, best.model, **_QUICK)
+            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2)
+            if lost < ENOUGH * max(1.0, best.model.mean_square):
+                best, like = _State(model, others, best.evidence - one.evidence), None
                 continue
-            found, is_near = first, False
-            if others:
-                found, is_near = _beside(task, best, one, like)
-            like = like or (found.probes if is_near else None)
-            scans[one.name] = (others, found)
-            if len(best.chosen) > _MOST:
-                # so many that none is sure: what each can be told from is all that is asked
+        for fresh in rivals if few else rivals[:1]:
+            if (fresh.name, fresh.degree) == (one.name, one.degree):
+                break
+            if fresh.name in {other.name for other in others}:
                 continue
-            rivals = _rivals_beside(found, one, task.library)
-            # of many causes none is sure: the best rival is enough, and all stay
-            few = len(best.chosen) <= _MERGED[1]
-            if few and others and (not rivals or rivals[0].evidence < ENOUGH):
-                # the others do what it did
-                model = task.fitted(others, best.model, **_QUICK)
-                lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2)
-                if lost < ENOUGH * max(1.0, best.model.mean_square):
-                    best, like = _State(model, others, best.evidence - one.evidence), None
-                    continue
-            for fresh in rivals if few else rivals[:1]:
-                if (fresh.name, fresh.degree) == (one.name, one.degree):
-                    break
-                if fresh.name in {other.name for other in others}:
-                    continue
-                chosen = [fresh if o is one else o for o in best.chosen]
-                model = task.fitted(chosen, best.model, **_QUICK)
-                if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                    scans[fresh.name], like = scans.pop(one.name), None
-                    best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
-                    break
-        if best is before:
-            break
-    return best, {name: found for name, (_, found) in scans.items()}
+            chosen = [fresh if o is one else o for o in best.chosen]
+            model = task.fitted(chosen, best.model, **_QUICK)
+            if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
+                scans[fresh.name], like = scans.pop(one.name), None
+                best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
+                break
+    return best, scans
 
 
 def _beside(task, best, one, like):
