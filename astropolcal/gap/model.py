@@ -48,11 +48,6 @@ _FEW = 3
 NOISE = 1e-3
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
-# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
-# leave less than this share, and is sought in so many steps
-_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
-# square of the bend (radian) that another sign has to be worth
-_OTHER_SIGN = 0.01
 
 
 @dataclass
@@ -345,21 +340,15 @@ class Linear:
         return self.model.problem.n_data - float(np.sum(self.tangent**2))
 
 
-def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
+def nominal_model(chains, observations, calibration=None):
     """Fit the nominal chains in both channels, from a calibration that is made if none is given."""
     if calibration is None:
         calibration = nominal_calibration(chains, observations)
-    problem = GapProblem(
-        calibration.chains, observations, like=None if like is None else like.problem
-    )
-    if not fit:
-        residual = problem.residual(problem.start)
-        return Model(problem, Fit(problem.start, float(residual @ residual), False))
-    if like is None:
-        problem.settle_noise()
-    found = in_branch(problem, _lowest(problem, chains))
+    problem = GapProblem(calibration.chains, observations)
+    problem.settle_noise()
+    found = _lowest(problem, chains)
     # in turn: the residuals of a better fit tell the noise better
-    for _ in range(_ROUNDS - 1 if like is None else 0):
+    for _ in range(_ROUNDS - 1):
         problem.settle_noise(found.coefficients)
         found = problem.fit(found.coefficients)
     before = np.inf
@@ -372,7 +361,8 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
             "the nominal fit did not converge: nothing can be said of missing effects; "
             "check the angles, the optics in the beam and the starting values"
         )
-    return Model(problem, found)
+    made = calibration if isinstance(calibration, Calibration) else None
+    return Model(problem, found, calibration=made)
 
 
 def _lowest(problem, chains):
@@ -412,27 +402,22 @@ def starting_model(calibration, observations, library, say):
     Where none does, the second is the nominal model again and the third an empty list; else the
     alternative is followed by its aliases.
     """
-    given = calibration if isinstance(calibration, Calibration) else None
-    chains = calibration.chains if given else calibration
+    chains = calibration.chains if isinstance(calibration, Calibration) else calibration
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
-    made = None
-    if given is None:
-        given = made = nominal_calibration(chains, observations)
-    elif given.measurement is None:
-        given = given.with_observations(observations)
-    if _may_be_wrong(given):
+    # of a calibration too: in other data a wavelength may be in another branch
+    made = nominal_calibration(chains, observations)
+    if _may_be_wrong(made):
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         found = _tried(chains, observations, discrete, say)
-        if found and found[0][0] < _FAR_BETTER * _misfit(given):
+        if found and found[0][0] < _FAR_BETTER * _misfit(made):
             say(f"calibrating: {found[0][1].title}")
             edited = found[0][1].edit(chains, _context(observations)).chains
             best = nominal_calibration(edited, observations)
-            if _misfit(best) < _FAR_BETTER * _misfit(given):
-                return _with_alternative(chains, observations, given, best, found)
-    nominal = nominal_model(chains, observations, calibration=given)
-    nominal.calibration = made if isinstance(made, Calibration) else None
+            if _misfit(best) < _FAR_BETTER * _misfit(made):
+                return _with_alternative(observations, made, best, found)
+    nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
 
 
@@ -472,11 +457,13 @@ def _may_be_wrong(calibration):
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
-def _with_alternative(chains, observations, given, best, found):
+def _with_alternative(observations, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
-    model = nominal_model(best.chains, observations, calibration=best)
+    model = nominal_model(best.chains, observations, best)
     # what fits badly need not converge to be left behind
-    nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
+    problem = GapProblem(given.chains, observations, like=model.problem)
+    residual = problem.residual(problem.start)
+    nominal = Model(problem, Fit(problem.start, float(residual @ residual), False))
     least, effect = found[0]
     model.added[effect.name] = []
     return nominal, model, [effect, *(o for misfit, o in found[1:] if misfit < _ALIKE * least)]
@@ -536,128 +523,3 @@ def _retards(optics, name):
     if isinstance(optic, Perturbation):
         return optic.kind.startswith("retardance") and optic.dependence == "constant"
     return isinstance(optic, LinearRetarder) and name.endswith(".retardance")
-
-
-def in_branch(problem, found):
-    """
-    Return the fit with the wavelengths in other branches that are far better there.
-
-    A retardance of the other sign, or a turn from it, may be a minimum of its own, from which a
-    fit does not leave. Wavelengths that fit much worse than the others are started again from what
-    their neighbours say, with all signs; where those would have all others bent, everything is
-    fitted from the signs of the smoothest course.
-    """
-    slots = [s for s in problem.free.slots if s.per_wavelength and s.name not in problem.laws]
-    slots = [slot for slot in slots if slot.size == len(problem.wavelength)]
-    if not slots or stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > NOISE:
-        return found
-    for starts in (_mended(problem, slots, found.coefficients), _smoothest(problem, slots, found)):
-        for start in starts:
-            again = problem.fit(start)
-            found = again if again.converged and again.chi2 < found.chi2 else found
-    return found
-
-
-def _mended(problem, slots, coefficients):
-    """Yield the coefficients with the wavelengths that fit worst in a better branch, if any are."""
-    before = _by_wavelength(problem, coefficients)
-    bad = before > _CONSPICUOUS * np.median(before)
-    if not bad.any() or np.sum(~bad) < 2:
-        return
-    live = np.zeros(problem.size, dtype=bool)
-    for slot in slots:
-        live[problem.slices[slot.name]] = bad
-    rows = problem.rows([bad[d.bins][:, None] for d in problem.datasets])
-    best, least = coefficients.copy(), before
-    for start in _branches(problem, slots, coefficients, bad):
-        trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients
-        after = _by_wavelength(problem, trial)
-        better = bad & (after < least)
-        for slot in slots:
-            where = problem.slices[slot.name]
-            best[where] = np.where(better, trial[where], best[where])
-        least = np.where(better, after, least)
-    # what a wavelength gains has to be more than what a fit may still win by itself
-    if np.any(least < _FAR_LESS * before):
-        yield best
-
-
-def _smoothest(problem, slots, found):
-    """Yield the coefficients with the signs of retardances that make their courses smoothest."""
-    start = found.coefficients.copy()
-    for slot in slots:
-        where = problem.slices[slot.name]
-        if slot.unit == u.deg and slot.size > 2:
-            start[where] = _smooth(
-                problem.wavelength, start[where], problem.low[where], problem.high[where]
-            )
-    if not np.array_equal(start, found.coefficients):
-        yield start
-
-
-def _smooth(wavelength, values, low, high):
-    """Return values with the signs and turns with which their course is least bent."""
-    turn = 2 * np.pi
-    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
-    # what is out of the bounds is no choice; its own value is always one, and preferred
-    cost = np.where((choices >= low) & (choices <= high), _OTHER_SIGN, np.inf)
-    cost[0] = 0.0
-    total, back = cost[:, :1] + cost[:, 1], []
-    for i in range(2, len(values)):
-        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
-        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
-        straight = second[None] + share * (second[None] - first[:, None])
-        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
-        back.append(bends.argmin(axis=0))
-        total = bends.min(axis=0)
-    path = list(np.unravel_index(total.argmin(), total.shape))
-    for step in reversed(back):
-        path.insert(0, int(step[path[0], path[1]]))
-    return choices[path, np.arange(len(values))]
-
-
-def _datasets(problem):
-    return zip(problem.channels, problem.datasets, strict=True)
-
-
-def _by_wavelength(problem, coefficients):
-    """Return the mean square of the residuals at each wavelength."""
-    square = problem.residual(coefficients) ** 2
-    total, count = np.zeros((2, len(problem.wavelength)))
-    for (channel, dataset), rows in zip(_datasets(problem), problem.segments, strict=True):
-        total[dataset.bins] += square[rows].reshape(channel.shape).sum(axis=(0, 2))
-        count[dataset.bins] += channel.count * channel.valid.sum(axis=1)
-    return total / np.maximum(count, 1)
-
-
-def _branches(problem, slots, coefficients, bad):
-    """Yield starts at which wavelengths are as their neighbours say, with one sign or another."""
-    smooth = {}
-    for slot in slots:
-        values = coefficients[problem.slices[slot.name]]
-        # a retardance is known up to a turn
-        good = np.unwrap(values[~bad]) if slot.unit == u.deg else values[~bad]
-        smooth[slot.name] = np.interp(problem.wavelength, problem.wavelength[~bad], good)
-    angles = [slot.name for slot in slots if slot.unit == u.deg]
-    for flipped in dict.fromkeys([(), tuple(angles), *((name,) for name in angles)]):
-        start = coefficients.copy()
-        for slot in slots:
-            where, value = problem.slices[slot.name], smooth[slot.name]
-            value = -value if slot.name in flipped else value
-            if slot.name in angles:
-                value = _within(value, problem.low[where], problem.high[where])
-            start[where] = np.where(bad, value, start[where])
-        yield np.clip(start, problem.low, problem.high)
-    own = coefficients.copy()
-    for name in angles:
-        where = problem.slices[name]
-        turned = _within(-own[where], problem.low[where], problem.high[where])
-        own[where] = np.where(bad, turned, own[where])
-    yield np.clip(own, problem.low, problem.high)
-
-
-def _within(angle, low, high):
-    """Return an angle, radian, moved by a turn where that brings it within its bounds."""
-    turn = 2 * np.pi
-    angle = np.where((angle < low) & (angle + turn <= high), angle + turn, angle)
-    return np.where((angle > high) & (angle - turn >= low), angle - turn, angle)

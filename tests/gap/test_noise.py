@@ -162,7 +162,7 @@ def test_a_calibration_and_its_diagnosis_compare_with_the_same_noise():
             table[beam] = factor * table[beam]
         observations = Observations.from_table(table, name="lamp")
         cal = calibrate(data.chain(), observations, cross_validate=False)
-        model = nominal_model(cal.chains, [observations], calibration=cal)
+        model = nominal_model(cal.chains, [observations], cal)
         *_, told = cal.fit["lack_of_fit"]
         assert told["noise"] == "roughness"
         noise = Doubles(model).noise_percent
