@@ -39,83 +39,48 @@ class _Medium:
         # eta_s = q, eta_p = n^2 / q
         self.admittance = np.stack([self.normal, index * index / self.normal])
 
-    def to_index(self):
-        """Return the derivatives of the normal wave number and the admittance to the index."""
-        slope = self.index / self.normal
+    def slopes(self, to_admittance, to_normal=0.0):
+        """Return derivatives to index and alpha from those to admittance and normal wave number."""
+        ratio, fall = self.index / self.normal, -self.alpha / self.normal
         # dq/dn = n / q, so that d(n^2 / q)/dn = 2 n / q - (n / q)^3
-        return slope, np.stack([slope, 2 * slope - slope**3])
-
-    def to_alpha(self):
-        """Return the derivatives of the normal wave number and the admittance to alpha."""
-        slope = -self.alpha / self.normal
+        by_index = np.stack([ratio, 2 * ratio - ratio**3])
         # dq/d(alpha) = -alpha / q, and d(n^2 / q)/dq = -(n / q)^2
-        return slope, np.stack([slope, -slope * (self.index / self.normal) ** 2])
-
-
-class _Film(_Medium):
-    """A film: its characteristic matrix without the phase of one passage, which cancels in r."""
-
-    def __init__(self, index, alpha, thickness, wavelength):
-        super().__init__(index, alpha)
-        self.wave = 2j * _TURN / wavelength
-        self.thickness = thickness
-        # twice the passage; never grows, so that a thick film overflows nowhere
-        self.echo = np.exp(self.wave * thickness * self.normal)
-
-    def times(self, upper, lower):
-        """Return the tangential fields upstream of the film from those downstream of it."""
-        plus, minus = (1 + self.echo) / 2, (1 - self.echo) / 2
-        front = plus * upper + minus / self.admittance * lower
-        return front, self.admittance * minus * upper + plus * lower
-
-    def back(self, upper, lower):
-        """Return a row vector times the matrix of the film."""
-        plus, minus = (1 + self.echo) / 2, (1 - self.echo) / 2
-        front = plus * upper + self.admittance * minus * lower
-        return front, minus / self.admittance * upper + plus * lower
-
-    def slopes(self, row, fields):
-        """Return the derivatives of row times fields to the admittance and to the echo."""
-        (left, right), (upper, lower) = row, fields
-        eta, minus = self.admittance, (1 - self.echo) / 2
-        to_admittance = minus * (right * upper - left * lower / eta**2)
-        to_echo = 0.5 * (left * (upper - lower / eta) + right * (lower - eta * upper))
-        return to_admittance, to_echo
+        by_alpha = np.stack([fall, -fall * ratio**2])
+        return (
+            to_normal * ratio + to_admittance * by_index,
+            to_normal * fall + to_admittance * by_alpha,
+        )
 
 
 class _Stack:
     """
     Amplitudes of a stack on canonical floats; s and p are the first axis.
 
-    ``indices`` runs from the ambient to the substrate, ``thicknesses`` over the films.
+    ``indices`` runs from the ambient to the substrate, ``thicknesses`` over the films. The
+    admittance Y of the light, the ratio of its tangential fields, is carried through the films from
+    the substrate on.
     """
 
     def __init__(self, wavelength, incidence, indices, thicknesses):
-        count = len(indices)
         arrays = np.broadcast_arrays(wavelength, incidence, *indices, *thicknesses)
         wavelength, self.incidence = arrays[:2]
-        indices, thicknesses = arrays[2 : 2 + count], arrays[2 + count :]
+        indices, thicknesses = arrays[2 : 2 + len(indices)], arrays[2 + len(indices) :]
         alpha = indices[0].real * np.sin(self.incidence)
-        self.ambient = _Medium(indices[0] + 0j, alpha)
-        self.substrate = _Medium(indices[-1] + 0j, alpha)
-        self.films = [
-            _Film(index + 0j, alpha, thickness, wavelength)
-            for index, thickness in zip(indices[1:-1], thicknesses, strict=True)
-        ]
-        self._solve()
-
-    def _solve(self):
-        # no light comes back from the substrate: its tangential fields are (1, eta)
-        fields = np.ones_like(self.substrate.admittance), self.substrate.admittance
-        self.fields = [fields]
-        for film in reversed(self.films):
-            fields = film.times(*fields)
-            self.fields.insert(0, fields)
-        upper, lower = fields
-        eta = self.ambient.admittance
-        # what comes in and what goes back are (eta E + H) / 2 and (eta E - H) / 2
-        self.total = eta * upper + lower
-        self.tangential = (eta * upper - lower) / self.total
+        self.ambient, *films, self.substrate = (_Medium(index + 0j, alpha) for index in indices)
+        # no light comes back from the substrate
+        y, field, self.films = self.substrate.admittance, 1.0, []
+        for film, thickness in zip(films[::-1], thicknesses[::-1], strict=True):
+            wave, eta = 2j * _TURN / wavelength, film.admittance
+            # twice the passage; never grows, so that a thick film overflows nowhere
+            echo = np.exp(wave * thickness * film.normal)
+            # of the characteristic matrix without the phase of one passage, which cancels in r
+            under = 1 + echo + y * (1 - echo) / eta
+            self.films.insert(0, (film, wave, thickness, echo, y, under))
+            field = field * under / 2
+            y = (y * (1 + echo) + eta * (1 - echo)) / under
+        self.y, eta = y, self.ambient.admittance
+        # what comes in and what goes back are (eta + Y) / 2 and (eta - Y) / 2 of the field
+        self.total, self.tangential = (eta + y) * field, (eta - y) / (eta + y)
 
     @property
     def amplitudes(self):
@@ -126,7 +91,7 @@ class _Stack:
     def transmittances(self):
         """Return T_s and T_p into the substrate."""
         # the phase of one passage that the films left out, squared
-        loss = np.prod([np.abs(film.echo) for film in self.films], axis=0)
+        loss = np.prod([np.abs(echo) for _, _, _, echo, _, _ in self.films], axis=0)
         out = 4 * self.ambient.admittance.real * self.substrate.admittance.real
         return out * loss / np.abs(self.total) ** 2
 
@@ -142,46 +107,29 @@ class _Stack:
         To the incidence (one), to the indices downstream of the ambient (a list with the substrate
         last), and to the thicknesses (a list). It is holomorphic in the indices.
         """
-        rows = self._rows()
-        upper = self.fields[0][0] * (1 - self.tangential) / self.total
-        to_alpha = _chain(self.ambient.to_alpha(), 0.0, upper)
+        y, eta = self.y, self.ambient.admittance
+        # of ln r = ln(eta - Y) - ln(eta + Y)
+        to_y = -2 * eta / (eta**2 - y**2)
+        _, to_alpha = self.ambient.slopes(2 * y / (eta**2 - y**2))
         indices, thicknesses = [], []
-        for film, row, fields in zip(self.films, rows, self.fields[1:], strict=False):
-            to_admittance, to_echo = film.slopes(row, fields)
+        for film, wave, thickness, echo, below, under in self.films:
+            eta = film.admittance
+            # the derivatives of Y above the film, see `__init__`
+            to_echo = to_y * 2 * (below**2 - eta**2) / (eta * under**2)
+            to_eta = to_y * (y / eta - 4 * below * echo / (eta * under**2))
+            to_y, y = to_y * 4 * echo / under**2, below
             # echo = exp(2i 2 pi / lambda d q)
-            to_normal = to_echo * film.wave * film.thickness * film.echo
-            thicknesses.append(to_echo * film.wave * film.normal * film.echo)
-            indices.append(_chain(film.to_index(), to_normal, to_admittance))
-            to_alpha = to_alpha + _chain(film.to_alpha(), to_normal, to_admittance)
-        # the fields in the substrate are (1, admittance)
-        right = rows[-1][1]
-        indices.append(_chain(self.substrate.to_index(), 0.0, right))
-        to_alpha = to_alpha + _chain(self.substrate.to_alpha(), 0.0, right)
+            to_phase = to_echo * wave * echo
+            thicknesses.append(to_phase * film.normal)
+            to_index, more = film.slopes(to_eta, to_phase * thickness)
+            indices.append(to_index)
+            to_alpha = to_alpha + more
+        to_index, more = self.substrate.slopes(to_y)
         # alpha = n_0 sin(incidence)
-        to_incidence = to_alpha * self.ambient.index.real * np.cos(self.incidence)
-        return (
-            self._of_log(to_incidence),
-            [self._of_log(slope) for slope in indices],
-            [self._of_log(slope) for slope in thicknesses],
-        )
-
-    def _rows(self):
-        """Return the derivative of the amplitudes to the fields upstream of each layer."""
-        eta, r = self.ambient.admittance, self.tangential
-        # r = (eta E - H) / (eta E + H), by E and by H
-        rows = [(eta * (1 - r) / self.total, -(1 + r) / self.total)]
-        for film in self.films:
-            rows.append(film.back(*rows[-1]))
-        return rows
-
-    def _of_log(self, slope):
-        # d ln(r_p / r_s); the sign of r_p cancels
-        return slope[1] / self.tangential[1] - slope[0] / self.tangential[0]
-
-
-def _chain(slopes, to_normal, to_admittance):
-    normal, admittance = slopes
-    return to_normal * normal + to_admittance * admittance
+        to_incidence = (to_alpha + more) * self.ambient.index.real * np.cos(self.incidence)
+        found = [to_incidence, *indices, to_index, *thicknesses]
+        incidence, *found = [p - s for s, p in found]
+        return incidence, found[: len(indices) + 1], found[len(indices) + 1 :]
 
 
 def _wrapped(phase):
@@ -315,25 +263,25 @@ def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):
         raise ParameterError(f"ambient = {ambient}; allowed are real, positive indices")
     indices = [entrance]
     indices += [_index(material, lam) for material in (*(m for m, _ in films), substrate)]
-    stack = _checked_stack(lam, incidence, indices, [_thickness(d) for _, d in films])
-    r_s, r_p = stack.amplitudes
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # at the Brewster angle of a transparent body the phase of p has no slope
-        slopes = stack.log_slopes()
-    return Reflection(r_s, r_p, *stack.transmittances(), slopes)
-
-
-def _checked_stack(lam, incidence, indices, thicknesses):
+    thicknesses = [length_to_um(thickness, "thickness") for _, thickness in films]
+    for thickness in thicknesses:
+        if not np.all(np.isfinite(thickness) & (thickness >= 0)):
+            raise ParameterError(f"thickness = {thickness} um must be finite and not negative")
     angle = angle_to_rad(incidence, "incidence")
     if not np.all((angle >= 0) & (angle < np.pi / 2)):
         raise ParameterError(f"incidence = {incidence}; allowed are 0 deg to less than 90 deg")
     try:
-        return _Stack(lam, angle, indices, thicknesses)
+        stack = _Stack(lam, angle, indices, thicknesses)
     except ValueError:
         raise ParameterError(
             "wavelength, incidence, indices and thicknesses must broadcast together; their shapes "
             f"are {[np.shape(x) for x in (lam, angle, *indices, *thicknesses)]}"
         ) from None
+    r_s, r_p = stack.amplitudes
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # at the Brewster angle of a transparent body the phase of p has no slope
+        slopes = stack.log_slopes()
+    return Reflection(r_s, r_p, *stack.transmittances(), slopes)
 
 
 def _index(material, lam):
@@ -350,10 +298,3 @@ def _plain_index(value):
     if not np.all(np.isfinite(index) & (index.real >= 0) & (index.imag >= 0) & (index != 0)):
         raise ParameterError(f"index = {value}; allowed are n + ik with n and k not negative")
     return index
-
-
-def _thickness(value):
-    thickness = length_to_um(value, "thickness")
-    if not np.all(np.isfinite(thickness) & (thickness >= 0)):
-        raise ParameterError(f"thickness = {value} must be finite and not negative")
-    return thickness
