@@ -19,8 +19,8 @@ from astropolcal.units import angle_to_rad, to_unit
 
 __all__ = ["elliptical_retarder", "linear_retarder", "rotate"]
 
-# sums of four factors, each known to a few 1e-16, lie on the limit to within this
-_ROUNDING = 1e-12
+#: Matrices with a one in a row and a column, (row, column, 4, 4).
+UNITS = np.eye(16).reshape(4, 4, 4, 4)
 
 
 def _mueller_array(matrix):
@@ -155,20 +155,6 @@ def rotate(matrix, angle):
     return _rotate(_mueller_array(matrix), _finite_angle(angle, "angle"))
 
 
-def linear_polarizer():
-    """Return an ideal polarizer that passes +Q and half of unpolarized light."""
-    return 0.5 * _diattenuator_retarder(1.0, 0.0)
-
-
-def diattenuator(diattenuation):
-    """
-    Return a linear diattenuator, (..., 4, 4).
-
-    Positive where +Q passes better, of unit transmission for unpolarized light.
-    """
-    return diattenuator_retarder(diattenuation, 0 * u.rad)
-
-
 def linear_retarder(retardance):
     r"""
     Return a linear retarder with its axis along Q.
@@ -255,27 +241,6 @@ def elliptical_retarder(horizontal, diagonal, circular):
     )
 
 
-def depolarizer(q, u=None, v=None):
-    """
-    Return a diagonal depolarizer of factors on Q, U and V.
-
-    It is possible where ``1 + q + u + v``, ``1 + q - u - v`` and so on are not negative.
-    """
-    q = _fraction(q, "q")
-    u, v = (q if x is None else _fraction(x, name) for x, name in ((u, "u"), (v, "v")))
-    # the coherency matrix of a diagonal matrix is diagonal, a quarter of these four sums
-    factors = np.stack(np.broadcast_arrays(np.ones(()), q, u, v), axis=-1)
-    signs = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]])
-    bad = ((factors @ signs) < -_ROUNDING).any(axis=-1)
-    if bad.any():
-        q, u, v = (float(x) for x in factors[bad][0, 1:])
-        raise ParameterError(
-            f"depolarizer factors q = {q}, u = {u}, v = {v} must satisfy "
-            "|q + u| <= 1 + v and |q - u| <= 1 - v"
-        )
-    return factors[..., None] * np.eye(4)
-
-
 # sqrt(1 - eps^2) has no derivative at |eps| = 1: a floor keeps it finite there
 _ROOT_FLOOR = 1e-8
 
@@ -330,13 +295,17 @@ def fill_phase_block(matrix, c, s):
     np.negative(s, out=matrix[..., 3, 2])
 
 
-def diattenuation_slope(diattenuation, c, s):
-    """Return the derivative of a diattenuator-retarder, by cosine and sine of its retardance."""
-    out = blank(diattenuation, c)
-    out[..., 0, 1] = out[..., 1, 0] = 1.0
-    slope = -diattenuation / np.maximum(transverse_share(diattenuation), _ROOT_FLOOR)
-    fill_phase_block(out, slope * c, slope * s)
-    return out
+def diattenuator_retarder_slopes(diattenuation, retardance):
+    """Return the derivatives of a diattenuator-retarder to its diattenuation and retardance."""
+    to_diattenuation = blank(diattenuation, retardance)
+    to_retardance = np.zeros_like(to_diattenuation)
+    c, s, root = np.cos(retardance), np.sin(retardance), transverse_share(diattenuation)
+    slope = -diattenuation / np.maximum(root, _ROOT_FLOOR)
+    to_diattenuation[..., 0, 1] = to_diattenuation[..., 1, 0] = 1.0
+    fill_phase_block(to_diattenuation, slope * c, slope * s)
+    # the block of (U, V) is root * [[c, s], [-s, c]]
+    fill_phase_block(to_retardance, -root * s, root * c)
+    return to_diattenuation, to_retardance
 
 
 # closer to one than this, a diattenuation is that of a polarizer

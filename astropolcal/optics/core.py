@@ -17,11 +17,11 @@ import numpy as np
 from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
+from astropolcal.mueller import _rotate, _rotation_matrix, blank, rotation_generator, turn
 from astropolcal.optics._modelling import (
     KeywordOnly,
     add_parameters,
-    copied_attributes,
+    deep_copied,
     joined,
     values_text,
 )
@@ -73,17 +73,6 @@ def finite_position(value, name, stage=None):
     if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
     return position
-
-
-def check_broadcast(wavelength, position):
-    """Refuse positions and wavelengths that do not broadcast."""
-    try:
-        np.broadcast_shapes(np.shape(wavelength), np.shape(position))
-    except ValueError:
-        raise ParameterError(
-            f"positions of shape {np.shape(position)} do not broadcast against wavelengths of "
-            f"shape {np.shape(wavelength)}; give the positions the shape (n_frames, 1)"
-        ) from None
 
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
@@ -243,29 +232,40 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                 )
         super().__setattr__(attr, value)
 
-    def __deepcopy__(self, memo):
-        new = self.__class__.__new__(self.__class__)
-        memo[id(self)] = new
-        copied_attributes(self, new, memo)
-        return new
+    __deepcopy__ = deep_copied
 
     def __repr__(self):
-        settings = "".join(f", {key}={value!r}" for key, value in self._unlike_default().items())
-        return f"<{type(self).__name__}({values_text(self)}{settings})>"
-
-    def _unlike_default(self):
-        """Return the settings that are not those of the class, name and mount last."""
-        settings = self._settings()
-        last = {key: settings.pop(key) for key in ("mount", "name")}
-        known = inspect.signature(type(self)).parameters
-        return {
-            key: value
-            for key, value in (settings | last).items()
+        settings, known = self._settings(), inspect.signature(type(self)).parameters
+        # name and mount last
+        settings |= {key: settings.pop(key) for key in ("mount", "name")}
+        words = [
+            f", {key}={value!r}"
+            for key, value in settings.items()
             if key not in known or value != known[key].default
-        }
+        ]
+        return f"<{type(self).__name__}({values_text(self)}{''.join(words)})>"
 
-    #: Methods of the wavelength that `curve` draws, with the unit of their values.
+    #: Methods of the wavelength that `curve` draws, with the unit of their values; ``_law`` has
+    #: value and derivatives to the parameters, canonical, by name of the law.
     _laws = {}
+
+    def _laws_at(self, wavelength):
+        """Return of each law the value and the derivatives by parameter, plain in their units."""
+        dispersion, _, values = self._resolve(wavelength, None)
+        factors = [canonical_factor(getattr(self, key).unit) for key in self.own_names]
+        found = {}
+        for name, unit in self._laws.items():
+            value, slopes = self._law(name, dispersion, *values)
+            own = zip(self.own_names, slopes, factors, strict=True)
+            scale = canonical_factor(unit)
+            found[name] = value / scale, {key: slope * f / scale for key, slope, f in own}
+        return found
+
+    def _as(self, kind, **settings):
+        """Return an optic of another kind, whose theta is as free as that of this one."""
+        new = kind(theta=self.theta.quantity, **settings)
+        new.theta.fixed, new.theta.bounds = self.theta.fixed, self.theta.bounds
+        return new
 
     # ---- where the optic stands ------------------------------------------
 
@@ -324,18 +324,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             parameter = getattr(self, key)
             self._check_unit(key, parameter.unit)
             values.append(np.asarray(parameter.value) * canonical_factor(parameter.unit))
-        self._check_length(values)
-        return values
-
-    def _check_length(self, values):
-        """Refuse a diattenuation of more than one, which has no Mueller matrix."""
         where = [self.param_names.index(key) for key in self._components]
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
+        # such a diattenuation has no Mueller matrix
         if np.any(length > 1 + _ROUNDING):
             raise ParameterError(
                 f"{self.name or type(self).__name__}: the diattenuation is {np.max(length):.4g}; "
                 "allowed is 1 at most"
             )
+        return values
 
     def _check_unit(self, key, unit):
         # a fitter may leave a parameter behind without its unit
@@ -344,6 +341,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                 f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
                 f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
             )
+
+    def of_beam(self, beam):
+        """Return a copy that follows a beam; the optic itself if it has none."""
+        if not hasattr(self, "beam"):
+            return self
+        new = self.copy()
+        new.beam = beam
+        return new
 
     @property
     def own_names(self):
@@ -474,6 +479,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def _dispersion_at(self, wavelength):
         """Return the dispersion, or None without a wavelength where none is needed."""
+        if wavelength is not None and not np.all(wavelength > 0):
+            raise ParameterError(f"wavelength = {wavelength} um must be positive")
         # only a law needs the wavelength; a constant matrix is the same at all
         if wavelength is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
@@ -482,13 +489,17 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _read(self, wavelength, position, parameters):
         values = self.canonical_values() if parameters is None else parameters
         lam = None if wavelength is None else length_to_um(wavelength)
-        if lam is not None and not np.all(lam > 0):
-            raise ParameterError(f"wavelength = {wavelength} must be positive")
         values = self.values_at(lam, values)
         turned = self._position
         if position is not None:
             turned = finite_position(position, "position", self.stage)
-        check_broadcast(lam, turned)
+        try:
+            np.broadcast_shapes(np.shape(lam), np.shape(turned))
+        except ValueError:
+            raise ParameterError(
+                f"positions of shape {np.shape(turned)} do not broadcast against wavelengths of "
+                f"shape {np.shape(lam)}; give the positions the shape (n_frames, 1)"
+            ) from None
         return lam, self.stage_sign * turned, values
 
     def _moved(self, dispersion, angle, shift):
@@ -726,6 +737,24 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
         own = {key: getattr(self, key) for key in self._declared_settings}
         return {"name": self.name, "mount": self.mount} | own
+
+
+class _LinearOptic(Optic):
+    """An optic whose matrix is a constant and, for each parameter, one times its value."""
+
+    _constant = np.zeros((4, 4))
+    _terms = ()
+
+    def _matrix(self, dispersion, *values):
+        out = blank(*values)
+        out += self._constant
+        for value, term in zip(values, self._terms, strict=True):
+            out += np.asarray(value)[..., None, None] * term
+        return out
+
+    def _derivatives(self, dispersion, *values):
+        shape = blank(*values).shape
+        return tuple(np.broadcast_to(term, shape) for term in self._terms)
 
 
 class Inverse(FittableModel):

@@ -63,11 +63,7 @@ class Curve(SharedParameters):
     def __init__(self, chain, optics, input_unit, unit=None):
         super().__init__()
         self._chain, self._input_unit, self._unit = chain, input_unit, unit
-        self._plan_for(optics)
-        self._take(optics)
-
-    def _plan_for(self, optics):
-        """Note which number each value of the optics is, and its factor to canonical units."""
+        # which number each value of the optics is, and its factor to canonical units
         self._names_of, self._plan = {}, []
         for i, optic in enumerate(optics):
             plan = []
@@ -82,6 +78,7 @@ class Curve(SharedParameters):
                     plan.append((None, factor))
             self._plan.append(plan)
         self._several = any(place is None for plan in self._plan for place, _ in plan)
+        self._take(optics)
 
     def _take(self, optics):
         self._optics = optics
@@ -118,16 +115,7 @@ class Curve(SharedParameters):
     def evaluate(self, x, *parameters):
         """Return the values at ``x``; without units numbers are in the units of the curve."""
         values = self._values(self._at(x), self._canonical(parameters))
-        return values.reshape(np.shape(x)) / self._scale
-
-    @property
-    def _scale(self):
-        """The unit of the values in canonical ones."""
-        known, scale = self._memo.get("unit", (self, None))
-        if known is not self._unit:
-            scale = canonical_factor(self._unit)
-            self._memo["unit"] = self._unit, scale
-        return scale
+        return values.reshape(np.shape(x)) / canonical_factor(self._unit)
 
     @property
     def fit_deriv(self):
@@ -136,7 +124,7 @@ class Curve(SharedParameters):
 
     def _fit_deriv(self, x, *parameters):
         slopes = self._slopes(self._at(x), self._canonical(parameters))
-        out, scale = np.zeros((len(parameters), np.size(x))), self._scale
+        out, scale = np.zeros((len(parameters), np.size(x))), canonical_factor(self._unit)
         for plan, own in zip(self._plan, slopes, strict=True):
             for (place, factor), slope in zip(plan, own, strict=True):
                 if place is not None:
@@ -173,6 +161,14 @@ class Curve(SharedParameters):
             found.append(full[len(theta) :])
         return found
 
+    def _once(self, make, place, values):
+        """Return what is made of an input and values; a fitter asks twice at the same point."""
+        there, then, found = self._memo.get(make.__name__, (None, None, None))
+        if there is not place or then is not values:
+            found = make(place, values)
+            self._memo[make.__name__] = place, values, found
+        return found
+
     def _at(self, x):
         """Return what depends on the input alone."""
         x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
@@ -197,21 +193,21 @@ class LawCurve(Curve):
         return optic.own_names
 
     def _located(self, x):
-        return x, self._optics[0]._dispersion_at(_positive(x))
+        return x, self._optics[0]._dispersion_at(x)
+
+    def _found(self, place, values):
+        (optic,), (x, dispersion) = self._optics, place
+        (own,) = self._values_at(x, values)
+        if self._law in optic._laws:
+            return optic._law(self._law, dispersion, *own)
+        slopes = [float(key == self._law) for key in optic.own_names]
+        return own[optic.own_names.index(self._law)], slopes
 
     def _values(self, place, values):
-        (optic,), (x, dispersion) = self._optics, place
-        (own,) = self._values_at(x, values)
-        if self._law in optic._laws:
-            return getattr(optic, f"_{self._law}")(dispersion, *own) + np.zeros(x.shape)
-        return own[optic.own_names.index(self._law)] + np.zeros(x.shape)
+        return self._once(self._found, place, values)[0] + np.zeros(place[0].shape)
 
     def _slopes(self, place, values):
-        (optic,), (x, dispersion) = self._optics, place
-        (own,) = self._values_at(x, values)
-        if self._law in optic._laws:
-            return [getattr(optic, f"_{self._law}_slopes")(dispersion, *own)]
-        return [[float(key == self._law) for key in optic.own_names]]
+        return [self._once(self._found, place, values)[1]]
 
 
 class LightCurve(Curve):
@@ -245,21 +241,22 @@ class LightCurve(Curve):
                 )
         if (self._against == "wavelength") and self._wavelength is not None:
             raise ParameterError("a curve against wavelength is at no single wavelength")
-        if np.ndim(self._wavelength) or not np.all(np.asarray(self._wavelength or 1.0) > 0):
-            raise ParameterError("a curve against a stage is at one positive wavelength")
+        if np.ndim(self._wavelength):
+            raise ParameterError("a curve against a stage is at one wavelength")
         if self._observable is not None and not any(optic.splits_light for optic in optics):
             raise ChainError("the chain has no beam splitter, so it has no such observable")
 
     def _take(self, optics):
         super()._take(optics)
         # an observable needs the optics of either beam
-        beams = [None] if self._observable is None else ["right", "left"]
-        self._arms = [[_of_beam(optic, beam) for optic in optics] for beam in beams]
+        self._arms = [optics]
+        if self._observable is not None:
+            self._arms = [[optic.of_beam(beam) for optic in optics] for beam in ("right", "left")]
 
     def _located(self, x):
         wavelength, positions = self._wavelength, dict(self._positions)
         if self._against == "wavelength":
-            wavelength = _positive(x)
+            wavelength = x
         else:
             # what is given of this stage is added
             positions[self._against] = positions.get(self._against, 0.0) + (
@@ -273,12 +270,7 @@ class LightCurve(Curve):
 
     def _beams(self, place, values):
         """Return of each beam what happens at its optics, and the light that leaves them."""
-        # a fitter asks for values and derivatives at the same point
-        there, then, beams = self._memo.get("beams", (None, None, None))
-        if there is not place or then is not values:
-            beams = [self._beam(arm, place, values) for arm in self._arms]
-            self._memo["beams"] = place, values, beams
-        return beams
+        return [self._beam(arm, place, values) for arm in self._arms]
 
     def _beam(self, arm, place, values):
         wavelength, places = place
@@ -303,7 +295,7 @@ class LightCurve(Curve):
         return steps, light
 
     def _values(self, place, values):
-        found = [self._flux(light) for _, light in self._beams(place, values)]
+        found = [self._flux(light) for _, light in self._once(self._beams, place, values)]
         return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
 
     def _flux(self, light):
@@ -312,7 +304,7 @@ class LightCurve(Curve):
         return (flux if flux.shape == shape else np.broadcast_to(flux, shape))[:, None]
 
     def _slopes(self, place, values):
-        beams = self._beams(place, values)
+        beams = self._once(self._beams, place, values)
         if self._observable is None:
             return self._slopes_of_beam(beams[0][0])
         found = [self._flux(light) for _, light in beams]
@@ -368,23 +360,15 @@ class ElementCurve(LightCurve):
         block = tuple(slice(1, 3) if i in (1, 2) else slice(i, i + 1) for i in self._element)
         return sides, [*map(_in_plane, sides)], block, matrix[block], dispersion, own
 
-    def _turned(self, place, values):
-        # a fitter asks for values and derivatives at the same point
-        there, then, found = self._memo.get("turn", (None, None, None))
-        if there is not place or then is not values:
-            found = self._turn(place, values)
-            self._memo["turn"] = place, values, found
-        return found
-
     def _values(self, place, values):
-        found = self._turned(place, values)
+        found = self._once(self._turn, place, values)
         if found is None:
             return super()._values(place, values)
         _, (row, column), _, matrix, *_ = found
         return self._whole((row * (matrix @ column)).sum(axis=0))
 
     def _slopes(self, place, values):
-        found = self._turned(place, values)
+        found = self._once(self._turn, place, values)
         if found is None:
             return super()._slopes(place, values)
         sides, (row, column), block, matrix, dispersion, own = found
@@ -405,20 +389,6 @@ class ElementCurve(LightCurve):
 def _in_plane(light):
     """Return Q and U of Q + iU, (2, n), or the one of what does not turn."""
     return np.ones((1, 1)) if light is None else light.view(float).reshape(-1, 2).T
-
-
-def _positive(wavelength):
-    if not np.all(wavelength > 0):
-        raise ParameterError(f"wavelength = {wavelength} um must be positive")
-    return wavelength
-
-
-def _of_beam(optic, beam):
-    if beam is None or not hasattr(optic, "beam"):
-        return optic
-    copy = optic.copy()
-    copy.beam = beam
-    return copy
 
 
 def _act(matrix, light):

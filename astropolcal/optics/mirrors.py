@@ -17,17 +17,11 @@ from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import get_material
-from astropolcal.mueller import (
-    _diattenuator_retarder,
-    diattenuation_slope,
-    fill_phase_block,
-    transverse_share,
-)
+from astropolcal.mueller import _diattenuator_retarder, diattenuator_retarder_slopes
 from astropolcal.optics._modelling import Setting
-from astropolcal.optics.core import Optic
+from astropolcal.optics.core import Optic, _LinearOptic
 from astropolcal.optics.polarizers import DiattenuatorRetarder
 from astropolcal.thinfilm import _Stack, _wrapped
-from astropolcal.units import canonical_factor
 
 __all__ = ["KMirror", "MetalMirror", "ParityFlip", "PowerLawMirror"]
 
@@ -36,7 +30,7 @@ _LN10 = np.log(10.0)
 _UM_IN_M = 1e-6
 
 
-class ParityFlip(Optic):
+class ParityFlip(_LinearOptic):
     r"""
     Parity flip diag(1, -1, 1, -1): changes the sign of Q and V.
 
@@ -55,11 +49,7 @@ class ParityFlip(Optic):
     array([ 1., -1.,  1., -1.])
     """
 
-    def _matrix(self, dispersion):
-        return np.diag([1.0, -1.0, 1.0, -1.0])
-
-    def _derivatives(self, dispersion):
-        return ()
+    _constant = np.diag([1.0, -1.0, 1.0, -1.0])
 
 
 class _Mirror(Optic):
@@ -88,14 +78,11 @@ class _Mirror(Optic):
 
     def _derivatives(self, dispersion, *values):
         ratio, slopes = self._log_slopes(dispersion, *values)
-        diattenuation, c, s = -np.tanh(ratio.real), np.cos(ratio.imag), np.sin(ratio.imag)
+        diattenuation = -np.tanh(ratio.real)
+        to_diattenuation, to_retardance = diattenuator_retarder_slopes(diattenuation, ratio.imag)
         # 1 - tanh^2, without the cancellation near a polarizer
         steepness = (1 - diattenuation) * (1 + diattenuation)
-        to_diattenuation = -steepness[..., None, None] * diattenuation_slope(diattenuation, c, s)
-        to_retardance = np.zeros_like(to_diattenuation)
-        root = transverse_share(diattenuation)
-        # the block of (U, V) is root * [[c, s], [-s, c]]
-        fill_phase_block(to_retardance, -root * s, root * c)
+        to_diattenuation = -steepness[..., None, None] * to_diattenuation
         return tuple(
             slope.real[..., None, None] * to_diattenuation
             + slope.imag[..., None, None] * to_retardance
@@ -116,28 +103,20 @@ class _Mirror(Optic):
         good = np.abs(incidence) < np.pi / 2
         self._check(good, "incidence", np.rad2deg(incidence), " deg", "less than 90 deg")
 
-    def _diattenuation(self, dispersion, *values):
-        return -np.tanh(self._log_ratio(dispersion, *values).real)
-
-    def _retardance(self, dispersion, *values):
-        return _wrapped(self._log_ratio(dispersion, *values).imag)
+    def _law(self, name, dispersion, *values):
+        ratio, slopes = self._log_slopes(dispersion, *values)
+        if name == "retardance":
+            return _wrapped(ratio.imag), [slope.imag for slope in slopes]
+        diattenuation = -np.tanh(ratio.real)
+        return diattenuation, [(diattenuation**2 - 1) * slope.real for slope in slopes]
 
     def diattenuation(self, wavelength):
         """Return the diattenuation, positive where s is better reflected than p."""
-        dispersion, _, values = self._resolve(wavelength, None)
-        return self._diattenuation(dispersion, *values)
+        return self._laws_at(wavelength)["diattenuation"][0]
 
     def retardance(self, wavelength):
         """Return the retardance, 0 to 360 deg (Quantity); 180 deg for an ideal mirror."""
-        dispersion, _, values = self._resolve(wavelength, None)
-        return np.rad2deg(self._retardance(dispersion, *values)) * u.deg
-
-    def _diattenuation_slopes(self, dispersion, *values):
-        ratio, slopes = self._log_slopes(dispersion, *values)
-        return [-(1 - np.tanh(ratio.real) ** 2) * slope.real for slope in slopes]
-
-    def _retardance_slopes(self, dispersion, *values):
-        return [slope.imag for slope in self._log_slopes(dispersion, *values)[1]]
+        return self._laws_at(wavelength)["retardance"][0] * u.deg
 
     def law_slopes(self, wavelength):
         """
@@ -146,30 +125,13 @@ class _Mirror(Optic):
         ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
         ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
         """
-        dispersion, _, values = self._resolve(wavelength, None)
-        # slopes are per canonical unit
-        factors = [canonical_factor(getattr(self, key).unit) for key in self.own_names]
-        found = {}
-        for law, slopes_of, unit in (
-            ("diattenuation", self._diattenuation_slopes, 1.0),
-            ("retardance", self._retardance_slopes, np.rad2deg(1.0)),
-        ):
-            slopes = zip(self.own_names, slopes_of(dispersion, *values), factors, strict=True)
-            found[law] = {key: unit * factor * slope for key, slope, factor in slopes}
-        return found
+        return {law: slopes for law, (_, slopes) in self._laws_at(wavelength).items()}
 
     def loosened(self, wavelength):
         """Return the diattenuator-retarder of the same values, free at each wavelength."""
+        values = {law: getattr(self, law)(wavelength) for law in self._laws}
         # the free optic has neither metal nor film
-        free = DiattenuatorRetarder(
-            diattenuation=self.diattenuation(wavelength),
-            retardance=self.retardance(wavelength),
-            theta=self.theta.value * u.deg,
-            name=self.name,
-            mount=self.mount,
-        )
-        free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
-        return free
+        return self._as(DiattenuatorRetarder, name=self.name, mount=self.mount, **values)
 
 
 class PowerLawMirror(_Mirror):
@@ -286,9 +248,22 @@ class _Metallic(_Mirror):
         materials = (get_material(name) for name in (self._material, self._film))
         return wavelength, *(material._index_um(wavelength) for material in materials)
 
-    @abstractmethod
+    incidence = Parameter(
+        default=45.0, unit=u.deg, bounds=(0, 89), fixed=True, description="angle of incidence"
+    )
+    film_thickness = Parameter(
+        default=0.0, unit=u.nm, bounds=(0, 2000), fixed=True, description="thickness of the film"
+    )
+    n_scale = Parameter(
+        default=1.0, bounds=(0.05, 20), fixed=True, description="factor on n of the metal"
+    )
+    k_scale = Parameter(
+        default=1.0, bounds=(0.2, 5), fixed=True, description="factor on k of the metal"
+    )
+
     def _reflections(self, incidence):
         """Return (angle, its derivative to the parameter, how often) of each reflection."""
+        return ((incidence, 1.0, 1),)
 
     def _stacks(self, dispersion, incidence, film_thickness, n_scale, k_scale):
         wavelength, metal, film = dispersion
@@ -369,22 +344,6 @@ class MetalMirror(_Metallic):
     <Quantity 187.9 deg>
     """
 
-    incidence = Parameter(
-        default=45.0, unit=u.deg, bounds=(0, 89), fixed=True, description="angle of incidence"
-    )
-    film_thickness = Parameter(
-        default=0.0, unit=u.nm, bounds=(0, 2000), fixed=True, description="thickness of the film"
-    )
-    n_scale = Parameter(
-        default=1.0, bounds=(0.05, 20), fixed=True, description="factor on n of the metal"
-    )
-    k_scale = Parameter(
-        default=1.0, bounds=(0.2, 5), fixed=True, description="factor on k of the metal"
-    )
-
-    def _reflections(self, incidence):
-        return ((incidence, 1.0, 1),)
-
 
 class KMirror(_Metallic):
     r"""
@@ -440,12 +399,6 @@ class KMirror(_Metallic):
     )
     film_thickness = Parameter(
         default=200.0, unit=u.nm, bounds=(0, 2000), description="thickness of the films"
-    )
-    n_scale = Parameter(
-        default=1.0, bounds=(0.05, 20), fixed=True, description="factor on n of the metal"
-    )
-    k_scale = Parameter(
-        default=1.0, bounds=(0.2, 5), fixed=True, description="factor on k of the metal"
     )
 
     def _reflections(self, incidence):

@@ -27,8 +27,9 @@ from astropolcal.mueller import (
     blank,
     retardance_slope,
     rotation_generator,
+    turn,
 )
-from astropolcal.optics._modelling import Setting
+from astropolcal.optics._modelling import Setting, phase
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.optics.retarders import EllipticalRetarder
@@ -49,7 +50,6 @@ __all__ = [
     "StrayLight",
 ]
 
-_IDENTITY = np.eye(4)
 # share of a frame that is light of the source at the least
 _LEAST_OF_SOURCE = 0.01
 
@@ -86,13 +86,57 @@ class FrameOptic(Optic):
         return coordinate + shift, angle + shift if self.turns else angle
 
 
+class _Modulated(FrameOptic):
+    """
+    What depends on one number: the sum of the parameters, each times a function of the position.
+
+    A subclass gives these functions as ``_waves``, by default the position itself, the matrix of
+    the number as ``_of``, and its derivative as ``_slope``.
+    """
+
+    def _waves(self, coordinate):
+        return (np.asarray(coordinate),)
+
+    def _sum(self, coordinate, values):
+        return sum(w * value for w, value in zip(self._waves(coordinate), values, strict=True))
+
+    def _matrix(self, coordinate, *values):
+        return self._of(self._sum(coordinate, values))
+
+    def _derivatives(self, coordinate, *values):
+        slope = self._slope(self._sum(coordinate, values))
+        return tuple(wave[..., None, None] * slope for wave in self._waves(coordinate))
+
+
+class _Rotation(_Modulated):
+    _of = staticmethod(_rotation_matrix)
+
+    def _slope(self, angle):
+        return turn(_rotation_matrix(angle))
+
+
+class _Retardation(_Modulated):
+    _of = staticmethod(_linear_retarder)
+    _slope = staticmethod(retardance_slope)
+
+
+class _Gain(_Modulated):
+    def _of(self, change):
+        return scaled(1.0 + change)
+
+    def _slope(self, change):
+        return scaled(np.ones_like(change))
+
+
 def _one_of(*allowed):
-    """Return the check of a setting that is one of some whole numbers."""
+    """Return the check of a setting that is one of some values of one kind."""
+    kind = type(allowed[0])
 
     def check(value, name):
-        if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
+        known = isinstance(value, bool | np.bool_) == (kind is bool) and np.isscalar(value)
+        if not known or value not in allowed:
             raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
-        return int(value)
+        return kind(value)
 
     return check
 
@@ -102,12 +146,6 @@ def _positive(value, name):
     if number.ndim or not (np.isfinite(number) and number > 0):
         raise ParameterError(f"{name} = {value!r} must be one positive number")
     return float(number)
-
-
-def _true_or_false(value, name):
-    if not isinstance(value, bool | np.bool_):
-        raise ParameterError(f"{name} = {value!r}; allowed are True and False")
-    return bool(value)
 
 
 class _Harmonic(FrameOptic):
@@ -121,12 +159,8 @@ class _Harmonic(FrameOptic):
         phase = self._harmonic * np.asarray(coordinate)
         return np.cos(phase), np.sin(phase)
 
-    def _sum(self, coordinate, cosine, sine):
-        c, s = self._waves(coordinate)
-        return cosine * c + sine * s
 
-
-class HarmonicRotator(_Harmonic):
+class HarmonicRotator(_Harmonic, _Rotation):
     r"""
     Rotator of the polarization by an angle that varies with the position of a stage.
 
@@ -157,15 +191,8 @@ class HarmonicRotator(_Harmonic):
     cosine = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="cosine amplitude")
     sine = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="sine amplitude")
 
-    def _matrix(self, coordinate, cosine, sine):
-        return _rotation_matrix(self._sum(coordinate, cosine, sine))
 
-    def _derivatives(self, coordinate, cosine, sine):
-        slope = _turned_slope(self._sum(coordinate, cosine, sine))
-        return tuple(_times(wave, slope) for wave in self._waves(coordinate))
-
-
-class DriftRotator(FrameOptic):
+class DriftRotator(_Rotation):
     r"""
     Rotator of the polarization by an angle that grows through the run.
 
@@ -190,12 +217,6 @@ class DriftRotator(FrameOptic):
     """
 
     rate = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="angle over the run")
-
-    def _matrix(self, coordinate, rate):
-        return _rotation_matrix(rate * np.asarray(coordinate))
-
-    def _derivatives(self, coordinate, rate):
-        return (_times(coordinate, _turned_slope(rate * np.asarray(coordinate))),)
 
 
 class DriftRetarder(FrameOptic):
@@ -224,18 +245,10 @@ class DriftRetarder(FrameOptic):
     -0.01745
     """
 
-    horizontal = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="horizontal linear retardance"
-    )
-    diagonal = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="45 deg linear retardance"
-    )
-    horizontal_rate = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="change over the run"
-    )
-    diagonal_rate = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="change over the run"
-    )
+    horizontal = phase("horizontal linear retardance")
+    diagonal = phase("45 deg linear retardance")
+    horizontal_rate = phase("change over the run")
+    diagonal_rate = phase("change over the run")
 
     @staticmethod
     def _vector(coordinate, horizontal, diagonal, horizontal_rate, diagonal_rate):
@@ -249,11 +262,11 @@ class DriftRetarder(FrameOptic):
         vector = self._vector(coordinate, *values)
         # nothing moves the circular retardance, so that its slope is not needed
         to_horizontal, to_diagonal, _ = EllipticalRetarder()._derivatives(None, *vector)
-        rates = (_times(coordinate, slope) for slope in (to_horizontal, to_diagonal))
-        return to_horizontal, to_diagonal, *rates
+        x = np.asarray(coordinate)[..., None, None]
+        return to_horizontal, to_diagonal, x * to_horizontal, x * to_diagonal
 
 
-class HarmonicRetarder(_Harmonic):
+class HarmonicRetarder(_Harmonic, _Retardation):
     r"""
     Linear retarder that turns with its mount and whose retardance varies with it.
 
@@ -283,15 +296,8 @@ class HarmonicRetarder(_Harmonic):
     cosine = Parameter(default=0.0, unit=u.deg, bounds=(-90, 90), description="cosine amplitude")
     sine = Parameter(default=0.0, unit=u.deg, bounds=(-90, 90), description="sine amplitude")
 
-    def _matrix(self, coordinate, cosine, sine):
-        return _linear_retarder(self._sum(coordinate, cosine, sine))
 
-    def _derivatives(self, coordinate, cosine, sine):
-        slope = retardance_slope(self._sum(coordinate, cosine, sine))
-        return tuple(_times(wave, slope) for wave in self._waves(coordinate))
-
-
-class HarmonicGain(_BeamOptic, _Harmonic):
+class HarmonicGain(_BeamOptic, _Harmonic, _Gain):
     r"""
     Transmission of the beams that varies with the position of a stage.
 
@@ -325,7 +331,7 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     sine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="sine amplitude")
 
     differential = Setting(
-        False, _true_or_false, "Whether the left beam changes with the opposite sign."
+        False, _one_of(True, False), "Whether the left beam changes with the opposite sign."
     )
 
     @property
@@ -333,38 +339,14 @@ class HarmonicGain(_BeamOptic, _Harmonic):
         """True where the left beam changes with the opposite sign."""
         return self._differential
 
-    @property
-    def _sign(self):
-        # +1 for the right beam, -1 for the left
-        return BEAMS[self._beam] if self._differential else 1.0
-
-    def _matrix(self, coordinate, cosine, sine):
-        return scaled(1.0 + self._sign * self._sum(coordinate, cosine, sine))
-
-    def _derivatives(self, coordinate, cosine, sine):
-        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, cosine, sine)))
-        return tuple(
-            scaled(np.broadcast_to(self._sign * wave, shape)) for wave in self._waves(coordinate)
-        )
+    def _waves(self, coordinate):
+        sign = BEAMS[self._beam] if self._differential else 1.0
+        return tuple(sign * wave for wave in super()._waves(coordinate))
 
 
 def scaled(gain):
     """Return the Mueller matrix of a gain that does not depend on polarization."""
-    return np.asarray(gain)[..., None, None] * _IDENTITY
-
-
-def _times(factor, matrix):
-    return np.asarray(factor)[..., None, None] * matrix
-
-
-def _turned_slope(angle):
-    """Return the derivative of T(angle)."""
-    out = blank(angle)
-    # of cos 2 angle and sin 2 angle, see T in Rotator
-    out[..., 1, 1] = out[..., 2, 2] = -2 * np.sin(2 * angle)
-    out[..., 1, 2] = 2 * np.cos(2 * angle)
-    out[..., 2, 1] = -out[..., 1, 2]
-    return out
+    return np.asarray(gain)[..., None, None] * np.eye(4)
 
 
 class FerroelectricLiquidCrystal(FrameOptic):
@@ -398,9 +380,7 @@ class FerroelectricLiquidCrystal(FrameOptic):
     [1.0, -1.0]
     """
 
-    retardance = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="retardance in both states"
-    )
+    retardance = phase("retardance in both states")
     switching_angle = Parameter(
         default=0.0,
         unit=u.deg,
@@ -434,7 +414,7 @@ class _Referenced(FrameOptic):
     )
 
 
-class FluxGain(_BeamOptic, _Referenced):
+class FluxGain(_BeamOptic, _Referenced, _Gain):
     r"""
     Gain of each beam that depends on its flux.
 
@@ -469,26 +449,17 @@ class FluxGain(_BeamOptic, _Referenced):
 
     power = Setting(1, _one_of(1, -1), "Exponent of the flux, 1 or -1.")
 
-    def _level(self, coordinate):
+    def _waves(self, coordinate):
         # on the stage previous_flux the coordinate is F now over F before, so that its inverse
         # is the afterglow of the frame before per flux of this one
-        relative = np.asarray(coordinate) / self._reference
-        if self._power == 1:
-            return relative
-        # where there is no flux, there is none to add to
-        return np.divide(1.0, relative, out=np.zeros_like(relative), where=relative != 0)
-
-    def _matrix(self, coordinate, right, left):
-        # each beam falls on a part of the detector of its own
-        own = right if self._beam == "right" else left
-        return scaled(1.0 + own * self._level(coordinate))
-
-    def _derivatives(self, coordinate, right, left):
-        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, right, left)))
-        slope = scaled(np.broadcast_to(self._level(coordinate), shape))
-        # what bends one beam does not move the other
-        none = np.zeros_like(slope)
-        return (slope, none) if self._beam == "right" else (none, slope)
+        level = np.asarray(coordinate) / self._reference
+        if self._power != 1:
+            # where there is no flux, there is none to add to
+            level = np.divide(1.0, level, out=np.zeros_like(level), where=level != 0)
+        # each beam falls on a part of the detector of its own, and what bends one does not move
+        # the other
+        none = np.zeros_like(level)
+        return (level, none) if self._beam == "right" else (none, level)
 
 
 class StrayLight(_Referenced):
@@ -529,18 +500,23 @@ class StrayLight(_Referenced):
         share = share / left
         return share, np.where(source > _LEAST_OF_SOURCE, share**2, 0.0)
 
-    def _matrix(self, coordinate, amount):
-        out = blank(coordinate, amount)
-        out[...] = _IDENTITY
-        # added light has no polarization: only I to I grows
-        out[..., 0, 0] += amount * self._share(coordinate, amount)[0]
+    def _matrix(self, coordinate, *added):
+        out = blank(coordinate, *added)
+        out += np.eye(4)
+        share, _ = self._share(coordinate, added[0])
+        for row, value in enumerate(added):
+            # the light is added whatever the polarization of the source: the first column only
+            out[..., row, 0] += value * share
         return out
 
-    def _derivatives(self, coordinate, amount):
-        out = blank(coordinate, amount)
-        share, slope = self._share(coordinate, amount)
-        out[..., 0, 0] = share + amount * slope
-        return (out,)
+    def _derivatives(self, coordinate, *added):
+        slopes = [blank(coordinate, *added) for _ in added]
+        share, slope = self._share(coordinate, added[0])
+        for row, value in enumerate(added):
+            slopes[row][..., row, 0] += share
+            # the more is added, the less is the source
+            slopes[0][..., row, 0] += value * slope
+        return tuple(slopes)
 
 
 class PolarizedBackground(StrayLight):
@@ -578,29 +554,11 @@ class PolarizedBackground(StrayLight):
     q = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added Q over the reference")
     u = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added U over the reference")
 
-    def _matrix(self, coordinate, amount, q, u):
-        out = blank(coordinate, amount, q, u)
-        out[...] = _IDENTITY
-        share, _ = self._share(coordinate, amount)
-        for row, value in enumerate((amount, q, u)):
-            # the light is added whatever the polarization of the source: the first column only
-            out[..., row, 0] += value * share
-        return out
-
-    def _derivatives(self, coordinate, amount, q, u):
-        slopes = [blank(coordinate, amount, q, u) for _ in range(3)]
-        share, slope = self._share(coordinate, amount)
-        for row, value in enumerate((amount, q, u)):
-            slopes[row][..., row, 0] += share
-            # the more is added, the less is the source
-            slopes[0][..., row, 0] += value * slope
-        return tuple(slopes)
-
 
 # ---- states of a device --------------------------------------------------------------------
 
 
-class StateRetarder(FrameOptic):
+class StateRetarder(_Retardation):
     r"""
     Linear retarder that is there in one state of a device only.
 
@@ -624,15 +582,7 @@ class StateRetarder(FrameOptic):
     [0.0, 1.0]
     """
 
-    retardance = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="retardance in this state"
-    )
-
-    def _matrix(self, coordinate, retardance):
-        return _linear_retarder(coordinate * retardance)
-
-    def _derivatives(self, coordinate, retardance):
-        return (_times(coordinate, retardance_slope(coordinate * retardance)),)
+    retardance = phase("retardance in this state")
 
 
 class StateAnalyser(FrameOptic):
@@ -670,9 +620,8 @@ class StateAnalyser(FrameOptic):
     )
 
     def _matrix(self, coordinate, efficiency, transmission):
-        shape = np.broadcast_shapes(*map(np.shape, (coordinate, efficiency, transmission)))
-        out = np.empty((*shape, 4, 4))
-        out[...] = _times(1.0 - np.asarray(coordinate), np.eye(4))
+        out = blank(coordinate, efficiency, transmission)
+        out += scaled(1.0 - coordinate)
         for i in (0, 1):
             out[..., i, i] += coordinate * transmission / 2
             out[..., i, 1 - i] += coordinate * transmission * efficiency / 2

@@ -15,9 +15,9 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import blank
-from astropolcal.optics.core import Optic
-from astropolcal.optics.modulated import FrameOptic
+from astropolcal.mueller import UNITS
+from astropolcal.optics.core import _LinearOptic
+from astropolcal.optics.modulated import _Modulated
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.words import check_choice
 
@@ -26,28 +26,21 @@ __all__ = ["MuellerElement", "Perturbation"]
 _I, _Q, _U, _V = range(4)
 
 
-def _generator(*entries):
-    out = np.zeros((4, 4))
-    for row, column, value in entries:
-        out[row, column] = value
-    return out
-
-
 #: Generator of each kind of perturbation. Those of retardance and rotation turn the Poincare
 #: sphere, those of diattenuation exchange intensity with polarization, and those of depolarization
 #: shrink one component against another. ``gain`` acts with opposite signs on the two beams.
 GENERATORS = {
-    "retardance_h": _generator((_U, _V, 1.0), (_V, _U, -1.0)),
-    "retardance_d": _generator((_Q, _V, -1.0), (_V, _Q, 1.0)),
+    "retardance_h": UNITS[_U, _V] - UNITS[_V, _U],
+    "retardance_d": -UNITS[_Q, _V] + UNITS[_V, _Q],
     # of T(angle), twice the angle on the sphere
-    "rotation": _generator((_Q, _U, 2.0), (_U, _Q, -2.0)),
-    "diattenuation_h": _generator((_I, _Q, 1.0), (_Q, _I, 1.0)),
-    "diattenuation_d": _generator((_I, _U, 1.0), (_U, _I, 1.0)),
-    "diattenuation_c": _generator((_I, _V, 1.0), (_V, _I, 1.0)),
-    "depolarization_linear": _generator((_Q, _Q, -1.0), (_U, _U, -1.0)),
-    "depolarization_h": _generator((_Q, _Q, -1.0), (_U, _U, 1.0)),
-    "depolarization_d": _generator((_Q, _U, -1.0), (_U, _Q, -1.0)),
-    "depolarization_circular": _generator((_V, _V, -1.0)),
+    "rotation": 2 * UNITS[_Q, _U] - 2 * UNITS[_U, _Q],
+    "diattenuation_h": UNITS[_I, _Q] + UNITS[_Q, _I],
+    "diattenuation_d": UNITS[_I, _U] + UNITS[_U, _I],
+    "diattenuation_c": UNITS[_I, _V] + UNITS[_V, _I],
+    "depolarization_linear": -UNITS[_Q, _Q] - UNITS[_U, _U],
+    "depolarization_h": -UNITS[_Q, _Q] + UNITS[_U, _U],
+    "depolarization_d": -UNITS[_Q, _U] - UNITS[_U, _Q],
+    "depolarization_circular": -UNITS[_V, _V],
     "gain": np.eye(4),
 }
 
@@ -112,19 +105,12 @@ class Dependence:
         if self.kind == "harmonic":
             angle = int(self.parts[2]) * x
             return np.stack([np.cos(angle), np.sin(angle)])
-        t = 2 * x - 1
-        wave = {
-            "constant": lambda: np.ones_like(x),
-            "dataset": lambda: np.ones_like(x),
-            "time": lambda: t,
-            "time2": lambda: t**2 - 1 / 3,
-            "step": lambda: (x >= int(self.parts[1])).astype(float),
-            "frame": lambda: (x == int(self.parts[1])).astype(float),
-            "direction": lambda: x,
-            "move": lambda: x,
-            "state": lambda: x,
-        }[self.kind]()
-        return wave[None]
+        if self.kind in ("step", "frame"):
+            frame = int(self.parts[1])
+            return (x >= frame if self.kind == "step" else x == frame).astype(float)[None]
+        t, one = 2 * x - 1, np.ones_like(x)
+        known = {"constant": one, "dataset": one, "time": t, "time2": t**2 - 1 / 3}
+        return known.get(self.kind, x)[None]
 
 
 _FORMS = re.compile(
@@ -158,7 +144,7 @@ _POWERS = {
 }
 
 
-class Perturbation(_BeamOptic, FrameOptic):
+class Perturbation(_BeamOptic, _Modulated):
     r"""
     A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
 
@@ -233,14 +219,7 @@ class Perturbation(_BeamOptic, FrameOptic):
         waves = self._dependence.waves(coordinate)
         return waves if len(waves) == 2 else (waves[0], np.zeros_like(waves[0]))
 
-    def _exponent(self, coordinate, amplitude, quadrature):
-        first, second = self._waves(coordinate)
-        return amplitude * first + quadrature * second
-
-    def _matrix(self, coordinate, amplitude, quadrature):
-        return self._exponential(self._exponent(coordinate, amplitude, quadrature))
-
-    def _exponential(self, x):
+    def _of(self, x):
         """Return exp(x G); G G G is G, -G (4 times that for rotations), or G is diagonal."""
         x = np.asarray(x)[..., None, None]
         if self._kind == "gain":
@@ -261,14 +240,6 @@ class Perturbation(_BeamOptic, FrameOptic):
             return rate * (np.cos(rate * x) * unit + np.sin(rate * x) * square)
         return np.cosh(x) * unit + np.sinh(x) * square
 
-    def _derivatives(self, coordinate, amplitude, quadrature):
-        x = self._exponent(coordinate, amplitude, quadrature)
-        slope = self._slope(x)
-        return tuple(
-            np.broadcast_to(wave, np.shape(x))[..., None, None] * slope
-            for wave in self._waves(coordinate)
-        )
-
 
 # in the order in which the parameters are declared
 _ELEMENTS = [(row, column) for row in range(4) for column in range(4)]
@@ -284,7 +255,7 @@ def _element(row, column):
     )
 
 
-class MuellerElement(Optic):
+class MuellerElement(_LinearOptic):
     """
     General element of constant Mueller matrix; the elements are parameters.
 
@@ -304,6 +275,7 @@ class MuellerElement(Optic):
     OpticParameter('m33', value=0.8, fixed=True, bounds=(-1, 1))
     """
 
+    _terms = UNITS.reshape(16, 4, 4)
     m00, m01, m02, m03 = (_element(0, j) for j in range(4))
     m10, m11, m12, m13 = (_element(1, j) for j in range(4))
     m20, m21, m22, m23 = (_element(2, j) for j in range(4))
@@ -344,17 +316,3 @@ class MuellerElement(Optic):
             )
         values = {f"m{i}{j}": matrix[..., i, j] for i, j in _ELEMENTS}
         return cls(**values, **kwargs)
-
-    def _matrix(self, dispersion, *elements):
-        out = blank(*elements)
-        for (i, j), value in zip(_ELEMENTS, elements, strict=True):
-            out[..., i, j] = value
-        return out
-
-    def _derivatives(self, dispersion, *elements):
-        slopes = []
-        for i, j in _ELEMENTS:
-            out = blank(*elements)
-            out[..., i, j] = 1.0
-            slopes.append(out)
-        return tuple(slopes)

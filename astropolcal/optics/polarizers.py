@@ -1,20 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Optics that polarize, attenuate, depolarize or split the light."""
 
-import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import (
+    UNITS,
     _diattenuator_retarder,
     blank,
-    diattenuation_slope,
-    fill_phase_block,
+    diattenuator_retarder_slopes,
     transverse_share,
 )
-from astropolcal.optics._modelling import Setting
-from astropolcal.optics.core import Optic
+from astropolcal.optics._modelling import Setting, phase
+from astropolcal.optics.core import Optic, _LinearOptic
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -28,7 +27,7 @@ __all__ = [
 ]
 
 
-class LinearPolarizer(Optic):
+class LinearPolarizer(_LinearOptic):
     r"""
     Perfect linear polarizer; transmits the orientation ``theta``.
 
@@ -52,13 +51,7 @@ class LinearPolarizer(Optic):
     (0.5, -0.5)
     """
 
-    def _matrix(self, dispersion):
-        out = np.zeros((4, 4))
-        out[:2, :2] = 0.5
-        return out
-
-    def _derivatives(self, dispersion):
-        return ()
+    _constant = 0.5 * UNITS[:2, :2].sum(axis=(0, 1))
 
 
 class Diattenuator(Optic):
@@ -94,7 +87,7 @@ class Diattenuator(Optic):
         return _diattenuator_retarder(diattenuation, 0.0)
 
     def _derivatives(self, dispersion, diattenuation):
-        return (diattenuation_slope(diattenuation, 1.0, 0.0),)
+        return diattenuator_retarder_slopes(diattenuation, 0.0)[:1]
 
 
 class DiattenuatorRetarder(Optic):
@@ -130,19 +123,13 @@ class DiattenuatorRetarder(Optic):
     diattenuation = Parameter(
         default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
     )
-    retardance = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="phase between the two axes"
-    )
+    retardance = phase("phase between the two axes")
 
     def _matrix(self, dispersion, diattenuation, retardance):
         return _diattenuator_retarder(diattenuation, retardance)
 
     def _derivatives(self, dispersion, diattenuation, retardance):
-        c, s = np.cos(retardance), np.sin(retardance)
-        to_retardance = blank(diattenuation, retardance)
-        root = transverse_share(diattenuation)
-        fill_phase_block(to_retardance, -root * s, root * c)
-        return diattenuation_slope(diattenuation, c, s), to_retardance
+        return diattenuator_retarder_slopes(diattenuation, retardance)
 
 
 class VectorDiattenuator(Optic):
@@ -211,7 +198,7 @@ def _vector_slope(own, other, i):
     return out
 
 
-class Depolarizer(Optic):
+class Depolarizer(_LinearOptic):
     r"""
     Diagonal depolarizer diag(1, a, b, c) with axes turned to ``theta``.
 
@@ -235,21 +222,8 @@ class Depolarizer(Optic):
     retained_u = Parameter(default=1.0, bounds=(0, 1), description="share of U that survives")
     retained_v = Parameter(default=1.0, bounds=(0, 1), description="share of V that survives")
 
-    def _matrix(self, dispersion, *retained):
-        out = blank(*retained)
-        out[..., 0, 0] = 1.0
-        # the first element is the intensity, which is kept
-        for i, value in enumerate(retained, start=1):
-            out[..., i, i] = value
-        return out
-
-    def _derivatives(self, dispersion, *retained):
-        slopes = []
-        for i in range(1, 4):
-            out = blank(*retained)
-            out[..., i, i] = 1.0
-            slopes.append(out)
-        return tuple(slopes)
+    # the intensity is kept
+    _constant, _terms = UNITS[0, 0], UNITS[(1, 2, 3), (1, 2, 3)]
 
 
 # sign of eta: the right beam is the ordinary one
@@ -268,7 +242,7 @@ class _BeamOptic(Optic):
     beam = Setting("right", _beam, 'The beam that goes on in a chain, ``"right"`` or ``"left"``.')
 
 
-class WollastonPrism(_BeamOptic):
+class WollastonPrism(_BeamOptic, _LinearOptic):
     r"""
     Wollaston prism: two beams of opposite linear polarization.
 
@@ -301,17 +275,12 @@ class WollastonPrism(_BeamOptic):
 
     efficiency = Parameter(default=1.0, bounds=(0, 1), description="modulation efficiency")
 
-    def _matrix(self, dispersion, efficiency):
-        out = blank(efficiency)
-        # half of unpolarized light goes into each beam
-        out[..., 0, 0] = out[..., 1, 1] = 0.5
-        out[..., 0, 1] = out[..., 1, 0] = 0.5 * BEAMS[self._beam] * efficiency
-        return out
+    # half of unpolarized light goes into each beam
+    _constant = 0.5 * (UNITS[0, 0] + UNITS[1, 1])
 
-    def _derivatives(self, dispersion, efficiency):
-        out = blank(efficiency)
-        out[..., 0, 1] = out[..., 1, 0] = 0.5 * BEAMS[self._beam]
-        return (out,)
+    @property
+    def _terms(self):
+        return (0.5 * BEAMS[self._beam] * (UNITS[0, 1] + UNITS[1, 0]),)
 
     def beams(self, wavelength, I, Q, U, V):  # noqa: E741
         """
@@ -337,16 +306,10 @@ class WollastonPrism(_BeamOptic):
         >>> float(right[1]), float(left[1])
         (0.0, 1.0)
         """
-        return tuple(self._through(beam)(wavelength, I, Q, U, V) for beam in ("right", "left"))
-
-    def _through(self, beam):
-        # the optic in the chain keeps its own beam
-        copy = self.copy()
-        copy.beam = beam
-        return copy
+        return tuple(self.of_beam(beam)(wavelength, I, Q, U, V) for beam in ("right", "left"))
 
 
-class BeamGain(_BeamOptic):
+class BeamGain(_BeamOptic, _LinearOptic):
     r"""
     Unequal gains of the two beams: :math:`1 + g` for the right, :math:`1 - g` for the left.
 
@@ -371,10 +334,8 @@ class BeamGain(_BeamOptic):
 
     imbalance = Parameter(default=0.0, bounds=(-0.5, 0.5), description="half the gain difference")
 
-    def _matrix(self, dispersion, imbalance):
-        gain = 1.0 + BEAMS[self._beam] * np.asarray(imbalance)
-        return gain[..., None, None] * np.eye(4)
+    _constant = np.eye(4)
 
-    def _derivatives(self, dispersion, imbalance):
-        sign = np.full(np.shape(imbalance), BEAMS[self._beam])
-        return (sign[..., None, None] * np.eye(4),)
+    @property
+    def _terms(self):
+        return (BEAMS[self._beam] * np.eye(4),)

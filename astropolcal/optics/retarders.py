@@ -9,11 +9,11 @@ from astropolcal.materials import MGF2, QUARTZ
 from astropolcal.mueller import (
     _elliptical_retarder,
     _linear_retarder,
-    _rotation_matrix,
     blank,
     retardance_slope,
 )
-from astropolcal.optics.core import Optic
+from astropolcal.optics._modelling import phase
+from astropolcal.optics.core import Optic, _LinearOptic
 
 __all__ = ["EllipticalRetarder", "LinearRetarder", "Rotator", "TwoLayerWaveplate"]
 
@@ -44,9 +44,7 @@ class LinearRetarder(Optic):
     1.0
     """
 
-    retardance = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="phase between the two axes"
-    )
+    retardance = phase("phase between the two axes")
 
     def _matrix(self, dispersion, retardance):
         return _linear_retarder(retardance)
@@ -106,33 +104,23 @@ class TwoLayerWaveplate(Optic):
             ]
         )
 
-    def _retardance(self, dispersion, w_sio2, w_mgf2):
-        return w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]
-
-    def _retardance_slopes(self, dispersion, w_sio2, w_mgf2):
-        return tuple(dispersion)
+    def _law(self, name, dispersion, w_sio2, w_mgf2):
+        return w_sio2 * dispersion[0] + w_mgf2 * dispersion[1], tuple(dispersion)
 
     def _matrix(self, dispersion, *thicknesses):
-        return _linear_retarder(self._retardance(dispersion, *thicknesses))
+        return _linear_retarder(self._law("retardance", dispersion, *thicknesses)[0])
 
     def _derivatives(self, dispersion, *thicknesses):
-        slope = retardance_slope(self._retardance(dispersion, *thicknesses))
+        slope = retardance_slope(self._law("retardance", dispersion, *thicknesses)[0])
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
         """Return the retardance at a wavelength of any shape, in degree and not wrapped."""
-        dispersion, _, thicknesses = self._resolve(wavelength, None)
-        return self._retardance(dispersion, *thicknesses) * u.rad.to(u.deg) * u.deg
+        return self._laws_at(wavelength)["retardance"][0] * u.deg
 
     def loosened(self, wavelength):
         """Return the linear retarder of the same retardances, free at each wavelength."""
-        free = LinearRetarder(
-            retardance=self.retardance(wavelength),
-            theta=self.theta.value * u.deg,
-            **self._settings(),
-        )
-        free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
-        return free
+        return self._as(LinearRetarder, retardance=self.retardance(wavelength), **self._settings())
 
 
 class EllipticalRetarder(Optic):
@@ -171,15 +159,9 @@ class EllipticalRetarder(Optic):
     array([1., 0., 0., 0.])
     """
 
-    horizontal = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="horizontal linear retardance"
-    )
-    diagonal = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="45 deg linear retardance"
-    )
-    circular = Parameter(
-        default=0.0, unit=u.deg, bounds=(-360, 360), description="right circular retardance"
-    )
+    horizontal = phase("horizontal linear retardance")
+    diagonal = phase("45 deg linear retardance")
+    circular = phase("right circular retardance")
 
     def _matrix(self, dispersion, horizontal, diagonal, circular):
         return _elliptical_retarder(horizontal, diagonal, circular)
@@ -255,7 +237,7 @@ def _series(x2, first, *ratios):
     return total / first
 
 
-class Rotator(Optic):
+class Rotator(_LinearOptic):
     r"""
     Rotation of the reference frame for everything that follows.
 
@@ -281,9 +263,5 @@ class Rotator(Optic):
 
     rotates_frame = True
 
-    def _matrix(self, dispersion):
-        # the turn by theta and mount is done in Optic, which knows `rotates_frame`
-        return _rotation_matrix(0.0)
-
-    def _derivatives(self, dispersion):
-        return ()
+    # the turn by theta and mount is done in Optic, which knows `rotates_frame`
+    _constant = np.eye(4)

@@ -5,13 +5,13 @@ import astropy.units as units
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.mueller import blank
-from astropolcal.optics.core import Optic
+from astropolcal.mueller import UNITS, blank
+from astropolcal.optics.core import _LinearOptic
 
 __all__ = ["Light", "PolarizedSource", "StarSource"]
 
 
-class Light(Optic):
+class Light(_LinearOptic):
     r"""
     Light of given Stokes parameters: a model with one input, the wavelength.
 
@@ -46,14 +46,7 @@ class Light(Optic):
     U = Parameter(default=0.0, fixed=True, description="U of the light")
     V = Parameter(default=0.0, fixed=True, description="V of the light")
 
-    def _matrix(self, dispersion, *stokes):
-        out = blank(*stokes)
-        for i, value in enumerate(stokes):
-            out[..., i, 0] = value
-        return out
-
-    def _derivatives(self, dispersion, *stokes):
-        return tuple(_unit_element(row, *stokes) for row in range(4))
+    _terms = UNITS[:, 0]
 
     def evaluate(self, wavelength, *parameters):
         """Return ``wavelength`` and the Stokes parameters of the light."""
@@ -63,7 +56,7 @@ class Light(Optic):
         return wavelength, *stokes
 
 
-class PolarizedSource(Optic):
+class PolarizedSource(_LinearOptic):
     r"""
     Source of linearly polarized light, in the place of the light that arrives.
 
@@ -95,22 +88,8 @@ class PolarizedSource(Optic):
     q = Parameter(default=0.0, bounds=(-0.7, 0.7), description="Q over I of the source")
     u = Parameter(default=0.0, bounds=(-0.7, 0.7), description="U over I of the source")
 
-    def _matrix(self, dispersion, q, u):
-        out = blank(q, u)
-        out[..., 0, 0] = 1.0
-        # only the first column: whatever polarization arrives is forgotten
-        out[..., 1, 0] = q
-        out[..., 2, 0] = u
-        return out
-
-    def _derivatives(self, dispersion, q, u):
-        return tuple(_unit_element(row, q, u) for row in (1, 2))
-
-
-def _unit_element(row, *values):
-    out = blank(*values)
-    out[..., row, 0] = 1.0
-    return np.asarray(out)
+    # only the first column: whatever polarization arrives is forgotten
+    _constant, _terms = UNITS[0, 0], UNITS[1:3, 0]
 
 
 class StarSource(PolarizedSource):
@@ -196,15 +175,9 @@ class StarSource(PolarizedSource):
         upright = self.with_parameters(theta=0 * units.deg)
         upright.mount = None
         q, u = upright.stokes(wavelength)
-        loose = PolarizedSource(
-            q=q,
-            u=u,
-            theta=self.theta.quantity,
-            fixed={"q": True, "u": True},
-            **super()._settings(),
-        )
-        for key in ("fixed", "bounds", "prior"):
-            setattr(loose.theta, key, getattr(self.theta, key))
+        held = {"q": True, "u": True}
+        loose = self._as(PolarizedSource, q=q, u=u, fixed=held, **super()._settings())
+        loose.theta.prior = self.theta.prior
         return loose
 
     def _dispersion(self, wavelength):
@@ -241,8 +214,12 @@ class StarSource(PolarizedSource):
             # x falls by 1 / reference
             -(slope + 2 * curvature * x) / reference,
         )
-        shape = np.broadcast(wavelength, q, u, *law).shape
-        return tuple(_column(np.broadcast_to(change, shape)) for change in changes)
+        out = blank(wavelength, q, u, *law)
+        first, second = UNITS[1:3, 0]
+        return tuple(
+            out + x.real[..., None, None] * first + x.imag[..., None, None] * second
+            for x in map(np.asarray, changes)
+        )
 
 
 def _interstellar(wavelength, p_max, lambda_max, width, rotation):
@@ -250,10 +227,3 @@ def _interstellar(wavelength, p_max, lambda_max, width, rotation):
     log = np.log(lambda_max / wavelength)
     shape = np.exp(-width * log**2)
     return p_max * shape, np.exp(-2j * rotation * log), log, shape
-
-
-def _column(change):
-    out = blank(change)
-    out[..., 1, 0] = change.real
-    out[..., 2, 0] = change.imag
-    return out
