@@ -36,7 +36,6 @@ class _Node:
         "phase",
         "places",
         "stage_angle",
-        "varies",
     )
 
     def __init__(self, index, leaf, wavelength, positions, follows):
@@ -47,7 +46,6 @@ class _Node:
         self.places = wavelength[:, None], {name: np.atleast_2d(positions[name]) for name in inputs}
         by_law = bool(set(leaf._follows) - {"theta"})
         self.per_frame = isinstance(leaf, FrameOptic) or by_law
-        self.varies = self.per_frame or bool(leaf._follows)
         shift = leaf.stage_sign * _of_beam(leaf, positions) if leaf.stage else 0.0
         if isinstance(leaf, FrameOptic):
             self.dispersion, self.stage_angle = leaf._moved(0.0, 0.0, np.atleast_2d(shift))
@@ -81,11 +79,6 @@ class _Node:
         self.phase = np.exp(-2j * turn) if np.any(turn) else None
         return self.stage_angle
 
-    @property
-    def moves(self):
-        """Whether the optic turns against the one upstream of it from frame to frame."""
-        return np.ndim(self.phase) > 0
-
     def matrix(self, values):
         return self._shaped(self.leaf._matrix(self.dispersion, *self._along(values)))
 
@@ -104,15 +97,6 @@ class _Node:
 def _lifted(values):
     """Put values given per wavelength along the first of two axes."""
     return [v[:, None] if np.ndim(v) == 1 else v for v in values]
-
-
-def _for_beam(leaf, beam):
-    """Return an optic as it acts on a beam."""
-    if not hasattr(leaf, "beam"):
-        return leaf
-    copy = leaf.copy()
-    copy.beam = beam
-    return copy
 
 
 def _of_beam(leaf, positions):
@@ -161,7 +145,7 @@ class Propagator:
         self._common = [_Node(i, leaf, *known) for i, leaf in enumerate(self.leaves[:split])]
         self._arms = [
             [
-                _Node(i, _for_beam(leaf, beam), *known)
+                _Node(i, leaf.of_beam(beam), *known)
                 for i, leaf in enumerate(self.leaves[split:], start=split)
             ]
             for beam in beams
@@ -172,7 +156,6 @@ class Propagator:
         first, other = self._arms[0][0], self._arms[-1][0]
         same = np.array_equal(first.stage_angle, other.stage_angle)
         self._same_entrance = same and not first.leaf.rotates_frame
-        self._meeting = _meeting(self._common, self._arms) if self._same_entrance else None
 
     def values(self):
         """Return the current canonical values, one list per optic, ``theta`` first."""
@@ -185,36 +168,20 @@ class Propagator:
         (n_wavelengths, n_columns) each, at values as ``values`` gives them, by default the current
         ones.
         """
-        values = self._own_values() if values is None else values
-        if self._meeting is None:
-            return Sweep(self, values).fluxes
-        common, frame = _at(self._common, values, 0.0)
-        arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
-        # what is static meets the light of all frames as two rows per wavelength
-        rows = np.concatenate([row for row, _ in arms], axis=1)
-        rows, phase = _inward(common[self._meeting :], rows, arms[0][1])
-        light, fresh = _behind(common[: self._meeting], self.source, keep=False)
-        fluxes = turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
-        return _both([_whole(fluxes[..., beam], self.shape) for beam in range(len(arms))])
+        return self.forward(values).fluxes
 
     def forward(self, values=None):
         """Carry the light through the chain and keep what derivatives need; return a Sweep."""
-        return Sweep(self, self._own_values() if values is None else values)
-
-    def _own_values(self):
-        """Return the chain's values at the wavelengths; refuse those known at other ones only."""
-        pairs = zip(self.leaves, self.values(), strict=True)
-        return [leaf.values_at(self.wavelength, own) for leaf, own in pairs]
+        if values is None:
+            # those that are known at other wavelengths only are refused
+            pairs = zip(self.leaves, self.values(), strict=True)
+            values = [leaf.values_at(self.wavelength, own) for leaf, own in pairs]
+        return Sweep(self, values)
 
 
 def splits(found):
     """Return whether one of some optics splits the light into two beams."""
     return any(leaf.splits_light for leaf in found)
-
-
-def _both(fluxes):
-    """Return the fluxes of two beams; of a chain without a splitter the left one is dark."""
-    return tuple(fluxes) if len(fluxes) > 1 else (fluxes[0], np.zeros_like(fluxes[0]))
 
 
 def _check(found, positions, n_wavelengths):
@@ -235,24 +202,6 @@ def _check(found, positions, n_wavelengths):
             raise ChainError(f"{label}, which differs between the beams, but the optic does not")
 
 
-def _meeting(common, arms):
-    """
-    Return the index of the first optic downstream of which no optic moves from frame to frame.
-
-    It is the splitter where one upstream of it moves against it, and None where one downstream of
-    does.
-    """
-    if any(node.varies or node.moves for arm in arms for node in arm[1:]) or any(
-        arm[0].varies for arm in arms
-    ):
-        return None
-    place, moves = len(common), arms[0][0].moves
-    while place and not moves and not common[place - 1].varies:
-        place -= 1
-        moves = common[place].moves
-    return place
-
-
 class Sweep:
     """A forward sweep: the fluxes of both beams, ready to be differentiated."""
 
@@ -260,17 +209,21 @@ class Sweep:
         self._propagator, self._values = propagator, values
         self._common, frame = _at(propagator._common, values, 0.0)
         self._arms = [_at(arm, values, frame)[0] for arm in propagator._arms]
-        light, fresh = _behind(self._common, propagator.source)
+        last, light = _enter(self._common, propagator.source)
+        light = light if last is None else act(last.matrix, light)
         same = propagator._same_entrance
         if same:
             # in front of the splitter the light of both beams is the same
-            light = turned(light, self._arms[0][0].phase, fresh)
+            light = turned(light, self._arms[0][0].phase, in_place=last is not None)
         fluxes = []
         for arm in self._arms:
             last, seen = _enter(arm, light, entered=same)
             fluxes.append(_flux(last, seen, propagator.shape))
+        if len(fluxes) == 1:
+            # of a chain without a splitter the left beam is dark
+            fluxes.append(np.zeros_like(fluxes[0]))
         #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
-        self.fluxes = _both(fluxes)
+        self.fluxes = tuple(fluxes)
 
     def crossings(self, wanted, weights):
         """
@@ -346,12 +299,11 @@ def _at(nodes, values, frame):
     return steps, frame
 
 
-def _enter(steps, light, *, entered=False, keep=True):
+def _enter(steps, light, *, entered=False):
     """
     Carry light to the last optic with a matrix; return it, or None, and the light it sees.
 
-    Light that has ``entered`` is in the frame of the first optic already. Where steps do not
-    keep the light that they see, the memory of one product serves the next, in the cache.
+    Light that has ``entered`` is in the frame of the first optic already.
     """
     last = None
     for step in steps:
@@ -362,33 +314,9 @@ def _enter(steps, light, *, entered=False, keep=True):
             light = turned(act(last.matrix, light), step.phase, in_place=True)
         elif not entered:
             light = turned(light, step.phase)
-        if keep:
-            step.light = light
+        step.light = light
         last = step
     return last, light
-
-
-def _behind(steps, light, keep=True):
-    """Return the light downstream of all optics, and whether it may be overwritten."""
-    last, light = _enter(steps, light, keep=keep)
-    return (light, False) if last is None else (act(last.matrix, light), True)
-
-
-def _inward(steps, rows=None, phase=None):
-    """
-    Carry analyser rows, (w, n, 4), to the first optic with a matrix; return them and its phase.
-
-    They come from downstream of all steps, where light is turned by ``phase``, or from the
-    detector.
-    """
-    for step in reversed(steps):
-        if step.matrix is not None:
-            if rows is None:
-                rows = step.matrix[:, :1]
-            else:
-                rows = act_back(step.matrix, turned(rows, inverse(phase)))
-            phase = step.phase
-    return rows, phase
 
 
 def _flux(last, light, shape):
