@@ -17,7 +17,6 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.chain import (
-    find_optic,
     leaves,
     stages,
     states_of,
@@ -82,26 +81,6 @@ def check_values(label, chain, size):
             require(value.size in (1, size), words)
 
 
-def check_keyword(column, keyword):
-    """Require a keyword of FITS, perhaps a hierarchical one."""
-    require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
-    # a keyword of several words is a hierarchical one
-    words = keyword.split(" ")
-    known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
-    short = len(keyword) <= 8 or len(words) > 1
-    require(known and short, f"{column}: {keyword!r} is not a FITS keyword")
-
-
-def check_same(source, optic, old, new):
-    """Require that a parameter is the same after a file."""
-    name = f"{source}: {optic.name}.{old.name} after a file"
-    require(np.array_equal(old.value, new.value), f"{name} is {new.value}, not {old.value}")
-    for what in ("unit", "bounds", "fixed"):
-        before, after = getattr(old, what), getattr(new, what)
-        require(before == after, f"{name}: {what} {after}, not {before}")
-    require((old.prior is None) == (new.prior is None), f"{name}: its prior is {new.prior}")
-
-
 def read_back(chain):
     """Return a chain after it was written to an ASDF file."""
     import asdf
@@ -119,21 +98,6 @@ def read_back(chain):
             read = file["chain"]
             restore_priors([read], file["priors"])
     return read
-
-
-def moved_value(parameter, rng):
-    """Return a value of a parameter a little off, within its bounds."""
-    low, high = limits(parameter)
-    value, unit = np.asarray(parameter.value, dtype=float), parameter.unit
-    step = rng.normal(size=value.shape)
-    if unit is not None and unit.is_equivalent(u.rad):
-        step = (_MOVED * step * u.rad).to_value(unit)
-    else:
-        step = step * (_MOVED if unit is None else _MOVED_SHARE * np.abs(value))
-    # at a bound the other way, so that every free parameter moves
-    moved = np.where((value + step < low) | (value + step > high), value - step, value + step)
-    moved = np.clip(moved, low, high)
-    return moved if unit is None else moved * unit
 
 
 # optics behind which nothing is left of what polarization the light had
@@ -161,6 +125,7 @@ class Probe:
     # ---- what it says of itself
 
     def check_class(self):
+        """It is an Instrument, its name is one word, and it answers to name and aliases."""
         instrument = self.instrument
         name = instrument.name
         require(isinstance(name, str) and name.strip(), "it has no name")
@@ -171,6 +136,7 @@ class Probe:
             require(instrument.answers_to(spelled), f"it does not answer to {spelled!r}")
 
     def check_documentation(self):
+        """Its class has a docstring, and references say where the values are from."""
         cls, references = type(self.instrument), self.instrument.references
         require((cls.__dict__.get("__doc__") or "").strip(), f"class {cls.__name__}: no docstring")
         words = f"references = {references!r}; a tuple of at least one text is needed"
@@ -178,6 +144,7 @@ class Probe:
         require(all(str(text).strip() for text in references), "one of its references is empty")
 
     def check_wavelengths(self):
+        """They are lengths, each positive, finite and another."""
         grid = self.grid
         require(grid.ndim == 1 and grid.size > 0, f"wavelength has shape {grid.shape}; (n,) is it")
         values = grid.to_value(u.um)
@@ -205,6 +172,7 @@ class Probe:
             yield source, self.instrument.chain(source, (), wavelength=grid)
 
     def check_sources(self):
+        """A chain is built for each of its sources, and an unknown source is refused."""
         for source, chain in self.chains():
             for leaf in leaves(chain):
                 require(isinstance(leaf, Optic), f"{source}: {leaf!r} is not an Optic")
@@ -218,6 +186,7 @@ class Probe:
         )
 
     def check_names(self):
+        """Every optic has a name of its own, and at most one of them splits the light."""
         for source, chain in self.chains():
             found = optic_names(chain)
             require(all(found), f"{source}: an optic has no name: {found}")
@@ -231,12 +200,14 @@ class Probe:
             )
 
     def check_bounds(self):
+        """Starting values are finite, within their bounds and as many as the wavelengths."""
         for grid in (None, self.few):
             size = self.grid.size if grid is None else grid.size
             for source, chain in self.chains(grid):
                 check_values(source, chain, size)
 
     def check_physical(self):
+        """Every optic is physical, at random positions, and so is the whole."""
         for source, chain in self.chains(self.few):
             self._check_physical(source, chain, self.few)
 
@@ -244,50 +215,48 @@ class Probe:
         for leaf in leaves(chain):
             matrix = system_mueller(leaf, grid, self._positions(leaf))
             require(np.all(is_physical(matrix)), f"{label}: {leaf.name} is not physical")
-        if not any(leaf.splits_light for leaf in leaves(chain)):
-            whole = system_mueller(chain, grid, self._positions(chain))
-            require(np.all(is_physical(whole)), f"{label}: the beam is not physical")
-            return
-        for beam in ("right", "left"):
-            whole = system_mueller(with_beam(chain, beam), grid, self._positions(chain))
-            require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
+        split = any(leaf.splits_light for leaf in leaves(chain))
+        for beam in ("right beam", "left beam") if split else ("beam",):
+            one = with_beam(chain, beam.split()[0]) if split else chain
+            whole = system_mueller(one, grid, self._positions(chain))
+            require(np.all(is_physical(whole)), f"{label}: the {beam} is not physical")
 
     def _positions(self, chain, n=16):
         draws = {stage: self.rng.uniform(0.1, 1, n) for stage in stages(chain)}
         return {s: x * u.one if s in COORDINATES else 180 * x * u.deg for s, x in draws.items()}
 
     def check_on_sky(self):
+        """A chain from the sky starts with the telescope, and nothing of the source is in it."""
         if not self.instrument.has_telescope:
             raise Absent("it has no telescope of known values")
         internal = [(s, chain) for s, chain in self.chains() if not is_star(s)]
         if not internal:
             raise Absent("it has no internal source")
         for source, chain in internal:
-            self._check_on_sky(source, chain)
-
-    def _check_on_sky(self, source, chain):
-        sky = self.instrument.on_sky(chain)
-        found, inner, names = leaves(sky), leaves(chain), optic_names(sky)
-        # what a lamp meets before anything turns belongs to the lamp
-        first = next((i for i, leaf in enumerate(inner) if leaf.stage), len(inner))
-        if self.instrument.entrance in (own := [leaf.name for leaf in inner]):
-            first = own.index(self.instrument.entrance)
-        left = [leaf.name for leaf in inner[:first] if leaf.name in names]
-        require(not left, f"{source}: {', '.join(left)} of the source would be upstream of a star")
-        kept = [leaf.name for leaf in inner[first:]]
-        lights = [o.name for o in found if isinstance(o, _LIGHTS) and o.name not in kept]
-        require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
-        words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
-        require(names[-len(kept) :] == kept, f"{source}: {words}")
-        front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
-        words = f"no optic upstream of {kept[0]} stands on the stage parallactic"
-        require("parallactic" in front, f"{source}: {words}")
-        again = optic_names(self.instrument.on_sky(sky))
-        require(again == names, f"{source}: a chain from the sky gets another telescope")
+            sky = self.instrument.on_sky(chain)
+            found, inner, names = leaves(sky), leaves(chain), optic_names(sky)
+            # what a lamp meets before anything turns belongs to the lamp
+            first = next((i for i, leaf in enumerate(inner) if leaf.stage), len(inner))
+            if self.instrument.entrance in (own := [leaf.name for leaf in inner]):
+                first = own.index(self.instrument.entrance)
+            left = ", ".join(leaf.name for leaf in inner[:first] if leaf.name in names)
+            require(not left, f"{source}: {left} of the source would be upstream of a star")
+            kept = [leaf.name for leaf in inner[first:]]
+            lights = [o.name for o in found if isinstance(o, _LIGHTS) and o.name not in kept]
+            words = f"{source}: {', '.join(lights)} would hide the polarization of a star"
+            require(not lights, words)
+            words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
+            require(names[-len(kept) :] == kept, f"{source}: {words}")
+            front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
+            words = f"no optic upstream of {kept[0]} stands on the stage parallactic"
+            require("parallactic" in front, f"{source}: {words}")
+            again = optic_names(self.instrument.on_sky(sky))
+            require(again == names, f"{source}: a chain from the sky gets another telescope")
 
     # ---- tables and headers
 
     def check_mounts(self):
+        """The position of every stage is a column of tables, or comes from a keyword."""
         layout = self.instrument.files or self.instrument.headers
         known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
         for source, chain in self.chains():
@@ -299,6 +268,7 @@ class Probe:
             require(placed, f"{source}: a star needs the site of the telescope")
 
     def check_headers(self):
+        """Keywords are those of FITS, differ, and are the same in the file layout."""
         keywords = self.instrument.keywords
         layout = self.instrument.files or self.instrument.headers
         if not keywords and layout is None:
@@ -309,11 +279,17 @@ class Probe:
             require(inside == keyword, f"{column} is {keyword} here, {inside} in its file layout")
         seen = {}
         for column, keyword in every.items():
-            check_keyword(column, keyword)
+            require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
+            # a keyword of several words is a hierarchical one
+            words = keyword.split(" ")
+            known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
+            short = len(keyword) <= 8 or len(words) > 1
+            require(known and short, f"{column}: {keyword!r} is not a FITS keyword")
             require(keyword not in seen, f"{seen.get(keyword)} and {column} are both {keyword}")
             seen[keyword] = column
 
     def check_setup(self):
+        """A table is given source and optics of its chain, and a strange one is refused."""
         for source, chain in self.chains(self.few):
             observations = self._observe(chain, source)
             told, present = self.instrument.setup(observations)
@@ -335,6 +311,7 @@ class Probe:
         raise Broken("a table of 'another polarimeter' is not refused")
 
     def check_published(self):
+        """Published values are within their bounds and physical, and their meta fit."""
         try:
             chain = self.instrument.published()
         except InstrumentError as none:
@@ -350,6 +327,7 @@ class Probe:
         )
 
     def check_round_trip(self):
+        """Every chain is the same after an ASDF file."""
         for source, chain in self.chains():
             read = read_back(chain)
             names = optic_names(read)
@@ -358,11 +336,20 @@ class Probe:
                 require(type(old) is type(new), f"{source}: {old.name} is a {type(new).__name__}")
                 require(old.mount == new.mount, f"{source}: {old.name} is on {new.mount}")
                 for key in old.param_names:
-                    check_same(source, old, getattr(old, key), getattr(new, key))
+                    was, now = getattr(old, key), getattr(new, key)
+                    name = f"{source}: {old.name}.{key} after a file"
+                    same = np.array_equal(was.value, now.value)
+                    require(same, f"{name} is {now.value}, not {was.value}")
+                    for what in ("unit", "bounds", "fixed"):
+                        before, after = getattr(was, what), getattr(now, what)
+                        require(before == after, f"{name}: {what} {after}, not {before}")
+                    both = (was.prior is None) == (now.prior is None)
+                    require(both, f"{name}: its prior is {now.prior}")
 
     # ---- observing
 
     def check_predicts(self):
+        """Both beams change with the modulator, and positions are those of the frames."""
         from astropolcal.measurement import Measurement
 
         largest = 0.0
@@ -383,6 +370,7 @@ class Probe:
         require(largest > 1e-6, "no source gives fluxes that change with the modulator")
 
     def check_calibrates(self):
+        """A calibration of simulated frames predicts frames that it did not see."""
         from astropolcal.calibration import calibrate
         from astropolcal.measurement import Measurement
 
@@ -414,8 +402,18 @@ class Probe:
         chain, rng = chain.copy(), np.random.default_rng(self.seed)
         for leaf in leaves(chain):
             for key in (k for k in leaf.param_names if not getattr(leaf, k).fixed):
-                value = moved_value(getattr(leaf, key), rng)
-                setattr(find_optic(chain, leaf.name), key, value)
+                parameter = getattr(leaf, key)
+                low, high = limits(parameter)
+                value, unit = np.asarray(parameter.value, dtype=float), parameter.unit or u.one
+                step = rng.normal(size=value.shape)
+                if unit.is_equivalent(u.rad):
+                    step = (_MOVED * step * u.rad).to_value(unit)
+                else:
+                    step = step * (_MOVED if unit == u.one else _MOVED_SHARE * np.abs(value))
+                # at a bound the other way, so that every free parameter moves
+                outside = (value + step < low) | (value + step > high)
+                moved = np.where(outside, value - step, value + step)
+                setattr(leaf, key, moved.clip(low, high) * unit)
         return chain
 
     def _observe(self, chain, source, grid=None, *, shift=0.0, noise=True):
@@ -453,23 +451,10 @@ class Probe:
         return frames
 
 
-RULES = {
-    "class": "it is an Instrument, its name is one word, and it answers to name and aliases",
-    "documentation": "its class has a docstring, and references say where the values are from",
-    "wavelengths": "they are lengths, each positive, finite and another",
-    "sources": "a chain is built for each of its sources, and an unknown source is refused",
-    "names": "every optic has a name of its own, and at most one of them splits the light",
-    "bounds": "starting values are finite, within their bounds and as many as the wavelengths",
-    "physical": "every optic is physical, at random positions, and so is the whole",
-    "on sky": "a chain from the sky starts with the telescope, and nothing of the source is in it",
-    "mounts": "the position of every stage is a column of tables, or comes from a keyword",
-    "headers": "keywords are those of FITS, differ, and are the same in the file layout",
-    "setup": "a table is given source and optics of its chain, and a strange one is refused",
-    "published": "published values are within their bounds and physical, and their meta fit",
-    "round trip": "every chain is the same after an ASDF file",
-    "predicts": "both beams change with the modulator, and positions are those of the frames",
-    "calibrates": "a calibration of simulated frames predicts frames that it did not see",
-}
+#: Every rule, in the order in which they are checked.
+RULES = [
+    name.removeprefix("check_").replace("_", " ") for name in vars(Probe) if name[:6] == "check_"
+]
 
 
 @dataclass
