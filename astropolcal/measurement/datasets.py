@@ -2,6 +2,7 @@
 """One dataset of a measurement: a chain, its observations, and its Jacobian."""
 
 import copy
+from contextlib import suppress
 
 import astropy.units as u
 import numpy as np
@@ -158,14 +159,8 @@ class Dataset:
         if weights.size == 1:
             return array
         nodes = array.reshape(array.shape[0], weights.size, -1)
-        # derivatives carry the weights of the nodes already (`_to_nodes`) and are only added up
+        # derivatives carry the weights of the nodes already and are only added up
         return np.einsum("wnc,n->wc", nodes, weights if mean else np.ones_like(weights))
-
-    def _to_nodes(self, array):
-        """Spread weights of columns over the nodes of their exposures."""
-        if self._node_weights.size == 1:
-            return array
-        return (array[:, None, :] * self._node_weights[:, None]).reshape(array.shape[0], -1)
 
     # ---- parameters ------------------------------------------------------------
 
@@ -213,7 +208,9 @@ class Dataset:
         """Return the derivative of the data to the flat vector, (n_free, n_data)."""
         right, left = self._fluxes(sweep)
         derivative = self.observable.derivative(right, left)
-        weights = [self._to_nodes(d.transpose(1, 0, 2).reshape(d.shape[1], -1)) for d in derivative]
+        # the weights of columns are spread over the nodes of their exposures
+        columns = [d.transpose(1, 0, 2).reshape(d.shape[1], 1, -1) for d in derivative]
+        weights = [(c * self._node_weights[:, None]).reshape(len(c), -1) for c in columns]
         # backward sweep: d(datum)/d(parameter) = sum over frames and beams of
         # d(datum)/d(flux) * d(flux)/d(parameter), without ever building the fluxes' own Jacobian
         slopes = sweep.derivatives([key for key, *_ in self._live], weights)
@@ -260,7 +257,12 @@ def _check_fit(chain, observations, observable):
 
 def _positions(chain, observations, positions):
     if positions is None:
-        positions = _reader(observations)(observations, chain)
+        # of an instrument that is not registered the columns are read
+        read = _columns
+        if observations.instrument is not None:
+            with suppress(InstrumentError):
+                read = instruments.get(observations.instrument).positions
+        positions = read(observations, chain)
     found = {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}
     used = ~observations.mask.all(axis=1)
     for stage, angle in found.items():
@@ -272,16 +274,6 @@ def _positions(chain, observations, positions):
                 "needed"
             )
     return found
-
-
-def _reader(observations):
-    """Return what reads positions: the instrument that the table names, or a plain reader."""
-    if observations.instrument is not None:
-        try:
-            return instruments.get(observations.instrument).positions
-        except InstrumentError:
-            pass  # of an instrument that is not registered the columns are read
-    return _columns
 
 
 def _columns(observations, chain):

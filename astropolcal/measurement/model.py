@@ -21,13 +21,13 @@ from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.observables import default_observable, get_observable
 from astropolcal.observations.reading import common_wavelengths
-from astropolcal.optics._modelling import LinearlyTied, with_own_scalars, without_units
+from astropolcal.optics._modelling import LinearlyTied, ScalarParameters, with_own_scalars
 from astropolcal.units import to_unit
 
 __all__ = ["Measurement"]
 
 
-class Measurement(FittableModel):
+class Measurement(ScalarParameters):
     """
     Chains and their observations as a 1-input, 1-output fittable model.
 
@@ -89,12 +89,6 @@ class Measurement(FittableModel):
     >>> bool(fitted.chains[0]["hwp"].retardance == fitted.hwp_retardance)
     True
     """
-
-    n_inputs = 1
-    n_outputs = 1
-    standard_broadcasting = False
-    col_fit_deriv = True
-    _param_names = ()
 
     def __init__(
         self,
@@ -172,11 +166,6 @@ class Measurement(FittableModel):
         else:
             super().__setattr__(attr, value)
 
-    @property
-    def param_names(self):
-        """Names of the free scalar parameters, one an element of the flat vector."""
-        return self._param_names
-
     # A fitter asks for the following again and again. Astropy looks every parameter up by name
     # in tables it builds anew; with one scalar a parameter, plain loops give the same.
     @property
@@ -198,16 +187,6 @@ class Measurement(FittableModel):
         return any(self.__dict__[label].fixed for label in self._param_names)
 
     @property
-    def has_tied(self):
-        """Whether a scalar parameter has a callable tie."""
-        return any(self.__dict__[label].tied for label in self._param_names)
-
-    @property
-    def has_bounds(self):
-        """Whether a scalar parameter has a bound."""
-        return any(self.__dict__[label].bounds != (None, None) for label in self._param_names)
-
-    @property
     def sync_constraints(self):
         """Whether astropy reads constraints from the parameters each time; not in a fit."""
         return self.__dict__.get("_sync_constraints", True)
@@ -218,10 +197,6 @@ class Measurement(FittableModel):
         # a fitter sets it last of all
         self.__dict__["_fitted"] = value
 
-    def _parameter_units_for_data_units(self, input_units, output_units):
-        units = {label: self.__dict__[label].unit for label in self._param_names}
-        return {label: unit for label, unit in units.items() if unit is not None}
-
     def without_units_for_data(self, **data):
         """Return the measurement as a fitter takes it: itself, with numbers in its units."""
         unit = getattr(data[self.outputs[0]], "unit", u.one)
@@ -229,17 +204,14 @@ class Measurement(FittableModel):
             raise ParameterError(f"the data are in {unit}; observables are plain numbers")
         return self
 
-    def with_units_from_data(self, **data):
-        """Return the fitted measurement: itself."""
-        return self
-
     def canonical(self):
         """Return a copy whose parameters are in canonical units, for fits of this package."""
         new = with_own_scalars(self, self._param_names)
         new._chains_are_shared = True
         new._factors = np.ones_like(self._factors)
-        bounds = _bounds(*self.free.bounds())
-        without_units(new, self._param_names, self.vector().tolist(), bounds)
+        for label, bound in zip(self._param_names, _bounds(*self.free.bounds()), strict=True):
+            parameter = new.__dict__[label]
+            parameter._unit, parameter.bounds = None, bound
         new.stand_at(self.vector())
         return new
 
@@ -358,10 +330,6 @@ class Measurement(FittableModel):
             # the noise it is in those of a datum
             np.concatenate([weights, np.full(self.n_priors, noise)]),
         )
-
-    def log_prior(self, vector):
-        """Return the log density of the priors, minus infinity outside the bounds."""
-        return self.free.log_prior(vector)
 
     # ---- results --------------------------------------------------------------
 

@@ -223,13 +223,21 @@ class FreeParameters:
             # as `Normal`, which an ASDF file can hold where scipy's frozen distribution cannot
             if parameter.prior is not None:
                 parameter.prior = normal_per_wavelength(parameter.prior, parameter.unit)
-        self._check_ties()
+        for name, tie in self.ties.items():
+            for wanted in (name, tie.source):
+                if wanted not in self._table:
+                    raise ParameterError(f"tie {name} -> {tie.source}: no parameter {wanted!r}")
+            if tie.source in self.ties:
+                raise ParameterError(f"tie {name} -> {tie.source}: the source is itself tied")
         self.slots = []
         self.size = 0
         for name, parameters in self._table.items():
             self._check(name, parameters, n_wavelengths)
             if not parameters[0].fixed and name not in self.ties:
-                self._append(name, parameters[0])
+                first = parameters[0]
+                size = int(np.size(first.value))
+                self.slots.append(Slot(name, first.unit, self.size, size, tuple(first.bounds)))
+                self.size += size
         self.by_name = {slot.name: slot for slot in self.slots}
         #: Priors of free parameters, with the slot each belongs to.
         self.priors = [
@@ -243,7 +251,19 @@ class FreeParameters:
                 raise ParameterError(
                     f"prior of {slot.name} has {size} values; allowed are 1 or {slot.size}"
                 )
-        self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
+        # slot, factor and offset (canonical) of what is tied
+        self._followers = {}
+        for name, tie in self.ties.items():
+            source, target = self.by_name.get(tie.source), self._table[name][0]
+            if source is None:
+                raise ParameterError(f"tie {name} -> {tie.source}: {tie.source} is not free")
+            if np.size(target.value) != source.size:
+                raise ParameterError(f"tie {name} -> {tie.source}: the shapes differ")
+            unit, offset = target.unit, tie.offset
+            if np.isscalar(offset) and offset == 0:
+                offset = 0.0 * (unit or u.one)
+            offset = to_unit(offset, unit, f"offset of {name}") * canonical_factor(unit)
+            self._followers[name] = source, float(tie.factor), offset
         self._bounds = self._limits()
 
     def of_chains(self, chains):
@@ -251,20 +271,6 @@ class FreeParameters:
         new = copy.copy(self)
         new._table = parameter_table(chains)
         return new
-
-    def _append(self, name, parameter):
-        size = int(np.size(parameter.value))
-        slot = Slot(name, parameter.unit, self.size, size, tuple(parameter.bounds))
-        self.slots.append(slot)
-        self.size += size
-
-    def _check_ties(self):
-        for name, tie in self.ties.items():
-            for wanted in (name, tie.source):
-                if wanted not in self._table:
-                    raise ParameterError(f"tie {name} -> {tie.source}: no parameter {wanted!r}")
-            if tie.source in self.ties or tie.source == name:
-                raise ParameterError(f"tie {name} -> {tie.source}: the source is itself tied")
 
     @staticmethod
     def _check(name, parameters, n_wavelengths):
@@ -282,24 +288,6 @@ class FreeParameters:
             )
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
-
-    def _follower(self, name, tie):
-        if tie.source not in self.by_name:
-            raise ParameterError(f"tie {name} -> {tie.source}: {tie.source} is not free")
-        target, slot = self._table[name][0], self.by_name[tie.source]
-        if np.size(target.value) not in (1, slot.size) or (
-            slot.size > 1 and np.size(target.value) == 1
-        ):
-            raise ParameterError(f"tie {name} -> {tie.source}: the shapes differ")
-        unit = target.unit
-        offset = tie.offset
-        if not isinstance(offset, u.Quantity) and offset == 0 and unit is not None:
-            offset = 0.0 * unit
-        return (
-            slot,
-            float(tie.factor),
-            to_unit(offset, unit, f"offset of {name}") * canonical_factor(unit),
-        )
 
     @property
     def labels(self):
@@ -327,7 +315,7 @@ class FreeParameters:
             vector[slot.slice] = np.ravel(self._table[slot.name][0].value) * slot.factor
         for slot, prior in self.priors:
             # a value that the prior excludes starts at the prior's mode
-            low, high = prior.canonical_support()
+            low, high = prior.support
             here = vector[slot.slice]
             # a fitter with bounds refuses a start outside of them
             excluded = (here < low) | (here > high)
@@ -350,7 +338,7 @@ class FreeParameters:
         pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
         low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
         for slot, prior in self.priors:
-            start, end = prior.canonical_support()
+            start, end = prior.support
             # where the density is zero there is a bound, whichever is tighter
             low[slot.slice] = np.maximum(low[slot.slice], start)
             high[slot.slice] = np.minimum(high[slot.slice], end)
@@ -359,14 +347,6 @@ class FreeParameters:
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
-
-    def log_prior(self, vector):
-        """Return the log density of the priors, minus infinity outside the bounds."""
-        vector = np.asarray(vector, dtype=float)
-        low, high = self._bounds
-        if np.any(vector < low) or np.any(vector > high):
-            return -np.inf
-        return float(sum(prior.log_density(vector[slot.slice]) for slot, prior in self.priors))
 
     def prior_residuals(self, vector):
         """Return the residuals of the priors that are not flat, one an element of theirs."""
@@ -524,7 +504,8 @@ class BoundPrior:
         return _plain(self.distribution.mean()), _plain(self.distribution.std())
 
     @cached_property
-    def _support(self):
+    def support(self):
+        """Where the density is not zero, canonical."""
         low, high = self.distribution.support()
         return low * self.factor, high * self.factor
 
@@ -541,10 +522,6 @@ class BoundPrior:
     def _is_normal(self):
         return self.distribution.dist.name == "norm"
 
-    def canonical_support(self):
-        """Return where the density is not zero, canonical."""
-        return self._support
-
     def log_densities(self, canonical):
         """Return the log density per declared unit at each value."""
         canonical = np.asarray(canonical, dtype=float)
@@ -555,14 +532,10 @@ class BoundPrior:
             # a sampler makes a million times
             return self._log_peak - 0.5 * ((value - mean) / std) ** 2
         if self.is_flat:
-            low, high = self._support
+            low, high = self.support
             inside = (canonical >= low) & (canonical <= high)
             return np.where(inside, self._log_peak, -np.inf)
         return self.distribution.logpdf(value)
-
-    def log_density(self, canonical):
-        """Return the log density per declared unit, summed over the values."""
-        return float(np.sum(self.log_densities(canonical)))
 
     def residual(self, canonical):
         """Return signed residuals whose half square is minus the log density, less its least."""
@@ -582,7 +555,7 @@ class BoundPrior:
         std = self._moments[1] * self.factor
         if self._is_normal:
             return np.broadcast_to(1 / std, canonical.shape).copy()
-        low, high = self._support
+        low, high = self.support
         # never beyond the support, where the density is zero and the residual infinite
         up = np.minimum(canonical + _STEP * std, high)
         down = np.maximum(canonical - _STEP * std, low)

@@ -431,7 +431,7 @@ def test_priors_act_after_reading(path):
     old, new = calibration.measurement, again.measurement
     assert new.n_priors == old.n_priors == 1
     vector = old.vector() + 1e-4
-    assert new.log_prior(vector) == old.log_prior(vector)
+    assert new.free.prior_residuals(vector) == old.free.prior_residuals(vector)
 
 
 def test_prior_without_unit_comes_back(path):

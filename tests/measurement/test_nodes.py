@@ -118,8 +118,6 @@ def test_prior_of_several_values():
         np.testing.assert_allclose(free.prior_residuals(vector), [1.0, -2.0])
         jacobian = free.prior_jacobian(vector)
         np.testing.assert_allclose(jacobian[:2], np.diag([1000.0, 500.0]))
-        expected = norm([0.01, 0.02], [0.001, 0.002]).logpdf(vector[:2]).sum()
-        assert free.log_prior(vector) == pytest.approx(expected), prior
 
 
 def test_prior_of_another_number_of_values_is_an_error():
