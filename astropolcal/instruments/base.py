@@ -20,8 +20,8 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
-from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments.telescope import _normal, as_exact, behind_telescope, star_options
+from astropolcal.exceptions import ChainError, InstrumentError
+from astropolcal.instruments.telescope import _normal, as_exact, star_options
 from astropolcal.observations.grid import (
     is_star,
     mask_incomplete_cycles,
@@ -204,10 +204,17 @@ def add_nuisance(chains, datasets, nuisance):
     size = len(common_wavelengths(datasets))
     for text in nuisance:
         kind, _, wanted = str(text).partition(":")
-        _check(kind, wanted, names)
+        check_choice("nuisance", kind, NUISANCES, InstrumentError)
+        if wanted:
+            check_choice(f"nuisance {kind}: dataset", wanted, names, InstrumentError)
         chosen = [i for i, name in enumerate(names) if wanted in ("", name)]
         if kind == "lamp":
-            chosen = _lamps(chains, chosen, text)
+            polarized = (optics.LinearPolarizer, optics.PolarizedSource)
+            chosen = [i for i in chosen if not isinstance(leaves(chains[i])[0], polarized)]
+            if not chosen:
+                raise InstrumentError(
+                    f"nuisance {text}: no dataset is of an unpolarized internal source"
+                )
         for i in chosen:
             chains[i] = _added(chains[i], datasets[i], kind, f"{kind}_{labels[i]}", size)
     return chains
@@ -219,21 +226,6 @@ def without_nuisance(chain):
     found = leaves(chain)
     kept = [leaf for leaf in found if not str(leaf.name).startswith(prefixes)]
     return chain if len(kept) == len(found) else join(kept)
-
-
-def _check(kind, wanted, names):
-    check_choice("nuisance", kind, NUISANCES, InstrumentError)
-    if wanted:
-        check_choice(f"nuisance {kind}: dataset", wanted, names, InstrumentError)
-
-
-def _lamps(chains, chosen, text):
-    """Return the chains of internal sources without polarizer."""
-    polarized = (optics.LinearPolarizer, optics.PolarizedSource)
-    lamps = [i for i in chosen if not isinstance(leaves(chains[i])[0], polarized)]
-    if not lamps:
-        raise InstrumentError(f"nuisance {text}: no dataset is of an unpolarized internal source")
-    return lamps
 
 
 def _added(chain, observations, kind, name, size):
@@ -457,7 +449,11 @@ class Instrument(ABC):
             If a table belongs to another instrument, or does not say what it is.
         """
         datasets = list(datasets)
-        self._check_options(options)
+        known = inspect.signature(self.chain).parameters
+        # before any table is read: a wrong word of the command line is the likelier mistake
+        unknown = sorted(set(options) - set(known))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
+            raise InstrumentError(f"{self.name}: its chain has no option {', '.join(unknown)}")
         for observations in datasets:
             self.check(observations)
         # one grid for all: what datasets share has one value for each wavelength of any of them
@@ -538,15 +534,14 @@ class Instrument(ABC):
         chain = without_nuisance(chain)
         if "parallactic" in stages(chain):
             return chain
-        behind = behind_telescope(chain, self)
+        found = leaves(chain)
+        start = next((i for i, leaf in enumerate(found) if leaf.name == self.entrance), None)
+        if start is None:
+            raise ChainError(
+                f"{self.name}: the chain has no optic {self.entrance!r} to put the telescope before"
+            )
+        behind = found[start:]
         return join([*self.telescope_optics(behind, **options), *behind])
-
-    def _check_options(self, options):
-        known = inspect.signature(self.chain).parameters
-        # before any table is read: a wrong word of the command line is the likelier mistake
-        unknown = sorted(set(options) - set(known))
-        if unknown and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
-            raise InstrumentError(f"{self.name}: its chain has no option {', '.join(unknown)}")
 
     def particulars(self, observations):
         """
@@ -563,6 +558,8 @@ class Instrument(ABC):
             Here of a star ``star``, the name of its source optic, and ``target``, as far as
             `chain` takes them.
         """
+        if not is_star(observations.source):
+            return {}
         known = inspect.signature(self.chain).parameters
         return {key: value for key, value in star_options(observations).items() if key in known}
 

@@ -18,7 +18,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import telescope as subaru
-from astropolcal.instruments.layout import FileLayout, frame_time
+from astropolcal.instruments.layout import COMMON, FileLayout, frame_time
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.reading import stated_date
 
@@ -67,16 +67,12 @@ class CHARIS(SubaruPolarimeter):
     wavelength = subaru.BINS
     keywords = SubaruPolarimeter.keywords | {"parallactic": "PARANG"}
     files = FileLayout(
-        keywords=keywords
+        keywords=COMMON
+        | keywords
         | {
-            "exposure_time": "EXPTIME",
             "mjd": "MJD",
             "date": "UTC-DATE",
             "time": "UTC-TIME",
-            "right_ascension": "RA",
-            "declination": "DEC",
-            "object": "OBJECT",
-            "instrument": "INSTRUME",
             "filter": "FILTNAME",
             "pickoff": "X_CHAPKO",
         },
@@ -87,7 +83,6 @@ class CHARIS(SubaruPolarimeter):
             "filter": ("Y_FLTNAM", "FILTER01"),
         },
         shape=(22, 201, 201),
-        units={"exposure_time": "s", "mjd": "d"},
         raw_columns=("hwp", "hwp_true", "derotator", "instrument"),
         identities=("CHARIS",),
         prefix="CRSA",
@@ -97,7 +92,6 @@ class CHARIS(SubaruPolarimeter):
         internal_apertures=((71.75, 86.25), (131.5, 116.25), 44.48, 112.38, 0.4633),
         star_offset=(63.5, 33.1),
         pixel_scale=16.2,
-        edge=1.0,
         site=subaru.SITE,
     )
     references = (

@@ -26,8 +26,8 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.layout import FileLayout, side_by_side
-from astropolcal.instruments.telescope import INTERNAL, STARS, misaligned, star_source
+from astropolcal.instruments.layout import COMMON, FileLayout, side_by_side
+from astropolcal.instruments.telescope import INTERNAL, PARANAL, STARS, misaligned, star_source
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
@@ -44,6 +44,18 @@ _COMMANDED = {"Qplus": 0.0, "Qminus": 45.0, "Uplus": 22.5, "Uminus": 67.5}
 _STAGES = {"hwp_true": "ESO INS4 DROT3", "derotator": "ESO INS4 DROT2"}
 _ROTATION, _STOKES = "ESO INS4 COMB ROT", "ESO OCS DPI H2RT STOKES"
 _FILTER, _PARALLACTIC = "ESO INS1 FILT ID", "ESO TEL PARANG START"
+
+# van Holstein et al. 2020, as distributed with their pipeline; one row per filter
+_DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
+
+#: Filters with coefficients, and the wavelengths that stand for them.
+FILTERS = tuple(str(name) for name in _DATA["filter"])
+CENTRES = _DATA["wavelength"]
+#: Day from which the telescope's mirrors have their new coating, and the names of both.
+RECOATING = _DATA.meta["recoating"]
+COATINGS = ("before", "after")
+# central wavelengths by the filter
+_BANDS = dict(zip(FILTERS, CENTRES, strict=True))
 
 
 class _Header:
@@ -84,20 +96,15 @@ class _Header:
         return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
 
 
-def frame_table(headers, location, filters, law):
-    """
-    Return the table of frames from their headers, see `astropolcal.instruments.IRDIS.frame_table`.
-
-    ``filters`` are the central wavelengths of those with coefficients, ``law`` says how plate and
-    derotator follow the sky.
-    """
+def frame_table(headers):
+    """Return the table of frames from their headers, see the method of `IRDIS`."""
     if not headers:
         raise ObservationError("no headers were given, at least one is needed")
     frames = [_Header(number, header) for number, header in enumerate(headers)]
     stars = [_PARALLACTIC in frame for frame in frames]
     if len(set(stars)) > 1:
         raise ObservationError(f"frame {stars.index(False)}: no keyword {_PARALLACTIC}")
-    bands = {_filter(frame, filters) for frame in frames}
+    bands = {_filter(frame) for frame in frames}
     kinds = ("FIELD", "PUPIL")
     trackings = {frame.text(_ROTATION, kinds).lower() if stars[0] else None for frame in frames}
     for what, found in (("filters", bands), ("kinds of tracking", trackings)):
@@ -105,27 +112,27 @@ def frame_table(headers, location, filters, law):
             names = ", ".join(sorted(map(str, found)))
             raise ObservationError(f"frames of several {what}: {names}")
     (band,), (tracking,) = bands, trackings
-    rows = [_row(frame, tracking, location if stars[0] else None) for frame in frames]
-    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, law)
+    rows = [_row(frame, tracking, on_sky=stars[0]) for frame in frames]
+    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking)
     table = QTable({key: [row[key] for row in rows] for key in rows[0]})
-    table["wavelength"] = np.full(len(rows), 1.0) * filters[band]
+    table["wavelength"] = np.full(len(rows), 1.0) * _BANDS[band]
     table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
     table.meta |= {"tracking": tracking} if tracking else {}
     return table
 
 
-def _filter(frame, filters):
+def _filter(frame):
     name = frame.text(_FILTER)
     band = name.removeprefix("FILT_BBF_")
-    if band == name or band not in filters:
+    if band == name or band not in _BANDS:
         raise InstrumentError(
             f"frame {frame.number}: {_FILTER} = {name!r} has no coefficients; allowed are "
-            f"{', '.join(f'FILT_BBF_{known}' for known in filters)}"
+            f"{', '.join(f'FILT_BBF_{known}' for known in _BANDS)}"
         )
     return band
 
 
-def _row(frame, tracking, location):
+def _row(frame, tracking, on_sky):
     angles = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
     angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
     # the image turns by twice the derotator
@@ -137,9 +144,13 @@ def _row(frame, tracking, location):
         start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
         middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
         moment = middle.isot
-    if location is not None:
+    if on_sky:
         angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
-        motion = _motion(frame, Time([start, middle]), location)
+        target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
+        places = pointing(target, Time([start, middle]), location_of(PARANAL))
+        # by how much altitude and parallactic angle change until the middle
+        higher, turned = (float(np.diff(angle.to_value(u.deg))[0]) for angle in places)
+        motion = (turned + 180) % 360 - 180, higher
         # of the start: an offset of what is computed cancels in the change
         angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0) + motion[1]
     commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
@@ -150,15 +161,6 @@ def _row(frame, tracking, location):
     return row | {"exposure_time": dit * ndit * u.s, "time": moment}
 
 
-def _motion(frame, times, location):
-    """Return by how much parallactic angle and altitude change from one time to the other."""
-    target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
-    altitude, parallactic = (
-        np.diff(angle.to_value(u.deg))[0] for angle in pointing(target, times, location)
-    )
-    return float((parallactic + 180) % 360 - 180), float(altitude)
-
-
 def _stage(frame, keyword):
     """Return the mean angle of a stage, or that of the start where there is no other."""
     first, last = f"{keyword} BEGIN", f"{keyword} END"
@@ -167,7 +169,7 @@ def _stage(frame, keyword):
     return frame.mean_angle(first, last if last in frame else first)
 
 
-def _warn_of_starts(frames, motions, tracking, law):
+def _warn_of_starts(frames, motions, tracking):
     """Say which angles are those of the start, and by how much the middle differs."""
     for column, keyword in _STAGES.items():
         few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
@@ -175,7 +177,8 @@ def _warn_of_starts(frames, motions, tracking, law):
             continue
         on_sky = (0.0, 0.0)
         if tracking is not None:
-            on_sky = (law.plate_law if column == "hwp_true" else law.derotator_law)(tracking)
+            law = SKY_LAW.plate_law if column == "hwp_true" else SKY_LAW.derotator_law
+            on_sky = law(tracking)
         lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
         warnings.warn(
             f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
@@ -186,16 +189,6 @@ def _warn_of_starts(frames, motions, tracking, law):
             stacklevel=4,
         )
 
-
-# van Holstein et al. 2020, as distributed with their pipeline; one row per filter
-_DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
-
-#: Filters with coefficients, and the wavelengths that stand for them.
-FILTERS = tuple(str(name) for name in _DATA["filter"])
-CENTRES = _DATA["wavelength"]
-#: Day from which the telescope's mirrors have their new coating, and the names of both.
-RECOATING = _DATA.meta["recoating"]
-COATINGS = ("before", "after")
 
 # a wavelength within this share of a filter's centre stands for the filter
 _SAME_FILTER = 0.01
@@ -273,38 +266,14 @@ def coating_of(coating, date):
     return found[0]
 
 
-def _column(name, index):
-    return _DATA[name][index]
-
-
 def _retarder(index, name):
     """Return the half-wave plate or the derotator, by the name of its stage."""
     theta = _DATA.meta[f"{name}_theta_deg"]
     held = misaligned(theta)
     held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
-    values = {key: _column(f"{name}_{key}", index) for key in ("diattenuation", "retardance")}
+    values = {key: _DATA[f"{name}_{key}"][index] for key in ("diattenuation", "retardance")}
     settings = {"theta": theta * u.deg, "mount": name, "name": name}
     return optics.DiattenuatorRetarder(**values, **settings, **held)
-
-
-def derotator(index):
-    """Return the derotator."""
-    turning = _retarder(index, "derotator")
-    # double differences see it in second order only
-    turning.diattenuation.fixed = True
-    return turning
-
-
-def polarizers(index):
-    """Return the pair of polarizers before the halves of the detector."""
-    efficiency = _column("polarizer_efficiency", index)
-    # the left beam passes +Q
-    return optics.WollastonPrism(efficiency=efficiency, theta=90 * u.deg, name="wollaston")
-
-
-def calibration_polarizer():
-    """Return the polarizer of the internal source."""
-    return optics.LinearPolarizer(name="calibration_polarizer", **misaligned(0))
 
 
 def telescope(index, coating):
@@ -320,8 +289,8 @@ def telescope(index, coating):
 
 def _mirror(name, coating, index):
     return optics.DiattenuatorRetarder(
-        diattenuation=_column(f"{name}_diattenuation_{coating}", index),
-        retardance=_column("mirror_retardance", index),
+        diattenuation=_DATA[f"{name}_diattenuation_{coating}"][index],
+        retardance=_DATA["mirror_retardance"][index],
         name=name,
         # an unpolarized star shows the diattenuation of a mirror, never its retardance
         fixed={"retardance": True},
@@ -331,8 +300,6 @@ def _mirror(name, coating, index):
 
 # ---- files -------------------------------------------------------------------------------------
 
-# longitude, latitude (deg) and height (m) of the telescope in the headers
-_SITE = (-70.4045, -24.6268, 2648.0)
 #: What keeps the direction of polarization that is measured fixed to the image.
 SKY_LAW = SkyLaw(
     plate={"field": (-1.0, 1.0), "pupil": (-0.5, 1.0)},
@@ -346,8 +313,7 @@ class IrdisLayout(FileLayout):
 
     def from_header(self, header):
         """Return a header with the angles, and the time, in the middle of the exposure."""
-        filters = dict(zip(FILTERS, CENTRES, strict=True))
-        (row,) = frame_table([header], location_of(_SITE), filters, SKY_LAW)
+        (row,) = frame_table([header])
         angles = KEYWORDS.keys() & set(row.colnames)
         known = {KEYWORDS[name]: row[name].to_value(u.deg) for name in angles}
         with offline():
@@ -368,7 +334,7 @@ class IrdisLayout(FileLayout):
         # a star that is always up: by its motion the altitude is that of the start
         own = {_ROTATION: "FIELD", "RA": 0.0, "DEC": -80.0} | own
         own["ESO TEL PARANG END"] = own[_PARALLACTIC]
-        _, motion = _row(_Header(0, own), None, location_of(_SITE))["motion"]
+        _, motion = _row(_Header(0, own), None, on_sky=True)["motion"]
         return own | {"ESO TEL ALT": own["ESO TEL ALT"] - motion}
 
 
@@ -384,31 +350,23 @@ KEYWORDS = {
 _LIT = 0.7
 #: Full frames, dark, flat and centred: both halves of the detector side by side.
 LAYOUT = IrdisLayout(
-    keywords=KEYWORDS
+    keywords=COMMON
+    | KEYWORDS
     | {
-        "exposure_time": "EXPTIME",
         "exposures": "ESO DET NDIT",
-        "mjd": "MJD-OBS",
-        "date": "DATE-OBS",
-        "right_ascension": "RA",
-        "declination": "DEC",
-        "object": "OBJECT",
-        "instrument": "INSTRUME",
         "filter": _FILTER,
     },
     shape=(1, 1024, 2048),
     cube_extension=0,
     weights="error",
-    units={"exposure_time": "s", "mjd": "d"},
     identities=("SPHERE",),
     prefix="IRDIS_",
     gain=1.75,
     read_noise=10.0,
     saturation=30000.0,
     pixel_scale=12.25,
-    fwhm=4.0,
     tracking=SKY_LAW.plate_law("field"),
-    site=_SITE,
+    site=PARANAL,
     stacked=True,
     centred=True,
     **side_by_side(1024, 1024, _LIT),
@@ -516,9 +474,16 @@ class IRDIS(Instrument):
         grid = self.grid(wavelength)
         # published coefficients are of filters: nothing is interpolated between them
         index = filters_at(grid)
-        common = [_retarder(index, "hwp"), derotator(index), polarizers(index)]
+        derotator = _retarder(index, "derotator")
+        # double differences see it in second order only
+        derotator.diattenuation.fixed = True
+        # a pair of polarizers before the halves of the detector; the left beam passes +Q
+        efficiency = _DATA["polarizer_efficiency"][index]
+        analyser = optics.WollastonPrism(efficiency=efficiency, theta=90 * u.deg, name="wollaston")
+        common = [_retarder(index, "hwp"), derotator, analyser]
         if source == "polarized":
-            return join([calibration_polarizer(), *common])
+            polarizer = optics.LinearPolarizer(name="calibration_polarizer", **misaligned(0))
+            return join([polarizer, *common])
         if source == "unpolarized":
             zero = np.zeros(index.size)
             # M4 and the lamp polarize together; only what reaches the plate can be measured
@@ -576,10 +541,6 @@ class IRDIS(Instrument):
             check_all_filters(behind)
         return telescope(filters_at(self.grid(wavelength)), coating_of(coating, date))
 
-    def setup(self, observations):
-        """Return the source from the table's meta, and no optional optics."""
-        return self.source_of(observations), ()
-
     def particulars(self, observations):
         """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
@@ -594,8 +555,8 @@ class IRDIS(Instrument):
     def configured(self, header):
         """Return the instrument with the filter and the shape of a file."""
         # a new one: the registry hands out instances that others may hold
-        one, filters = type(self)(), dict(zip(FILTERS, CENTRES, strict=True))
-        one.wavelength = np.atleast_1d(filters[_filter(_Header(0, header), filters)])
+        one = type(self)()
+        one.wavelength = np.atleast_1d(_BANDS[_filter(_Header(0, header))])
         one.files = layout_of(header)
         return one
 
@@ -658,8 +619,7 @@ class IRDIS(Instrument):
         >>> table["derotator"].round(6), table.meta["filter"]
         (<Quantity [1.] deg>, 'H')
         """
-        filters = dict(zip(FILTERS, CENTRES, strict=True))
-        table = frame_table(list(headers), self.location, filters, self.sky_law)
+        table = frame_table(list(headers))
         days = {self.coating_on(time) for time in table["time"]}
         if len(days) > 1:
             raise InstrumentError(

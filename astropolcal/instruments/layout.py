@@ -352,22 +352,16 @@ def side_by_side(rows, columns, lit):
     }
 
 
-def header_map(keywords, transforms=(), **times):
-    """Return a layout that reads headers alone, of files whose cubes are not known."""
-    keywords = (
-        {
-            "mjd": "MJD-OBS",
-            "date": "DATE-OBS",
-            "right_ascension": "RA",
-            "declination": "DEC",
-            "object": "OBJECT",
-            "instrument": "INSTRUME",
-        }
-        | keywords
-        | times
-    )
-    return FileLayout(keywords, (1, 1, 1), units={"mjd": "d"}, transforms=dict(transforms))
-
+#: Keywords that most instruments have, by the column of the table.
+COMMON = {
+    "exposure_time": "EXPTIME",
+    "mjd": "MJD-OBS",
+    "date": "DATE-OBS",
+    "right_ascension": "RA",
+    "declination": "DEC",
+    "object": "OBJECT",
+    "instrument": "INSTRUME",
+}
 
 #: Columns that are angles of a stage.
 ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
@@ -388,9 +382,8 @@ TEXTS = (
 #: Beyond these, in degree, an angle in a header cannot be right.
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
 RANGES |= {"em_gain": (0.0, 1e5), "exposures": (1.0, 1e6)}
-# numbers without a unit
-# what a layout means that gives no unit; everything else is in degree
-_UNITS = {"camera": "", "em_gain": "", "exposures": "", "exposure_time": "s"}
+# what a layout means that gives no unit, "" for a number; everything else is in degree
+_UNITS = {"camera": "", "em_gain": "", "exposures": "", "exposure_time": "s", "mjd": "d"}
 
 _MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 

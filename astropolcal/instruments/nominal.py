@@ -95,8 +95,6 @@ of the prisms (0.99), and by how much their clocking departs from 0 and 45 deg. 
 polarizer on board: standard stars calibrate it.
 """
 
-import re
-
 import astropy.units as u
 import numpy as np
 
@@ -106,10 +104,11 @@ from astropolcal.instruments.base import SkyLaw
 from astropolcal.instruments.polarimeter import (
     Polarimeter,
     aluminium,
+    diattenuator,
     turning_retarder,
     wollaston,
 )
-from astropolcal.instruments.telescope import PARANAL, STARS, misaligned, star_source
+from astropolcal.instruments.telescope import PARANAL, STARS, misaligned, star_options, star_source
 
 __all__ = []
 
@@ -150,8 +149,7 @@ class FORS2(Polarimeter):
 
     def inner(self, source, optics_in, grid):
         """Return the collimator, the plate, whose zero is free per wavelength, and the prism."""
-        zero = np.zeros(grid.size)
-        collimator = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="collimator")
+        collimator = diattenuator("collimator", grid)
         collimator.horizontal.fixed = collimator.diagonal.fixed = source == "polarized"
         theta = np.interp(grid.to_value(u.nm), self.wavelength.value, _FORS2_ZERO)
         plate = turning_retarder("hwp", 178, grid, most=15, theta=theta * u.deg)
@@ -189,9 +187,8 @@ class NaCo(Polarimeter):
 
     def inner(self, source, optics_in, grid):
         """Return the mirrors of the instrument, the plate and the prism."""
-        zero = np.zeros(grid.size)
-        mirrors = optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="mirrors")
-        return [mirrors, turning_retarder("hwp", 178, grid, most=20), wollaston(grid)]
+        plate = turning_retarder("hwp", 178, grid, most=20)
+        return [diattenuator("mirrors", grid), plate, wollaston(grid)]
 
     def telescope_optics(self, behind=(), *, wavelength=None):
         """Return M3 of aluminium, and the adapter, which keeps the sky at the position angle."""
@@ -310,8 +307,7 @@ class GPI(Polarimeter):
 
     def inner(self, source, optics_in, grid):
         """Return what is upstream of the plate, the plate and the prism."""
-        q, u_ = (np.full(grid.size, value) for value in _POLARIZANCE[:2])
-        upstream = optics.VectorDiattenuator(horizontal=q, diagonal=u_, name="telescope_and_ao")
+        upstream = diattenuator("telescope_and_ao", grid, *_POLARIZANCE[:2])
         retardance = np.interp(grid.to_value(u.um), self.wavelength.value, _RETARDANCE)
         plate = turning_retarder("hwp", retardance, grid, about=_GPI_ZERO, most=30)
         return [upstream, plate, wollaston(grid)]
@@ -376,18 +372,14 @@ class RomanCoronagraph(Polarimeter):
 
     def inner(self, source, optics_in, grid):
         """Return the turning of the sky, what is upstream of the prisms, and the prisms."""
-        zero = np.zeros(grid.size)
+        ten = np.full(grid.size, 10.0) * u.deg
         return [
             optics.Rotator(mount="-roll", name="roll"),
-            optics.VectorDiattenuator(horizontal=zero, diagonal=zero, name="telescope"),
-            optics.LinearRetarder(
-                retardance=(zero + 10) * u.deg, bounds={"retardance": (0, 90)}, name="mirrors"
-            ),
+            diattenuator("telescope", grid),
+            optics.LinearRetarder(retardance=ten, bounds={"retardance": (0, 90)}, name="mirrors"),
             wollaston(grid, mount="prism", **misaligned(0)),
         ]
 
     def particulars(self, observations):
         """Return the names of a star, ``object`` in the meta: of its source, in the catalogue."""
-        target = str(observations.meta.get("object") or "")
-        words = re.sub(r"\W+", "", target)
-        return {"star": f"star_{words}", "target": target} if words else {}
+        return star_options(observations)

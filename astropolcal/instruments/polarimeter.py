@@ -16,7 +16,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.layout import header_map
+from astropolcal.instruments.layout import COMMON, FileLayout
 from astropolcal.observations.pointings import location_of
 
 __all__ = []
@@ -82,7 +82,10 @@ class Polarimeter(Instrument):
     @property
     def headers(self):
         """Layout that reads the headers of frames."""
-        return header_map(self.keywords, self.transforms, **self.times)
+        keywords = {key: word for key, word in COMMON.items() if key != "exposure_time"}
+        return FileLayout(
+            keywords | self.keywords | self.times, (1, 1, 1), transforms=self.transforms
+        )
 
     @property
     def location(self):
@@ -139,6 +142,13 @@ def aluminium(grid):
         fixed={"retardance": True},
         bounds={"diattenuation": (-0.1, 0.1)},
     )
+
+
+def diattenuator(name, grid, horizontal=0.0, diagonal=0.0):
+    """Return optics that polarize along a direction of their own, free per wavelength."""
+    values = {"horizontal": horizontal, "diagonal": diagonal}
+    values = {key: np.full(grid.size, value) for key, value in values.items()}
+    return optics.VectorDiattenuator(name=name, **values)
 
 
 def turning_retarder(

@@ -13,13 +13,7 @@ import numpy as np
 
 from astropolcal import optics, standards
 from astropolcal.chain import leaves
-from astropolcal.exceptions import (
-    AstropolcalError,
-    AstropolcalWarning,
-    ChainError,
-    InstrumentError,
-)
-from astropolcal.observations.grid import is_star
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
 from astropolcal.units import to_unit
 
 __all__ = []
@@ -119,14 +113,14 @@ def _normal(mean, std):
     return norm(mean, std)
 
 
-def mounted(optic, tolerance=_MOUNTING):
+def mounted(optic):
     """
     Return the optic, whose orientation is now known as well as its mounting.
 
     A calibration then finds ``theta`` with a normal prior around its present value, in place of
-    taking it as exact; ``tolerance`` is the standard deviation.
+    taking it as exact.
     """
-    spread = tolerance.to_value(optic.theta.unit)
+    spread = _MOUNTING.to_value(optic.theta.unit)
     optic.theta.fixed, optic.theta.prior = False, _normal(float(optic.theta.value), spread)
     return optic
 
@@ -152,31 +146,25 @@ def star_source(source, wavelength, name="star", target=None):
     parameters. Of any other star q and u are free at each wavelength. ``target`` is its name in
     the catalogue of standards.
     """
-    if target and source.endswith("standard star"):
-        _check_standard(source, target)
+    known = _standard(source, target) if target and source.endswith("standard star") else None
     if source == "unpolarized standard star":
-        return _unpolarized_star(wavelength, name, target)
-    if source == "polarized standard star" and target:
-        return _polarized_star(wavelength, name, target)
+        try:
+            error = known.unpolarized_error().value if known else _UNPOLARIZED
+        except AstropolcalError:
+            error = _UNPOLARIZED
+        values = {
+            f"{key}{suffix}": (0.0, error * w) for key in "qu" for suffix, w in _smooth(wavelength)
+        }
+        return _with_priors(name, _middle(wavelength), values)
+    if known:
+        return _polarized_star(known.interstellar(), wavelength, name)
     zero = np.zeros(wavelength.size)
     return optics.PolarizedSource(q=zero, u=zero, name=name)
 
 
-def _unpolarized_star(wavelength, name, target):
-    """Return a star whose q and u are zero as far as the catalogue knows."""
-    try:
-        error = standards.get(target).unpolarized_error().value if target else _UNPOLARIZED
-    except AstropolcalError:
-        error = _UNPOLARIZED
-    values = {
-        f"{key}{suffix}": (0.0, error * w) for key in "qu" for suffix, w in _smooth(wavelength)
-    }
-    return _with_priors(name, _middle(wavelength), values)
-
-
-def _polarized_star(wavelength, name, target):
+def _polarized_star(known, wavelength, name):
     """Return a star with the interstellar polarization of the catalogue."""
-    known, middle = standards.get(target).interstellar(), _middle(wavelength)
+    middle = _middle(wavelength)
     law, errors = known.law, known.errors
     longest = law.lambda_max.quantity
     # the catalogue's change of the angle is one per wavelength, here it is one per logarithm
@@ -218,8 +206,8 @@ def _smooth(wavelength):
     return list(_WIDTHS.items())[: wavelength.size]
 
 
-def _check_standard(source, target):
-    """Refuse a polarized standard that nobody knows; warn of an unpolarized one."""
+def _standard(source, target):
+    """Return a standard star; refuse a polarized one that nobody knows, warn of an unpolarized."""
     try:
         known = standards.get(target)
     except AstropolcalError as error:
@@ -230,29 +218,18 @@ def _check_standard(source, target):
             ) from error
         words = f"{error}; it is unpolarized according to the table"
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
-        return
+        return None
     if not source.startswith(known.kind):
         raise InstrumentError(
             f"{target} is {known.kind} according to the catalogue, but the table's source is "
             f"{source!r}"
         )
-
-
-def behind_telescope(chain, instrument):
-    """Return the optics of a chain of an instrument from its entrance on, such as ``hwp``."""
-    found = leaves(chain)
-    start = next((i for i, leaf in enumerate(found) if leaf.name == instrument.entrance), None)
-    if start is None:
-        raise ChainError(
-            f"{instrument.name}: the chain has no optic {instrument.entrance!r} to put the "
-            "telescope before"
-        )
-    return found[start:]
+    return known
 
 
 def star_options(observations):
     """
-    Return the options of a chain that name its star, empty for other sources.
+    Return the options of a chain that name its star, empty for one without a name.
 
     They are ``star``, the name of the source optic, and ``target``, from ``object`` in the meta of
     the observations.
@@ -260,9 +237,7 @@ def star_options(observations):
     target = str(observations.meta.get("object") or "")
     words = re.sub(r"\W+", "", target)
     # a star without a name is the same optic in all datasets
-    if not words or not is_star(observations.source):
-        return {}
-    return {"star": f"star_{words}", "target": target}
+    return {"star": f"star_{words}", "target": target} if words else {}
 
 
 #: Longitude, latitude (deg) and height (m) of the VLT, as in its headers.

@@ -23,7 +23,13 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
-from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut, side_by_side
+from astropolcal.instruments.layout import (
+    COMMON,
+    EM_EXCESS_NOISE,
+    FileLayout,
+    ReadOut,
+    side_by_side,
+)
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
@@ -72,26 +78,19 @@ _READ_OUTS = {
 
 #: The multiband imager; ``layout_of`` has the other modes.
 LAYOUT = FileLayout(
-    keywords=KEYWORDS
+    keywords=COMMON
+    | KEYWORDS
     | {
-        "exposure_time": "EXPTIME",
         "mjd": "MJD",
-        "date": "DATE-OBS",
         "time": "UT",
-        "right_ascension": "RA",
-        "declination": "DEC",
-        "object": "OBJECT",
-        "instrument": "INSTRUME",
         "pickoff": _MODE,
     },
     shape=(len(FIELDS), _FIELD_SIDE, 2 * _FIELD_SIDE),
     cube_extension=0,
     weights="error",
     alternatives={"flc_state": ("U_FLCSTT",), "hwp": ("U_HWPANG",), "filter": ("U_FILTER",)},
-    units={"exposure_time": "s", "mjd": "d"},
     identities=("VAMPIRES",),
     prefix="VMPA",
-    frame_pattern=r"(?<!\d)\d{8}(?!\d)",
     gain=0.105,
     read_noise=0.25,
     saturation=_FULL,
@@ -187,36 +186,6 @@ def _starts(grid, values):
     return np.interp(grid.to_value(u.nm), _START_AT, values) * u.deg
 
 
-def _half_wave_plate(grid, kind):
-    settings = subaru.misaligned(0)
-    if kind == "two-layer":
-        return subaru.two_layer_plate(**settings)
-    # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
-    settings["bounds"] |= {"retardance": (-180, -90)}
-    start = _starts(grid, _HALF_WAVE_PLATE)
-    return optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
-
-
-def _derotator(grid, kind):
-    turning = subaru.derotator(kind, _starts(grid, _DEROTATOR), _BOUNDS)
-    if kind == "elliptical":
-        turning.diagonal.prior = turning.circular.prior = subaru._normal(0, 10)
-    return turning
-
-
-def _relay(size):
-    """Return what stands between derotator and liquid crystal, the dichroics included."""
-    relay = optics.DiattenuatorRetarder(
-        diattenuation=np.full(size, 0.01),
-        retardance=np.full(size, -30.0) * u.deg,
-        name="relay",
-        bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
-    )
-    # wide: a retarder here looks like one in the derotator, unless that turns far
-    relay.retardance.prior = subaru._normal(0, 45)
-    return relay
-
-
 def liquid_crystal(size, switching=43):
     """Return a liquid crystal of half a wave, whose switching angle (deg) is known to 2 deg."""
     settings = subaru.misaligned(0, most=20)
@@ -232,20 +201,6 @@ def liquid_crystal(size, switching=43):
     # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
     crystal.switching_angle.prior = subaru._normal(switching, 2)
     return crystal
-
-
-def _cameras(size):
-    cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
-    # pairs of both states see it in second order only, hence the prior
-    cameras.imbalance.prior = subaru._normal(0, 0.1)
-    return cameras
-
-
-def _splitter(size):
-    """Return the polarizing beam splitter; an efficiency above one is none."""
-    wollaston = optics.WollastonPrism(efficiency=np.full(size, 0.95), name="wollaston")
-    wollaston.efficiency.prior = subaru._normal(0.95, 0.03)
-    return wollaston
 
 
 # as tables may call them
@@ -340,12 +295,35 @@ class VAMPIRES(SubaruPolarimeter):
         known |= {"plate": (plate, ("free", "two-layer")), "m3": (m3, subaru.M3_MODELS)}
         self.check_choices(source, optics_in, **known)
         grid = self.grid(wavelength)
+        size, settings = grid.size, subaru.misaligned(0)
+        if plate == "two-layer":
+            hwp = subaru.two_layer_plate(**settings)
+        else:
+            # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
+            settings["bounds"] |= {"retardance": (-180, -90)}
+            start = _starts(grid, _HALF_WAVE_PLATE)
+            hwp = optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
+        turning = subaru.derotator(derotator, _starts(grid, _DEROTATOR), _BOUNDS)
+        if derotator == "elliptical":
+            turning.diagonal.prior = turning.circular.prior = subaru._normal(0, 10)
+        # what stands between derotator and liquid crystal, the dichroics included
+        relay = optics.DiattenuatorRetarder(
+            diattenuation=np.full(size, 0.01),
+            retardance=np.full(size, -30.0) * u.deg,
+            name="relay",
+            bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
+        )
+        # wide: a retarder here looks like one in the derotator, unless that turns far
+        relay.retardance.prior = subaru._normal(0, 45)
+        crystal = [liquid_crystal(size)] if "flc" in optics_in else []
+        # an efficiency above one is none
+        wollaston = optics.WollastonPrism(efficiency=np.full(size, 0.95), name="wollaston")
+        wollaston.efficiency.prior = subaru._normal(0.95, 0.03)
+        cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
+        # pairs of both states see it in second order only, hence the prior
+        cameras.imbalance.prior = subaru._normal(0, 0.1)
         train = subaru.entrance(source, grid, star, target, m3, _mirror)
-        train.append(_half_wave_plate(grid, plate))
-        train += [_derotator(grid, derotator), _relay(grid.size)]
-        if "flc" in optics_in:
-            train.append(liquid_crystal(grid.size))
-        return join([*train, _splitter(grid.size), _cameras(grid.size)])
+        return join([*train, hwp, turning, relay, *crystal, wollaston, cameras])
 
     def telescope_optics(self, behind):
         """Return the telescope with a tertiary mirror of bare silver."""
@@ -397,7 +375,18 @@ class VAMPIRES(SubaruPolarimeter):
         ``flc_state``.
         """
         source = self.source_of(observations, _SOURCES)
-        return source, ("flc",) if _is_modulated(observations) else ()
+        # what the table says goes before what its columns suggest
+        stated = observations.meta.get("flc")
+        if stated is not None:
+            what, stated = f"{observations.name}: flc", str(stated).lower()
+            check_choice(what, stated, ("in", "out"), InstrumentError)
+            return source, ("flc",) if stated == "in" else ()
+        # what a calibration remembers of a dataset has no columns, but the meta say how it is
+        # paired
+        frames = getattr(observations, "frames", None)
+        columns = () if frames is None else frames.colnames
+        paired = observations.meta.get("pairing") == "flc_state"
+        return source, ("flc",) if "flc_state" in columns or paired else ()
 
     def meta_without(self, names):
         """Return what a liquid crystal leaves: no states by which frames are paired."""
@@ -419,17 +408,3 @@ class VAMPIRES(SubaruPolarimeter):
         """Return bare gold at 45 deg, with which the paper compares the fold mirror."""
         gold = optics.MetalMirror(material="gold", incidence=45 * u.deg, name="fold_mirror")
         return {"fold_mirror": {"gold at 45°": gold}}
-
-
-def _is_modulated(observations):
-    # what the table says goes before what its columns suggest
-    stated = observations.meta.get("flc")
-    if stated is not None:
-        check_choice(
-            f"{observations.name}: flc", str(stated).lower(), ("in", "out"), InstrumentError
-        )
-        return str(stated).lower() == "in"
-    # what a calibration remembers of a dataset has no columns, but the meta say how it is paired
-    frames = getattr(observations, "frames", None)
-    columns = () if frames is None else frames.colnames
-    return "flc_state" in columns or observations.meta.get("pairing") == "flc_state"
