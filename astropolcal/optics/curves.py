@@ -46,9 +46,7 @@ def curve_of(chain, optics, what, element=None, against="wavelength", wavelength
             f"{', '.join(known)} and of an Observable"
         )
     observable = what if hasattr(what, "frames_per_datum") else None
-    alone = len(optics) == 1 and observable is None and not optics[0].rotates_frame
-    kind = ElementCurve if alone else LightCurve
-    return kind(chain, optics, (row, column), observable, against, wavelength, positions)
+    return LightCurve(chain, optics, (row, column), observable, against, wavelength, positions)
 
 
 def _laws(optic):
@@ -342,53 +340,6 @@ class LightCurve(Curve):
                 row = turned(inward, back) if len(found) + 1 < len(steps) else None
             found.append(slopes)
         return found[::-1]
-
-
-class ElementCurve(LightCurve):
-    """An element of the Mueller matrix of one optic; where that is one matrix, its angle turns."""
-
-    def _turn(self, place, values):
-        """Return row and column as Q + iU and (k, n), and the matrix between; None of several."""
-        (dispersion, shift), (theta, *own) = place[1][0], self._values_at(place[0], values)[0]
-        dispersion, angle = self._optics[0]._moved(dispersion, theta, shift)
-        matrix = self._optics[0]._matrix(dispersion, *own)
-        if matrix.ndim > 2 or np.ndim(angle) != 2 or len(angle) > 1:
-            return None
-        phase = np.exp(-2j * angle[0])
-        turned = {1: phase, 2: 1j * phase if 2 in self._element else None}
-        sides = [turned.get(i) for i in self._element]
-        block = tuple(slice(1, 3) if i in (1, 2) else slice(i, i + 1) for i in self._element)
-        return sides, [*map(_in_plane, sides)], block, matrix[block], dispersion, own
-
-    def _values(self, place, values):
-        found = self._once(self._turn, place, values)
-        if found is None:
-            return super()._values(place, values)
-        _, (row, column), _, matrix, *_ = found
-        return self._whole((row * (matrix @ column)).sum(axis=0))
-
-    def _slopes(self, place, values):
-        found = self._once(self._turn, place, values)
-        if found is None:
-            return super()._slopes(place, values)
-        sides, (row, column), block, matrix, dispersion, own = found
-        # by theta: T(-theta) M T(theta) turns on either side
-        by_angle = np.zeros(1)
-        if sides[0] is not None:
-            by_angle = (_in_plane(-2j * sides[0]) * (matrix @ column)).sum(axis=0)
-        if sides[1] is not None:
-            by_angle = by_angle + (row * (matrix @ _in_plane(-2j * sides[1]))).sum(axis=0)
-        slopes = (slope[block] for slope in self._optics[0]._derivatives(dispersion, *own))
-        return [[by_angle, *((row * (one @ column)).sum(axis=0) for one in slopes)]]
-
-    def _whole(self, flux):
-        size = self._memo["inputs"][0].size
-        return flux if flux.size == size else np.broadcast_to(flux, size)
-
-
-def _in_plane(light):
-    """Return Q and U of Q + iU, (2, n), or the one of what does not turn."""
-    return np.ones((1, 1)) if light is None else light.view(float).reshape(-1, 2).T
 
 
 def _act(matrix, light):
