@@ -32,69 +32,26 @@ def polarization_angle(q, u):
     return np.where(angle >= 180, 0.0, angle)
 
 
-# where the Stokes parameter u is an argument, it hides the units
-_DEGREE = u.deg
+def polarization_errors(q, u_, sigma_q, sigma_u, covariance=0.0):
+    r"""
+    Return the errors of degree and angle (degree) of linear polarization, and that across it.
 
-
-def _polarization_and_errors(q, u_, sigma_q, sigma_u, covariance):
-    """Return q / p, u / p and the checked errors of a polarized measurement."""
-    q, u_ = number(q, "q"), number(u_, "u")
-    sigma_q, sigma_u = checked_error(sigma_q, "sigma_q"), checked_error(sigma_u, "sigma_u")
-    covariance = number(covariance, "covariance")
-    # Cauchy-Schwarz; full correlation lies on the limit to rounding
-    limit = sigma_q * sigma_u
-    require(
-        np.abs(covariance) <= limit * (1 + ROUNDING),
-        covariance,
-        "covariance",
-        "at most sigma_q sigma_u in size",
-    )
+    To first order, of numbers whose degree p is above zero. The error along (q, u) is that of the
+    degree, :math:`\sigma_p^2 = (q^2 \sigma_q^2 + u^2 \sigma_u^2 + 2 q u\,\sigma_{qu}) / p^2`. That
+    across is :math:`b^2 = (u^2 \sigma_q^2 + q^2 \sigma_u^2 - 2 q u\,\sigma_{qu}) / p^2` of
+    Plaszczynski et al. 2014, doi:10.1093/mnras/stu270; over 2 p it is the error of the angle, and
+    it sets the positive bias of the degree. Without covariance the first two are :math:`s_p` and
+    :math:`s_\chi` in Sec. 2.3 of the CHARIS recalibration paper. Good above a signal-to-noise ratio
+    of about three; `aolp_interval` holds below, too.
+    """
     # hypot neither overflows nor underflows where the squares would
     dolp = np.hypot(q, u_)
-    require(dolp > 0, dolp, "dolp", "positive for first-order errors to exist (see aolp_interval)")
-    return q / dolp, u_ / dolp, sigma_q, sigma_u, covariance
-
-
-def dolp_error(q, u, sigma_q, sigma_u, covariance=0.0):
-    r"""
-    Return the standard deviation of :math:`p = \sqrt{q^2 + u^2}`, to first order.
-
-    :math:`\sigma_p^2 = (q^2 \sigma_q^2 + u^2 \sigma_u^2 + 2 q u\,\sigma_{qu}) / p^2`, which without
-    covariance is :math:`s_p` in Sec. 2.3 of the CHARIS recalibration paper. Good above a
-    signal-to-noise ratio of about three.
-    """
-    along, across, sigma_q, sigma_u, covariance = _polarization_and_errors(
-        q, u, sigma_q, sigma_u, covariance
-    )
-    variance = (along * sigma_q) ** 2 + (across * sigma_u) ** 2 + 2 * along * across * covariance
-    return np.sqrt(np.maximum(variance, 0))
-
-
-def transverse_error(q, u, sigma_q, sigma_u, covariance=0.0):
-    r"""
-    Return the error of (q, u) across the direction of polarization.
-
-    It sets the error of the angle and the positive bias of the degree of linear polarization.
-    :math:`b^2 = (u^2 \sigma_q^2 + q^2 \sigma_u^2 - 2 q u\,\sigma_{qu}) / p^2` of Plaszczynski et
-    al. 2014, doi:10.1093/mnras/stu270.
-    """
-    along, across, sigma_q, sigma_u, covariance = _polarization_and_errors(
-        q, u, sigma_q, sigma_u, covariance
-    )
-    variance = (across * sigma_q) ** 2 + (along * sigma_u) ** 2 - 2 * along * across * covariance
-    return np.sqrt(np.maximum(variance, 0))
-
-
-def aolp_error(q, u, sigma_q, sigma_u, covariance=0.0):
-    r"""
-    Return the error of the angle of linear polarization in degree (Quantity), to first order.
-
-    ``transverse_error`` over 2 p, which without covariance is :math:`s_\chi` in Sec. 2.3 of the
-    CHARIS recalibration paper; `aolp_interval` holds at a low signal-to-noise ratio, too.
-    """
-    across = transverse_error(q, u, sigma_q, sigma_u, covariance)
+    c, s = q / dolp, u_ / dolp
+    cross = 2 * c * s * covariance
+    along = np.sqrt(np.maximum((c * sigma_q) ** 2 + (s * sigma_u) ** 2 + cross, 0))
+    across = np.sqrt(np.maximum((s * sigma_q) ** 2 + (c * sigma_u) ** 2 - cross, 0))
     # the angle is half that of (q, u)
-    return np.rad2deg(across / (2 * np.hypot(number(q, "q"), number(u, "u")))) * _DEGREE
+    return along, np.rad2deg(across / (2 * dolp)), across
 
 
 def _signal_to_noise(dolp, sigma):
@@ -208,10 +165,6 @@ def aolp_interval(dolp, sigma, probability=0.6827):
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
     half = ((low + high) / 2) / 2
     return np.rad2deg(np.where(sigma > 0, half, 0.0)) * u.deg
-
-
-# rounding allowed where a degree of polarization is compared with one
-ROUNDING = 1e-12
 
 
 def require(good, value, name, allowed):

@@ -13,13 +13,7 @@ from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.star import measured_star, stated_star, without_star
 from astropolcal.exceptions import AstropolcalError, ParameterError
-from astropolcal.stokes import (
-    aolp_error,
-    debias_dolp,
-    dolp_error,
-    polarization_angle,
-    transverse_error,
-)
+from astropolcal.stokes import debias_dolp, polarization_angle, polarization_errors
 from astropolcal.words import check_choice
 
 __all__ = ["Corrected"]
@@ -486,8 +480,5 @@ def _errors(q, u, dolp, error):
         # rounding may lift a perfect correlation above one
         limit = s_q[good] * s_u[good]
         cross = np.clip(error["covariance_qu"][good], -limit, limit)
-        arguments = q[good], u[good], s_q[good], s_u[good], cross
-        found[0, good] = dolp_error(*arguments)
-        found[1, good] = aolp_error(*arguments).value
-        found[2, good] = transverse_error(*arguments)
+        found[:, good] = polarization_errors(q[good], u[good], s_q[good], s_u[good], cross)
     return found
