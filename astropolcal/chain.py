@@ -473,24 +473,18 @@ def at_positions(chain, **positions):
     return copy
 
 
-def _stage_position(leaf, positions):
-    """Return the position of the leaf's stage in canonical floats, with its sign."""
-    if leaf.stage is None:
-        return 0.0
-    if leaf.stage not in positions:
-        raise ChainError(
-            f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}, but "
-            f"positions has only {sorted(positions)}"
-        )
-    return leaf.stage_sign * positions[leaf.stage]
-
-
 def _oriented_leaves(chain, wavelength, positions):
     """Yield each leaf with what its matrix needs: dispersion, angle, values."""
     for leaf in leaves(chain):
         check_inputs(leaf, positions)
         dispersion, angle, values = leaf._resolve(wavelength, None, places=positions)
-        yield leaf, *leaf._moved(dispersion, angle, _stage_position(leaf, positions)), values
+        if leaf.stage and leaf.stage not in positions:
+            raise ChainError(
+                f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}, but "
+                f"positions has only {sorted(positions)}"
+            )
+        shift = leaf.stage_sign * positions[leaf.stage] if leaf.stage else 0.0
+        yield leaf, *leaf._moved(dispersion, angle, shift), values
 
 
 def check_inputs(leaf, positions):

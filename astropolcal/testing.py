@@ -25,6 +25,8 @@ from astropolcal.chain import (
 )
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
+from astropolcal.measurement import Measurement
+from astropolcal.measurement.parameters import limits
 from astropolcal.mueller import is_physical
 from astropolcal.observations.grid import is_star
 from astropolcal.optics import (
@@ -62,18 +64,12 @@ def optic_names(chain):
     return [leaf.name for leaf in leaves(chain)]
 
 
-def limits(parameter):
-    """Return the bounds of a parameter as numbers."""
-    low, high = parameter.bounds
-    return -np.inf if low is None else low, np.inf if high is None else high
-
-
 def check_values(label, chain, size):
     """Require values that are finite, within their bounds and as many as the wavelengths."""
     for leaf in leaves(chain):
         for key in leaf.param_names:
             name, value = f"{label}: {leaf.name}.{key}", np.asarray(getattr(leaf, key).value)
-            low, high = limits(getattr(leaf, key))
+            low, high = limits(getattr(leaf, key).bounds)
             good = np.isfinite(value) & (value >= low) & (value <= high)
             outside = f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
             require(good.all(), outside)
@@ -350,8 +346,6 @@ class Probe:
 
     def check_predicts(self):
         """Both beams change with the modulator, and positions are those of the frames."""
-        from astropolcal.measurement import Measurement
-
         largest = 0.0
         for source, chain in self.chains(self.few):
             observations = self._observe(chain, source, noise=False)
@@ -372,7 +366,6 @@ class Probe:
     def check_calibrates(self):
         """A calibration of simulated frames predicts frames that it did not see."""
         from astropolcal.calibration import calibrate
-        from astropolcal.measurement import Measurement
 
         # a lamp needs no pointing, so that less can go wrong that is not of the chain
         internal = [source for source in self.sources if not is_star(source)]
@@ -403,7 +396,7 @@ class Probe:
         for leaf in leaves(chain):
             for key in (k for k in leaf.param_names if not getattr(leaf, k).fixed):
                 parameter = getattr(leaf, key)
-                low, high = limits(parameter)
+                low, high = limits(parameter.bounds)
                 value, unit = np.asarray(parameter.value, dtype=float), parameter.unit or u.one
                 step = rng.normal(size=value.shape)
                 if unit.is_equivalent(u.rad):

@@ -49,18 +49,17 @@ def canonical_unit(unit):
     )
 
 
+# there are a handful of units, and 600 fits ask 600,000 times
+@lru_cache
 def canonical_factor(unit):
     """
     Return the number by which a value in a unit, or without one (None), becomes canonical.
 
     What is neither angle, length nor dimensionless, such as a rate in deg / day, stays as it is.
     """
-    return 1.0 if unit is None else _factor(u.Unit(unit))
-
-
-@lru_cache
-def _factor(unit):
-    # there are a handful of units, and 600 fits ask 600,000 times
+    if unit is None:
+        return 1.0
+    unit = u.Unit(unit)
     try:
         return float(unit.to(canonical_unit(unit)))
     except ParameterError:

@@ -233,7 +233,18 @@ class CHARIS(SubaruPolarimeter):
         """
         meta, name = observations.meta, observations.name
         inside = _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False})
-        present = {"dichroic": inside, "nbs": _beam_switcher(meta, name)}
+        words = {"installed": True, "not installed": False, "in": True, "out": False}
+        switcher = _stated(meta, name, "nasmyth_beam_switcher", words)
+        if switcher is None:
+            day = (stated_date(meta, name, InstrumentError) or "")[:10]
+            # a month alone is not conclusive
+            switcher = _switcher_by(day) if len(day) == len("2025-10-01") else None
+        if switcher is None:
+            raise InstrumentError(
+                f"{name}: neither nasmyth_beam_switcher nor a conclusive date in the table's meta; "
+                "is the beam switcher 'installed' or 'not installed'?"
+            )
+        present = {"dichroic": inside, "nbs": switcher}
         source = self.source_of(observations)
         return source, tuple(optic for optic, there in present.items() if there)
 
@@ -265,22 +276,6 @@ def _stated(meta, name, key, words):
             f"{name}: {key} is {meta[key]!r}; allowed are {', '.join(map(repr, words))}"
         )
     return words[word]
-
-
-def _beam_switcher(meta, name):
-    words = {"installed": True, "not installed": False, "in": True, "out": False}
-    stated = _stated(meta, name, "nasmyth_beam_switcher", words)
-    if stated is not None:
-        return stated
-    day = (stated_date(meta, name, InstrumentError) or "")[:10]
-    # a month alone is not conclusive
-    by_date = _switcher_by(day) if len(day) == len("2025-10-01") else None
-    if by_date is not None:
-        return by_date
-    raise InstrumentError(
-        f"{name}: neither nasmyth_beam_switcher nor a conclusive date in the table's meta; "
-        "is the beam switcher 'installed' or 'not installed'?"
-    )
 
 
 def _switcher_by(day):

@@ -276,12 +276,7 @@ class FileLayout:
         known. With an EM gain above one, gain and read noise are those before the multiplication;
         of a mean of several ``exposures`` they are those of the electrons of all.
         """
-        how, n = self._way(values), values.get("exposures", 1)
-        return replace(how, gain=how.gain * n, read_noise=how.read_noise * math.sqrt(n))
-
-    def _way(self, values):
-        """Return how a single exposure was read out."""
-        own = ReadOut(self.gain, self.read_noise, self.saturation)
+        how = ReadOut(self.gain, self.read_noise, self.saturation)
         em_gain, mode = values.get("em_gain"), values.get("read_mode")
         if em_gain is not None:
             if not (em_gain == 0 or em_gain >= 1):
@@ -291,20 +286,22 @@ class FileLayout:
                 )
             # 0 and 1 both mean the conventional register, which has a noise of its own
             if em_gain <= 1:
-                return self.read_outs.get("conventional", own)
-            multiplied = ReadOut(self.gain, self.read_noise, self.saturation, EM_EXCESS_NOISE)
-            return self.read_outs.get("em", multiplied).multiplied(em_gain)
-        if mode is None or not self.read_outs:
-            return own
-        mode, camera = str(mode).strip().lower(), values.get("camera")
-        # two cameras of one kind need not have the same noise
-        names = [mode] if camera is None else [f"{mode} {camera:g}", mode]
-        found = next((name for name in names if name in self.read_outs), None)
-        if found is None:
-            raise ObservationError(
-                f"{self.keywords['read_mode']} = {mode!r}; allowed are {', '.join(self.read_outs)}"
-            )
-        return self.read_outs[found]
+                how = self.read_outs.get("conventional", how)
+            else:
+                multiplied = replace(how, excess_noise=EM_EXCESS_NOISE)
+                how = self.read_outs.get("em", multiplied).multiplied(em_gain)
+        elif mode is not None and self.read_outs:
+            mode, camera = str(mode).strip().lower(), values.get("camera")
+            # two cameras of one kind need not have the same noise
+            names = [mode] if camera is None else [f"{mode} {camera:g}", mode]
+            found = [name for name in names if name in self.read_outs]
+            if not found:
+                word, known = self.keywords["read_mode"], ", ".join(self.read_outs)
+                raise ObservationError(f"{word} = {mode!r}; allowed are {known}")
+            how = self.read_outs[found[0]]
+        # of a single exposure so far
+        n = values.get("exposures", 1)
+        return replace(how, gain=how.gain * n, read_noise=how.read_noise * math.sqrt(n))
 
     def left_file(self, path):
         """

@@ -48,7 +48,7 @@ _DEPARTURE = 0.2
 _WIDTHS = {"": 1.0, "_slope": 1.0, "_curvature": 0.71}
 
 
-def tertiary_mirror(model, wavelength, name="m3"):
+def tertiary_mirror(model, wavelength):
     """
     Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
 
@@ -61,14 +61,14 @@ def tertiary_mirror(model, wavelength, name="m3"):
     if model == "power law":
         # the bounds of the paper, half to twice its start
         bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
-        return mounted(optics.PowerLawMirror(name=name, bounds=bounds, **_START))
+        return mounted(optics.PowerLawMirror(name="m3", bounds=bounds, **_START))
     if model == "metal":
-        settings = {"material": "silver", "film_thickness": _FILM_START, "name": name}
+        settings = {"material": "silver", "film_thickness": _FILM_START, "name": "m3"}
         return mounted(_metal(optics.MetalMirror, 500, **settings))
     mirror = optics.DiattenuatorRetarder(
         diattenuation=np.full(wavelength.size, 0.01),
         retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
-        name=name,
+        name="m3",
         fixed={"retardance": True},
     )
     return mounted(mirror)
@@ -93,9 +93,9 @@ def _metal(kind, thickest, *, fixed=(), bounds=(), **settings):
     return mirror
 
 
-def published_mirror(name="m3"):
+def published_mirror():
     """Return Subaru's tertiary mirror with the published permittivity."""
-    return optics.PowerLawMirror(name=name, **_PUBLISHED)
+    return optics.PowerLawMirror(name="m3", **_PUBLISHED)
 
 
 def telescope(mirror, altitude="-altitude"):

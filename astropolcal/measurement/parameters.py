@@ -110,11 +110,14 @@ class Slot:
 
     def canonical_bounds(self):
         """Return lower and upper bound as canonical floats, infinite where open."""
-        low, high = self.bounds
-        return (
-            -np.inf if low is None else low * self.factor,
-            np.inf if high is None else high * self.factor,
-        )
+        low, high = limits(self.bounds)
+        return low * self.factor, high * self.factor
+
+
+def limits(bounds):
+    """Return the bounds of a parameter as two numbers, infinite where open."""
+    low, high = bounds
+    return -np.inf if low is None else low, np.inf if high is None else high
 
 
 def parameter_table(chains):
@@ -571,10 +574,7 @@ def bind_prior(prior, name, unit, bounds):
             "frozen continuous distributions of scipy.stats"
         )
     mode = _mode(distribution)
-    low, high = (
-        -np.inf if bounds[0] is None else bounds[0],
-        np.inf if bounds[1] is None else bounds[1],
-    )
+    low, high = limits(bounds)
     start, end = distribution.support()
     # a flat prior has no peak that would have to be inside
     inside = (low <= mode) & (mode <= high) | (distribution.dist.name == "uniform")

@@ -508,11 +508,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def values_at(self, lam, values):
         """Return canonical values at wavelengths (um), where they are known."""
-        values = [
-            getattr(self, key).at(lam, value)
-            for key, value in zip(self.param_names, values, strict=True)
-        ]
+        found = []
         for key, value in zip(self.param_names, values, strict=True):
+            value = getattr(self, key).at(lam, value)
             # wavelengths are the last axis; a single value holds at all of them
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
@@ -520,7 +518,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
-        return values
+            found.append(value)
+        return found
 
     def _oriented(self, dispersion, angle, values):
         matrix = self._matrix(dispersion, *values)
@@ -740,21 +739,28 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
 
 class _LinearOptic(Optic):
-    """An optic whose matrix is a constant and, for each parameter, one times its value."""
+    """An optic whose matrix is a constant, with elements in proportion to its parameters."""
 
     _constant = np.zeros((4, 4))
-    _terms = ()
+    # for each parameter the rows, columns and factors of the elements that it adds to
+    _elements = ()
 
     def _matrix(self, dispersion, *values):
         out = blank(*values)
-        out += self._constant
-        for value, term in zip(values, self._terms, strict=True):
-            out += np.asarray(value)[..., None, None] * term
+        out[...] = self._constant
+        for value, elements in zip(values, self._elements, strict=True):
+            for row, column, factor in elements:
+                out[..., row, column] += factor * value
         return out
 
     def _derivatives(self, dispersion, *values):
-        shape = blank(*values).shape
-        return tuple(np.broadcast_to(term, shape) for term in self._terms)
+        slopes = []
+        for elements in self._elements:
+            out = blank(*values)
+            for row, column, factor in elements:
+                out[..., row, column] = factor
+            slopes.append(out)
+        return tuple(slopes)
 
 
 class Inverse(FittableModel):

@@ -223,7 +223,8 @@ class Depolarizer(_LinearOptic):
     retained_v = Parameter(default=1.0, bounds=(0, 1), description="share of V that survives")
 
     # the intensity is kept
-    _constant, _terms = UNITS[0, 0], UNITS[(1, 2, 3), (1, 2, 3)]
+    _constant = UNITS[0, 0]
+    _elements = (((1, 1, 1.0),), ((2, 2, 1.0),), ((3, 3, 1.0),))
 
 
 # sign of eta: the right beam is the ordinary one
@@ -279,8 +280,9 @@ class WollastonPrism(_BeamOptic, _LinearOptic):
     _constant = 0.5 * (UNITS[0, 0] + UNITS[1, 1])
 
     @property
-    def _terms(self):
-        return (0.5 * BEAMS[self._beam] * (UNITS[0, 1] + UNITS[1, 0]),)
+    def _elements(self):
+        half = 0.5 * BEAMS[self._beam]
+        return (((0, 1, half), (1, 0, half)),)
 
     def beams(self, wavelength, I, Q, U, V):  # noqa: E741
         """
@@ -337,5 +339,5 @@ class BeamGain(_BeamOptic, _LinearOptic):
     _constant = np.eye(4)
 
     @property
-    def _terms(self):
-        return (BEAMS[self._beam] * np.eye(4),)
+    def _elements(self):
+        return (tuple((i, i, BEAMS[self._beam]) for i in range(4)),)

@@ -169,7 +169,7 @@ class EllipticalRetarder(Optic):
     def _derivatives(self, dispersion, horizontal, diagonal, circular):
         # M = cos x 1 + sinc [d] + versine d d^T with x = |d|; by d_i that is d_i times the slope
         # over x of each factor, plus what d_i itself does
-        vector = _vector(horizontal, diagonal, circular)
+        vector = np.stack(np.broadcast_arrays(horizontal, diagonal, circular), axis=-1)
         total = np.sqrt(np.sum(vector**2, axis=-1))
         sinc, versine, sinc_slope, versine_slope = (f[..., None, None] for f in _functions(total))
         outer = vector[..., :, None] * vector[..., None, :]
@@ -199,42 +199,22 @@ _CROSS = np.array(
 ).reshape(3, 9)
 
 
-def _vector(horizontal, diagonal, circular):
-    return np.stack(np.broadcast_arrays(horizontal, diagonal, circular), axis=-1)
-
-
 def _functions(x):
     """Return sin(x)/x, (1 - cos x)/x^2 and their derivatives over x, for any x >= 0."""
-    # below 0.3 rad the seven terms of the series are exact to rounding; above, the closed forms
-    # lose about two digits to cancellation
+    sinc, half = np.sinc(x / np.pi), np.sinc(x / (2 * np.pi))
+    # (1 - cos x)/x^2 is the square of sin(x / 2)/(x / 2) over 2
+    return sinc, half**2 / 2, _sinc_slope(x), half * _sinc_slope(x / 2) / 4
+
+
+def _sinc_slope(x):
+    """Return the derivative of sin(x)/x over x."""
+    # below 0.3 rad six terms of the series are exact to rounding; above, the closed form loses
+    # about two digits to cancellation
     small = x < 0.3
-    safe = np.where(small, 1.0, x)
-    x2, safe2 = x * x, safe * safe
-    sine, cosine = np.sin(safe), np.cos(safe)
-    sinc = np.where(small, _series(x2, 1, 6, 20, 42, 72, 110), sine / safe)
-    versine = np.where(
-        # 1 - cos x as 2 sin^2(x / 2), which keeps its digits
-        small,
-        _series(x2, 2, 12, 30, 56, 90, 132),
-        2 * np.sin(safe / 2) ** 2 / safe2,
-    )
-    sinc_slope = np.where(
-        small, -_series(x2, 3, 10, 28, 54, 88, 130), (cosine - sine / safe) / safe2
-    )
-    versine_slope = np.where(
-        small,
-        -_series(x2, 12, 15, 112 / 3, 67.5, 105.6, 455 / 3),
-        (sine / safe - 2 * versine) / safe2,
-    )
-    return sinc, versine, sinc_slope, versine_slope
-
-
-def _series(x2, first, *ratios):
-    """Sum (1/first)(1 - x2/r1 (1 - x2/r2 (1 - ...))), the nested power series."""
-    total = 1.0
-    for ratio in reversed(ratios):
-        total = 1.0 - x2 / ratio * total
-    return total / first
+    safe, series = np.where(small, 1.0, x), 1.0
+    for ratio in (130, 88, 54, 28, 10):
+        series = 1.0 - x * x / ratio * series
+    return np.where(small, -series / 3, (np.cos(safe) - np.sin(safe) / safe) / safe**2)
 
 
 class Rotator(_LinearOptic):
