@@ -387,21 +387,6 @@ def _polar_rotation(block):
     return np.where(empty, np.eye(3), np.where(lone, smallest, rotation))
 
 
-def _without_diattenuator(block, column, axis, strength):
-    """
-    Return the block of M times the inverse of its diattenuator.
-
-    Written for the two states that the diattenuator passes best and worst, so
-    that nothing cancels however close to a polarizer it is.
-    """
-    image = np.squeeze(block @ axis[..., None], axis=-1)
-    best = (column + image) / (1 + strength)
-    worst = (column - image) / (1 - strength)
-    across = block - image[..., :, None] * axis[..., None, :]
-    across = across / np.sqrt((1 - strength) * (1 + strength))[..., None]
-    return across + (best - worst)[..., :, None] * axis[..., None, :] / 2
-
-
 def retardance_vector(matrix):
     """
     Return the retardance vector of the retarder within Mueller matrices (..., 4, 4).
@@ -424,7 +409,15 @@ def retardance_vector(matrix):
         raise ParameterError(f"diattenuation = {strength.max()} must be at most 1")
     axis, pure = _unit(row, np.array([1.0, 0.0, 0.0])), strength >= 1 - _POLARIZER
     attenuation = np.where(pure, 0.0, strength)
-    block = _without_diattenuator(matrix[..., 1:, 1:], column, axis, attenuation)
+    # the block without the diattenuator, written for the two states that this passes best and
+    # worst, so that nothing cancels however close to a polarizer it is
+    block = matrix[..., 1:, 1:]
+    image = np.squeeze(block @ axis[..., None], axis=-1)
+    best = (column + image) / (1 + attenuation)
+    worst = (column - image) / (1 - attenuation)
+    across = block - image[..., :, None] * axis[..., None, :]
+    across = across / np.sqrt((1 - attenuation) * (1 + attenuation))[..., None]
+    block = across + (best - worst)[..., :, None] * axis[..., None, :] / 2
     turn = _smallest_rotation(axis, _unit(column, axis))
     return _rotation_vector(np.where(pure[..., None], turn, _polar_rotation(block))) * u.rad
 

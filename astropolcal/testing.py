@@ -546,23 +546,19 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
         elif rule not in ("class", "documentation", "headers") and report.failed.get("sources"):
             report.skipped[rule] = "there are no chains"
         else:
-            _apply(rule, probe, report)
+            try:
+                with warnings.catch_warnings():
+                    # what an instrument warns of is for its users, not a breach of a rule
+                    warnings.simplefilter("ignore")
+                    getattr(probe, f"check_{rule.replace(' ', '_')}")()
+            except Absent as absent:
+                report.skipped[rule] = str(absent)
+            except Broken as broken:
+                report.failed[rule] = str(broken)
+            except Exception as error:  # whatever the code of an instrument raises is a finding
+                report.failed[rule] = f"{type(error).__name__}: {error}"
+            else:
+                report.passed.append(rule)
     if raises and not report:
         raise InstrumentError(str(report))
     return report
-
-
-def _apply(rule, probe, report):
-    try:
-        with warnings.catch_warnings():
-            # what an instrument warns of is for its users, not a breach of a rule
-            warnings.simplefilter("ignore")
-            getattr(probe, f"check_{rule.replace(' ', '_')}")()
-    except Absent as absent:
-        report.skipped[rule] = str(absent)
-    except Broken as broken:
-        report.failed[rule] = str(broken)
-    except Exception as error:  # whatever the code of an instrument raises is a finding
-        report.failed[rule] = f"{type(error).__name__}: {error}"
-    else:
-        report.passed.append(rule)

@@ -73,10 +73,10 @@ def test_models_of_the_tertiary_mirror():
     }
     assert set(expected) == set(M3_MODELS)
     for model, numbers in expected.items():
-        mirror = tertiary_mirror(model, WAVELENGTH, name="mirror")
+        mirror = tertiary_mirror(model, WAVELENGTH)
         free = {key for key in mirror.param_names if not getattr(mirror, key).fixed}
         assert free == numbers | {"theta"}, model
-        assert mirror.name == "mirror"
+        assert mirror.name == "m3"
         assert mirror.theta.prior.mean() == 0
         assert 0 < mirror.theta.prior.std() < 1
         assert FreeParameters([star_chain(m3=model)], len(WAVELENGTH)).size > 0

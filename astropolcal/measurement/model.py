@@ -209,9 +209,7 @@ class Measurement(ScalarParameters):
         new = with_own_scalars(self, self._param_names)
         new._chains_are_shared = True
         new._factors = np.ones_like(self._factors)
-        for label, bound in zip(self._param_names, _bounds(*self.free.bounds()), strict=True):
-            parameter = new.__dict__[label]
-            parameter._unit, parameter.bounds = None, bound
+        new._drop_units(_bounds(*self.free.bounds()))
         new.stand_at(self.vector())
         return new
 

@@ -230,6 +230,20 @@ class ScalarParameters(OwnUnits, FittableModel):
         """Names of the parameters."""
         return self._param_names
 
+    def _hold(self, parameters):
+        """Take on parameters by name, once astropy has set those it knows to their defaults."""
+        self._param_names = tuple(parameters)
+        self.__dict__ |= parameters
+        self._constraints_cache = {}
+        self._param_metrics = defaultdict(dict)
+        self._initialize_slices()
+
+    def _drop_units(self, bounds):
+        """Take the units from the parameters, and give them other bounds."""
+        for name, bound in zip(self._param_names, bounds, strict=True):
+            parameter = self.__dict__[name]
+            parameter._unit, parameter.bounds = None, bound
+
     @property
     def has_tied(self):
         """Whether a parameter is tied; a fitter asks before every evaluation."""
@@ -315,50 +329,6 @@ class Chain(OwnUnits, CompoundModel):
 
 
 Chain.__or__ = joined
-
-
-class SharedParameters(ScalarParameters):
-    """
-    A model of one input and one output whose parameters are those of optics, the same objects.
-
-    A subclass says with `_adopt` which they are. The values of the model are numbers in ``_unit``.
-    """
-
-    _unit = None
-
-    def _adopt(self, owners):
-        """Take on parameters: of each name the optic that has it, and its name there."""
-        # only then: astropy sets what it knows in the beginning to its default
-        self._param_names, self._owners = tuple(owners), owners
-        self.__dict__ |= {name: getattr(*owner) for name, owner in owners.items()}
-        self._constraints_cache = {}
-        self._param_metrics = defaultdict(dict)
-        self._initialize_slices()
-
-    def __setattr__(self, attr, value):
-        if attr in self._param_names:
-            setattr(*self._owners[attr], value)
-        else:
-            super().__setattr__(attr, value)
-
-    @property
-    def return_units(self):
-        """Unit of the values, where they have one."""
-        return None if self._unit is None else {self.outputs[0]: self._unit}
-
-    def without_units_for_data(self, **data):
-        """Return the model as a fitter takes it: with values in the unit of the data."""
-        values = data[self.outputs[0]]
-        if not isinstance(values, u.Quantity):
-            return self
-        own = u.one if self._unit is None else self._unit
-        if not values.unit.is_equivalent(own):
-            raise ParameterError(
-                f"the data are in {values.unit}, but the curve gives {str(own) or 'plain numbers'}"
-            )
-        model = self if values.unit == own else self.copy()
-        model._unit = values.unit
-        return model
 
 
 def deep_copied(optic, memo):

@@ -556,7 +556,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return wavelength, *self._light_behind(wavelength, (I, Q, U, V), parameters)
 
     def _light_behind(self, wavelength, light, parameters):
-        values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
+        values = []
+        for key, value in zip(self.param_names, parameters, strict=True):
+            if isinstance(value, u.Quantity):
+                self._check_unit(key, value.unit)
+            number = np.asarray(getattr(value, "value", value))
+            # a model of astropy is a set of one model, whose axis it adds in a call
+            number = number[0] if number.ndim and number.shape[0] == 1 else number
+            values.append(np.asarray(number) * canonical_factor(self._declared(key).unit))
         # elements first, (4, 4, ...), so that rows multiply the channels of the light
         matrix = np.moveaxis(
             self._oriented(*self._resolve(u.Quantity(wavelength, u.um), None, values)),
@@ -570,16 +577,6 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                 f"give light of shape {matrix[0, 0].shape}"
             )
         return [sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix]
-
-    def _strip(self, key, value):
-        """Undo the model-set axis and the unit that astropy adds in a call."""
-        unit = self._declared(key).unit
-        if isinstance(value, u.Quantity):
-            self._check_unit(key, value.unit)
-        number = np.asarray(getattr(value, "value", value))
-        # a model of astropy is a set of one model
-        number = number[0] if number.ndim and number.shape[0] == 1 else number
-        return np.asarray(number) * canonical_factor(unit)
 
     @property
     def inverse(self):

@@ -11,7 +11,7 @@ import numpy as np
 
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.mueller import inverse, plane, turned
-from astropolcal.optics._modelling import SharedParameters
+from astropolcal.optics._modelling import ScalarParameters
 from astropolcal.optics.core import COORDINATES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
@@ -55,8 +55,14 @@ def _laws(optic):
     return own | optic._laws
 
 
-class Curve(SharedParameters):
-    """What is common to all curves; a subclass works on canonical floats."""
+class Curve(ScalarParameters):
+    """
+    A model of one input and one output whose parameters are those of optics, the same objects.
+
+    A subclass works on canonical floats; the values of the model are numbers in ``_unit``.
+    """
+
+    _unit = None
 
     def __init__(self, chain, optics, input_unit, unit=None):
         super().__init__()
@@ -80,9 +86,36 @@ class Curve(SharedParameters):
 
     def _take(self, optics):
         self._optics = optics
-        self._adopt({name: (optics[i], key) for name, (i, key) in self._names_of.items()})
+        # of each parameter the optic that has it, and its name there
+        self._owners = {name: (optics[i], key) for name, (i, key) in self._names_of.items()}
+        self._hold({name: getattr(*owner) for name, owner in self._owners.items()})
         # what a fitter asks for again: setting an attribute of a model takes astropy a while
         self._memo = {}
+
+    def __setattr__(self, attr, value):
+        if attr in self._param_names:
+            setattr(*self._owners[attr], value)
+        else:
+            super().__setattr__(attr, value)
+
+    @property
+    def return_units(self):
+        """Unit of the values, where they have one."""
+        return None if self._unit is None else {self.outputs[0]: self._unit}
+
+    def without_units_for_data(self, **data):
+        """Return the model as a fitter takes it: with values in the unit of the data."""
+        values = data[self.outputs[0]]
+        if not isinstance(values, u.Quantity):
+            return self
+        own = u.one if self._unit is None else self._unit
+        if not values.unit.is_equivalent(own):
+            raise ParameterError(
+                f"the data are in {values.unit}, but the curve gives {str(own) or 'plain numbers'}"
+            )
+        model = self if values.unit == own else self.copy()
+        model._unit = values.unit
+        return model
 
     def _names(self, optic):
         """Return the parameters of an optic on which the curve depends."""
