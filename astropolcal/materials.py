@@ -219,15 +219,19 @@ class UniaxialMaterial(_Ranged):
         self.ordinary_law = ordinary_law
         self.extraordinary_law = extraordinary_law
 
+    def _indices_um(self, wavelength_um):
+        """Return the ordinary and the extraordinary index at floats in micrometre."""
+        wavelength_um = self._checked_um(wavelength_um)
+        laws = self.ordinary_law, self.extraordinary_law
+        return [law._index_um(wavelength_um) for law in laws]
+
     def ordinary(self, wavelength):
         """Return the ordinary refractive index, a dimensionless Quantity."""
-        return u.Quantity(self.ordinary_law._index_um(self._checked_um(length_to_um(wavelength))))
+        return u.Quantity(self._indices_um(length_to_um(wavelength))[0])
 
     def extraordinary(self, wavelength):
         """Return the extraordinary refractive index, a dimensionless Quantity."""
-        return u.Quantity(
-            self.extraordinary_law._index_um(self._checked_um(length_to_um(wavelength)))
-        )
+        return u.Quantity(self._indices_um(length_to_um(wavelength))[1])
 
     def birefringence(self, wavelength):
         """Return the extraordinary minus the ordinary refractive index (Quantity)."""
@@ -235,17 +239,14 @@ class UniaxialMaterial(_Ranged):
 
     def _birefringence_um(self, wavelength_um):
         """Return the birefringence at floats in micrometre, for the hot path."""
-        wavelength_um = self._checked_um(wavelength_um)
-        return self.extraordinary_law._index_um(wavelength_um) - self.ordinary_law._index_um(
-            wavelength_um
-        )
+        ordinary, extraordinary = self._indices_um(wavelength_um)
+        return extraordinary - ordinary
 
     def _index_um(self, wavelength_um):
         """Return the mean index at floats in micrometre, as complex numbers."""
-        wavelength_um = self._checked_um(wavelength_um)
-        ordinary = self.ordinary_law._index_um(wavelength_um)
+        ordinary, extraordinary = self._indices_um(wavelength_um)
         # mean over directions: two of the three axes of the crystal are ordinary
-        return (2 * ordinary + self.extraordinary_law._index_um(wavelength_um)) / 3 + 0j
+        return (2 * ordinary + extraordinary) / 3 + 0j
 
 
 _EV_UM = u.eV.to(u.um, equivalencies=u.spectral())

@@ -13,7 +13,6 @@ import math
 import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import astropy.units as u
 import numpy as np
@@ -40,10 +39,6 @@ from astropolcal.observations.reading import common_wavelengths
 from astropolcal.words import check_choice
 
 __all__ = ["Instrument", "SkyLaw", "add_nuisance"]
-
-
-# what keeps the pupil, or the image, still at a Nasmyth focus
-_NASMYTH = MappingProxyType({"pupil": (0.0, 0.5), "field": (0.5, 0.5)})
 
 
 @dataclass(frozen=True)
@@ -86,7 +81,8 @@ class SkyLaw:
     """
 
     plate: object = TRACKING
-    derotator: dict = field(default_factory=lambda: dict(_NASMYTH))
+    # what keeps the pupil, or the image, still at a Nasmyth focus
+    derotator: dict = field(default_factory=lambda: {"pupil": (0.0, 0.5), "field": (0.5, 0.5)})
 
     def __post_init__(self):
         # one law for all modes has the name ""
