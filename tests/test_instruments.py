@@ -261,7 +261,7 @@ def test_inconclusive_date_is_an_error():
 def test_word_that_is_not_understood_is_an_error():
     for key in ["nasmyth_beam_switcher", "yjh50_dichroic"]:
         meta = {"date": "2025-10-05", key: "perhaps"}
-        with pytest.raises(InstrumentError, match=f"night: {key} is 'perhaps'; allowed are"):
+        with pytest.raises(InstrumentError, match=f"night: {key} = 'perhaps'; allowed are"):
             _setup(source="polarized", **meta)
 
 

@@ -232,9 +232,9 @@ class CHARIS(SubaruPolarimeter):
             If the meta do not say, or name a source that is unknown.
         """
         meta, name = observations.meta, observations.name
-        inside = _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False})
+        inside = subaru.stated(meta, name, "yjh50_dichroic", {"in": True, "out": False})
         words = {"installed": True, "not installed": False, "in": True, "out": False}
-        switcher = _stated(meta, name, "nasmyth_beam_switcher", words)
+        switcher = subaru.stated(meta, name, "nasmyth_beam_switcher", words)
         if switcher is None:
             day = (stated_date(meta, name, InstrumentError) or "")[:10]
             # a month alone is not conclusive
@@ -264,18 +264,6 @@ class CHARIS(SubaruPolarimeter):
             return {}
         present = None if time is None else _switcher_by(time.isot[:10])
         return {} if present is None else {"nbs": present}
-
-
-def _stated(meta, name, key, words):
-    """Return what the meta say of an optional optic, None where they say nothing."""
-    if meta.get(key) is None:
-        return None
-    word = str(meta[key]).strip().lower()
-    if word not in words:
-        raise InstrumentError(
-            f"{name}: {key} is {meta[key]!r}; allowed are {', '.join(map(repr, words))}"
-        )
-    return words[word]
 
 
 def _switcher_by(day):

@@ -15,6 +15,7 @@ from astropolcal import optics, standards
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
 from astropolcal.units import to_unit
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -238,6 +239,15 @@ def star_options(observations):
     words = re.sub(r"\W+", "", target)
     # a star without a name is the same optic in all datasets
     return {"star": f"star_{words}", "target": target} if words else {}
+
+
+def stated(meta, name, key, words):
+    """Return what the meta say of an optional optic, None where they say nothing."""
+    if meta.get(key) is None:
+        return None
+    word = str(meta[key]).strip().lower()
+    check_choice(f"{name}: {key}", word, words, InstrumentError)
+    return words[word]
 
 
 #: Longitude, latitude (deg) and height (m) of the VLT, as in its headers.

@@ -33,7 +33,6 @@ from astropolcal.instruments.layout import (
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
-from astropolcal.words import check_choice
 
 __all__ = ["VAMPIRES"]
 
@@ -376,17 +375,15 @@ class VAMPIRES(SubaruPolarimeter):
         """
         source = self.source_of(observations, _SOURCES)
         # what the table says goes before what its columns suggest
-        stated = observations.meta.get("flc")
-        if stated is not None:
-            what, stated = f"{observations.name}: flc", str(stated).lower()
-            check_choice(what, stated, ("in", "out"), InstrumentError)
-            return source, ("flc",) if stated == "in" else ()
-        # what a calibration remembers of a dataset has no columns, but the meta say how it is
-        # paired
-        frames = getattr(observations, "frames", None)
-        columns = () if frames is None else frames.colnames
-        paired = observations.meta.get("pairing") == "flc_state"
-        return source, ("flc",) if "flc_state" in columns or paired else ()
+        words, meta = {"in": True, "out": False}, observations.meta
+        inside = subaru.stated(meta, observations.name, "flc", words)
+        if inside is None:
+            # what a calibration remembers of a dataset has no columns, but the meta say how it is
+            # paired
+            frames = getattr(observations, "frames", None)
+            columns = () if frames is None else frames.colnames
+            inside = "flc_state" in columns or meta.get("pairing") == "flc_state"
+        return source, ("flc",) if inside else ()
 
     def meta_without(self, names):
         """Return what a liquid crystal leaves: no states by which frames are paired."""
