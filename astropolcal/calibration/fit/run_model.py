@@ -15,6 +15,7 @@ from astropolcal.calibration.fit.evidence import (
     COURSES,
     EVENT,
     Deviation,
+    Try,
     Weighed,
     chances_of_runs,
     laws_of,
@@ -60,10 +61,6 @@ class Term:
     def size(self):
         return self.law.shape[1] * self.times.shape[1]
 
-    def block(self, run):
-        """Return the derivative of the elements of a run to the coefficients."""
-        return np.kron(self.times[run], self.law)
-
 
 class Model:
     """The coefficients of all runs, and the rows around them."""
@@ -92,11 +89,11 @@ class Model:
         self.limits = self._of_shared(first, lambda i: np.array(frees[i].bounds()) / self.scales[i])
         self.value = self._of_shared(first, lambda i: work.alone[i][None] / self.scales[i])[0]
         self.held = np.zeros(self.value.size, dtype=bool)
-        self.priors = [
-            _priors_of(free, scale) for free, scale in zip(frees, self.scales, strict=True)
-        ]
         self.chances = None if dates is None else chances_of_runs(dates, events)
-        self.vectors, self.rows = work.alone, None
+        self.vectors = work.alone
+        #: Rows around the parameters of each run alone, with its residuals there.
+        self.alone = self.rows = work.around(self.vectors)
+        self.value = self._solved()[0]
 
     def _of_shared(self, first, values):
         where = [(first[name], self.names[first[name]].index(name)) for name in self.shared]
@@ -115,48 +112,50 @@ class Model:
 
     # ---- linear algebra
 
+    def _known(self, i, which):
+        """Return rows and targets of a run's priors on some elements, in steps."""
+        free, vector = self.work.shapes[i].free, self.vectors[i]
+        rows = (free.prior_jacobian(vector) * self.scales[i][:, None]).T
+        aims = rows @ (vector / self.scales[i]) - free.prior_residuals(vector)
+        wanted = rows[:, which].any(axis=1)
+        return rows[wanted], aims[wanted]
+
+    def _with_priors(self, i):
+        """Return a run's rows and targets, with the priors on what is its own."""
+        one, known = self.rows[i], self._known(i, self.own[i])
+        return np.concatenate([one.rows, known[0]]), np.concatenate([one.targets, known[1]])
+
     def _split(self, i):
-        """Return a run's rows with what is its own projected out, and how that follows."""
-        one, mine = self.rows[i], self.own[i]
-        rows, targets = one.rows, one.targets
-        if mine.any():
-            extra, aims = self.priors[i](self.vectors[i] / self.scales[i], mine)
-            rows = np.concatenate([rows, extra])
-            targets = np.concatenate([targets, aims])
-            basis = orthonormal(rows[:, mine])
-            targets = targets - basis @ (basis.T @ targets)
-            rows = rows - basis @ (basis.T @ rows)
-            rows[:, mine] = 0.0
+        """Return a run's rows with what is its own projected out, and their targets."""
+        rows, targets = self._with_priors(i)
+        basis = orthonormal(rows[:, self.own[i]])
+        targets = targets - basis @ (basis.T @ targets)
+        rows = rows - basis @ (basis.T @ rows)
+        rows[:, self.own[i]] = 0.0
         return rows, targets
 
-    def _spread(self, i, rows):
-        """Return rows of a run's elements as rows of all coefficients."""
-        shared = ~self.own[i]
-        out = [np.zeros((len(rows), self.value.size - sum(t.size for t in self.terms)))]
-        out[0][:, self.columns[i]] = rows[:, shared]
+    def _shares(self, i):
+        """Return the derivative of a run's elements to all coefficients, zero of its own ones."""
+        out, start = np.zeros((len(self.names[i]), self.value.size)), len(self.shared)
+        out[~self.own[i], self.columns[i]] = 1.0
         for term in self.terms:
             where = [self.names[i].index(name) for name in term.names]
-            out.append(rows[:, where] @ term.block(i))
-        return np.concatenate(out, axis=1)
+            out[where, start : start + term.size] = np.kron(term.times[i], term.law)
+            start += term.size
+        return out
 
     def _prior_rows(self):
         """Return rows and targets of what is known beforehand of the coefficients."""
-        rows, aims, seen = [], [], set()
+        sizes = [np.full(len(self.shared), np.inf)]
+        sizes = np.concatenate(sizes + [np.full(term.size, term.prior) for term in self.terms])
+        rows, seen = [np.diag(1 / sizes)[np.isfinite(sizes)]], set()
+        aims = [np.zeros(len(rows[0]))]
         for i, names in enumerate(self.names):
             fresh = np.array([n not in seen for n in names]) & ~self.own[i]
             seen |= set(names)
-            if fresh.any():
-                one, targets = self.priors[i](self.vectors[i] / self.scales[i], fresh)
-                rows.append(self._spread(i, one))
-                aims.append(targets)
-        start = self.value.size - sum(t.size for t in self.terms)
-        for term in self.terms:
-            if np.isfinite(term.prior):
-                block = np.zeros((term.size, self.value.size))
-                block[:, start : start + term.size] = np.eye(term.size) / term.prior
-                rows.append(block)
-                aims.append(np.zeros(term.size))
-            start += term.size
+            one, targets = self._known(i, fresh)
+            rows.append(one @ self._shares(i))
+            aims.append(targets)
         return np.concatenate(rows), np.concatenate(aims)
 
     def _system(self):
@@ -165,7 +164,7 @@ class Model:
         total = np.column_stack([rows, aims - rows @ self.value])
         for i in range(len(self.rows)):
             own, targets = self._split(i)
-            own = self._spread(i, own)
+            own = own @ self._shares(i)
             total = np.concatenate([total, np.column_stack([own, targets - own @ self.value])])
             if len(total) > max(4 * total.shape[1], _MANY):
                 total = np.linalg.qr(total, mode="r")
@@ -174,52 +173,31 @@ class Model:
     def _solved(self):
         """Return the coefficients that fit best, within their bounds, and the directions."""
         rows, aims = self._system()
-        n = self.limits.shape[1]
-        low, high = self.limits
-        held = np.zeros(self.value.size, dtype=bool)
+        n, (low, high) = len(self.shared), self.limits
+        start, held = self.value.copy(), np.zeros(self.value.size, dtype=bool)
         while True:
-            live = np.flatnonzero(~held)
+            new, live = start.copy(), np.flatnonzero(~held)
             found = decompose(rows[:, live])
-            new = self.value.copy()
-            new[held] = np.clip(new[:n], low, high)[held[:n]] if held.any() else new[held]
-            left = aims - rows @ (new - self.value)
+            left = aims - rows @ (start - self.value)
             new[live] += found.half.T @ (found.half @ (rows[:, live].T @ left))
-            outside = np.zeros_like(held)
-            outside[:n] = ~held[:n] & ((new[:n] < low) | (new[:n] > high))
+            outside = ~held[:n] & ((new[:n] < low) | (new[:n] > high))
             if not outside.any():
                 self.held = held
                 return new, found
-            self.value = self.value.copy()
-            self.value[:n] = np.where(outside[:n], np.clip(new[:n], low, high), self.value[:n])
-            rows, aims = self._system()
-            held |= outside
+            start[:n] = np.where(outside, np.clip(new[:n], low, high), start[:n])
+            held[:n] |= outside
 
     def _vectors(self, value):
         """Return the canonical parameters of all runs."""
         out = []
-        n = self.value.size - sum(t.size for t in self.terms)
         for i, mine in enumerate(self.own):
-            theta = self.vectors[i] / self.scales[i]
-            theta[~mine] = value[:n][self.columns[i]]
-            start = n
-            for term in self.terms:
-                where = [self.names[i].index(name) for name in term.names]
-                theta[where] += term.block(i) @ value[start : start + term.size]
-                start += term.size
-            if mine.any():
-                extra, aims = self.priors[i](self.vectors[i] / self.scales[i], mine)
-                rows = np.concatenate([self.rows[i].rows, extra])
-                targets = np.concatenate([self.rows[i].targets, aims]) - rows @ theta
-                theta[mine] += np.linalg.pinv(rows[:, mine], rcond=_PINV) @ targets
+            theta = self._shares(i) @ value
+            theta[mine] = (self.vectors[i] / self.scales[i])[mine]
+            rows, targets = self._with_priors(i)
+            theta[mine] += np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (targets - rows @ theta)
             bounds = self.work.shapes[i].free.bounds()
             out.append(np.clip(theta * self.scales[i], *bounds))
         return out
-
-    def begin(self):
-        """Solve around the parameters that each run has by itself."""
-        #: Rows around the parameters of each run alone, with its residuals there.
-        self.alone = self.rows = self.work.around(self.vectors)
-        self.value = self._solved()[0]
 
     def solve(self):
         """Solve around the present parameters, go there, and return those before."""
@@ -252,11 +230,6 @@ class Model:
 
     # ---- courses
 
-    def add(self, term):
-        """Add a course, of no size yet."""
-        self.terms.append(term)
-        self.value = np.concatenate([self.value, np.zeros(term.size)])
-
     def add_wanted(self, vary):
         """Add the courses that the user asks for."""
         if not isinstance(vary, dict):
@@ -269,20 +242,21 @@ class Model:
             check_choice(f"vary: {what}", course, COURSES, ParameterError)
             names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
             if course in ("walk", "scatter"):
-                best = self._weighed(names, self._parts()).best([course])
-                self.add(Term(what, course, names, best.law, best.waves, best.size))
-            elif course != "constant":
-                self._add_plain(what, course, names)
-
-    def _add_plain(self, what, course, names):
-        """Add a drift, or a step at each event, of which every element has its own."""
-        waves, law = waves_of(self.dates)[course], np.eye(len(names))
-        gaps = np.flatnonzero(self.chances == EVENT) if course == "steps" else [0]
-        if not len(gaps):
-            raise ParameterError(f"vary: {what} has steps, but there is no event between the runs")
-        for gap in gaps:
-            at = int(gap) if course == "steps" else None
-            self.add(Term(what, course, names, law, waves[:, [gap]], gap=at))
+                found = [self._weighed(names, self._parts()).best([course])]
+            else:
+                gaps = {"steps": np.flatnonzero(self.chances == EVENT).tolist(), "drift": [None]}
+                times, law = waves_of(self.dates).get(course), np.eye(len(names))
+                # of a drift, and of a step at an event, every element has its own
+                found = [
+                    Try(0.0, course, gap, law, times[:, [gap or 0]], np.inf)
+                    for gap in gaps.get(course, [])
+                ]
+            if course == "steps" and not found:
+                raise ParameterError(
+                    f"vary: {what} has steps, but there is no event between the runs"
+                )
+            for one in found:
+                self._take([*self.terms, self._term(what, names, one)])
 
     def search(self):
         """Add the courses that the evidence asks for."""
@@ -320,7 +294,9 @@ class Model:
             odds = {what: one.odds_of(among) for what, one in found.items()}
             what = max(odds, key=odds.get, default=None)
             if what is not None and odds[what] > _ENOUGH:
-                self._take([*self.terms, self._term(what, found[what].best(among))])
+                self._take(
+                    [*self.terms, self._term(what, self.varying[what], found[what].best(among))]
+                )
                 gained += odds[what] + self._exchange()
             elif among == COURSES[1:]:
                 break
@@ -328,10 +304,10 @@ class Model:
                 among = COURSES[1:]
         return gained, self.terms
 
-    def _term(self, what, best):
+    def _term(self, what, names, best):
         # a size that is given to what follows no law keeps it from following the noise
         prior = np.inf if best.course in _SIMPLE else best.size
-        return Term(what, best.course, self.varying[what], best.law, best.waves, prior, best.gap)
+        return Term(what, best.course, names, best.law, best.waves, prior, best.gap)
 
     def _exchange(self):
         """Put in place of each course the best of its optic beside all others; return the gain.
@@ -342,27 +318,24 @@ class Model:
         for old in self.terms[:-1]:
             k, terms = self.terms.index(old), list(self.terms)
             self._take([*terms[:k], *terms[k + 1 :]])
-            parts, mine = self._parts(), optic(old.what)
-            found = {
-                what: self._weighed(names, parts)
-                for what, names in self.varying.items()
-                if optic(what) == mine
-            }
+            found = self.weighed(optic(old.what))
             odds = {what: one.odds_of(COURSES[1:]) for what, one in found.items()}
             what = max(odds, key=odds.get)
             gained -= odds[old.what]
             if odds[what] > _ENOUGH:
-                new = self._term(what, found[what].best(COURSES[1:]))
+                new = self._term(what, self.varying[what], found[what].best(COURSES[1:]))
                 gained += odds[what]
                 self._take([*terms[:k], new, *terms[k + 1 :]])
         return gained
 
-    def weighed(self):
-        """Return the probabilities of all courses of each optic, beside all that were added."""
-        if not self.varying:
-            return {}
-        parts = self._parts()
-        return {what: self._weighed(names, parts) for what, names in self.varying.items()}
+    def weighed(self, among=None):
+        """Return the probabilities of all courses of each optic, beside all that were added.
+
+        Of ``among``, an optic, only.
+        """
+        wanted = {k: names for k, names in self.varying.items() if among in (None, optic(k))}
+        parts = self._parts() if wanted else []
+        return {what: self._weighed(names, parts) for what, names in wanted.items()}
 
     def _parts(self):
         """Return of each run rows, what all coefficients take of them, and what is left."""
@@ -371,7 +344,7 @@ class Model:
         wide[~self.held] = found.half.T
         for i in range(len(self.rows)):
             rows, targets = self._split(i)
-            spread = self._spread(i, rows)
+            spread = rows @ self._shares(i)
             parts.append((rows, spread @ wide, targets - spread @ value))
         return parts
 
@@ -411,27 +384,19 @@ class Model:
     def errors_of(self, i):
         """Return determined and open directions of a run's parameters, in steps."""
         _, found = self._solved()
-        follow = self._follow(i)[:, ~self.held]
-        known, null = found.half @ follow.T, found.null @ follow.T
-        mine = self.own[i]
-        if mine.any():
-            extra, _ = self.priors[i](self.vectors[i] / self.scales[i], mine)
-            own = decompose(np.concatenate([self.rows[i].rows, extra])[:, mine])
-            block = np.zeros((own.right.shape[0], mine.size))
-            block[:, mine] = own.right
-            known = np.concatenate([known, block[: own.rank] / own.singular[: own.rank, None]])
-            null = np.concatenate([null, block[own.rank :]])
+        mine, (rows, _) = self.own[i], self._with_priors(i)
+        # how the run's parameters follow the coefficients
+        follow = self._shares(i)
+        follow[mine] = -np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (rows @ follow)
+        follow = follow[:, ~self.held].T
+        own = decompose(rows[:, mine])
+        block = np.zeros((own.right.shape[0], mine.size))
+        block[:, mine] = own.right
+        known = np.concatenate(
+            [found.half @ follow, block[: own.rank] / own.singular[: own.rank, None]]
+        )
+        null = np.concatenate([found.null @ follow, block[own.rank :]])
         return known, null[np.linalg.norm(null, axis=1) > STILL]
-
-    def _follow(self, i):
-        """Return the derivative of a run's parameters to the coefficients, in steps."""
-        mine = self.own[i]
-        out = self._spread(i, np.eye(mine.size))
-        if mine.any():
-            extra, _ = self.priors[i](self.vectors[i] / self.scales[i], mine)
-            rows = np.concatenate([self.rows[i].rows, extra])
-            out[mine] = -np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (rows @ out)
-        return out
 
 
 # nothing is known of it
@@ -461,24 +426,3 @@ def _differ(one, other):
 
 def _is_of(name, wanted):
     return stem(name) in wanted or optic(name) in wanted
-
-
-def _priors_of(free, scale):
-    """Return what gives rows and targets of a run's priors on some elements, in steps."""
-
-    def rows_of(theta, which):
-        rows, aims = [np.zeros((0, scale.size))], [np.zeros(0)]
-        for slot, prior in free.priors:
-            here = np.arange(slot.start, slot.start + slot.size)
-            wanted = which[here]
-            if prior.is_flat or not wanted.any():
-                continue
-            value = theta[here] * scale[here]
-            slope = np.broadcast_to(prior.slope(value), here.shape) * scale[here]
-            block = np.zeros((here.size, scale.size))
-            block[np.arange(here.size), here] = slope
-            rows.append(block[wanted])
-            aims.append((slope * theta[here] - prior.residual(value))[wanted])
-        return np.concatenate(rows), np.concatenate(aims)
-
-    return rows_of

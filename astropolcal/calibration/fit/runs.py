@@ -138,7 +138,6 @@ def calibrate_runs(
     kept = _Checkpoint(checkpoint, [_fingerprint(*part, observable) for part in parts])
     work = _Work(parts, {"observable": observable}, errors, executor, kept)
     model = _Coefficients(work, own, dates, events)
-    model.begin()
     if vary == "evidence":
         model.search()
     elif vary:
