@@ -323,7 +323,7 @@ def test_more_parameters_than_data_are_refused(make):
 
 
 def test_fit_that_does_not_arrive_warns(few, monkeypatch):
-    from astropolcal.calibration.fit import calibrate as fit
+    from astropolcal.calibration.fit import strategies as fit
 
     chain, _, data = few
     monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
@@ -334,7 +334,7 @@ def test_fit_that_does_not_arrive_warns(few, monkeypatch):
 
 
 def test_step_that_does_not_arrive_warns_too(few, monkeypatch):
-    from astropolcal.calibration.fit import calibrate as fit
+    from astropolcal.calibration.fit import strategies as fit
 
     chain, _, data = few
     monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
@@ -361,7 +361,7 @@ def test_when_branches_are_searched(few, monkeypatch):
         ("two-step", None, False),  # the paper's procedure goes downhill from its start
         ("two-step", True, True),
     ]:
-        from astropolcal.calibration.fit import calibrate as fit
+        from astropolcal.calibration.fit import strategies as fit
 
         calls = []
 

@@ -9,7 +9,7 @@ import pytest
 from star_data import CHARIS, observe_star
 
 from astropolcal import calibrate
-from astropolcal.calibration.fit import calibrate as fit_module
+from astropolcal.calibration.fit import strategies as fit_module
 from astropolcal.calibration.validation import cross_validation as accuracy
 from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
 from astropolcal.exceptions import FitError

@@ -297,7 +297,7 @@ def test_no_freedom_at_all_gives_no_error(make):
 
 
 def test_noise_that_does_not_settle_is_told(truth, data, monkeypatch):
-    from astropolcal.calibration.fit import calibrate as module
+    from astropolcal.calibration.fit import strategies as module
 
     monkeypatch.setattr(module, "ROUNDS", 1)
     with pytest.warns(AstropolcalWarning, match="noise from the residuals did not settle in 1 fit"):

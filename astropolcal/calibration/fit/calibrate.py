@@ -5,6 +5,11 @@ The joint strategy fits all free parameters of all datasets at once, from a
 start in which every wavelength sits in its best mirror branch. The two-step
 strategy is the procedure of McIntosh et al. (2026, Sec. 5.2): per wavelength
 with misalignments held, then global, then per wavelength again.
+
+Gauge: where the data do not determine all directions, every point along them fits equally well, and
+where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
+parameters common to all wavelengths (the misalignments) have moved least from where they started. A
+user names another gauge by holding parameters (``fix=``) or by a prior.
 """
 
 import platform
@@ -18,39 +23,25 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
-from astropy.utils.exceptions import AstropyWarning
 
 from astropolcal.calibration.fit.strategies import (
     BinProblem,
-    copy_fitted,
-    describe_gauge,
-    hold_silent,
-    open_parameters,
-    other_laws,
-    search_branches,
+    fit_once,
+    joint,
+    known_noises,
+    outside_bounds,
     sequential,
-    settled,
-    smooth_branches,
-    telescope_alone,
     two_step,
 )
-from astropolcal.calibration.identifiability.analysis import complete, finding_of
+from astropolcal.calibration.identifiability.analysis import complete, finding_of, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
-from astropolcal.calibration.noise.estimates import (
-    noise_from_errors,
-    noise_from_null_channel,
-    noise_from_roughness,
-)
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
-    ROUNDS,
-    TALL,
     Problem,
     Weighting,
     describe,
     first_weighting,
-    noise_of,
     outlying_data,
     robust_sigma,
 )
@@ -63,10 +54,10 @@ from astropolcal.calibration.uncertainty.covariance import (
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
-from astropolcal.files import one_line
+from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs
-from astropolcal.measurement.parameters import ROUNDING, with_own
+from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
@@ -76,21 +67,8 @@ __all__ = ["calibrate"]
 
 STRATEGIES = ("joint", "two-step", "sequential")
 ERRORS = ("scatter", "white")
-_MAX_EVALUATIONS = 500
-_MAX_ROUNDS = 4
+GAUGES = ("minimal", None)
 _ROBUST_ROUNDS = 50
-# residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
-# one counts that leaves less than this share
-_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
-# nor is one tried that leaves so many times as much before everything is fitted, or is not better
-# after so many evaluations
-_HOPELESS, _GLANCE = 100.0, 15
-# of data without noise, residuals below this are rounding
-_ROUNDED = 1e-6
-# branches are searched in so many groups of frames of a dataset, if it has several times as many
-_FEW, _LONG = 256, 4
-# a wavelength in the branch of its neighbours may have up to so many times the sum of squares
-_WORTH = 3.0
 
 
 @in_one_thread
@@ -202,7 +180,13 @@ def calibrate(
     >>> cal.converged
     True
     """
-    _check_choices(strategy, loss, errors)
+    for name, value, allowed in (
+        ("strategy", strategy, STRATEGIES),
+        ("loss", loss, LOSSES),
+        ("errors", errors, ERRORS),
+        ("gauge", gauge, GAUGES),
+    ):
+        check_choice(name, value, allowed, FitError)
     search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
@@ -217,16 +201,23 @@ def calibrate(
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
-    how = _Strategy(fitter, search, weights, options)
-    outcome, weighting, stages = how.fit(strategy, measurement, weighting)
+    if strategy == "joint":
+        outcome, weighting = joint(measurement, weighting, fitter, search, options)
+        stages = []
+    elif strategy == "two-step":
+        outcomes, weighting, stages = two_step(measurement, weighting, fitter, search, options)
+    else:
+        outcomes, weighting, stages = sequential(measurement, weights, fitter, search, options)
+    if stages:
+        # the first step that did not converge makes the next ones useless
+        outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1])
     if loss != "linear":
         outcome, weighting = _robust(measurement, fitter, loss, outcome)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
         )
-    hold_silent(measurement, origin)
-    chosen, weighting, whitened = _settled(measurement, weighting, origin, gauge)
+    chosen, whitened = _at_gauge(measurement, weighting, origin, gauge)
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
     return _result(
         measurement,
@@ -236,10 +227,10 @@ def calibrate(
             "observable": measurement.observable.name,
             "fitter": type(fitter).__name__,
             "strategy": strategy,
-            "weights": weighting.choice,
+            "weights": measurement.weighting.choice,
             "loss": loss,
             "errors": errors,
-            "noise": describe(measurement, weighting),
+            "noise": describe(measurement, measurement.weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
             **({"own": copies} if copies else {}),
         },
@@ -247,12 +238,6 @@ def calibrate(
         stages=stages,
         cross_validate=cross_validate,
     )
-
-
-def _check_choices(*values):
-    choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
-    for (name, allowed), value in zip(choices.items(), values, strict=True):
-        check_choice(name, value, allowed, FitError)
 
 
 def _fixed(chain, fix):
@@ -272,21 +257,6 @@ def _fixed(chain, fix):
     return copies[0] if single else copies
 
 
-def _settled(measurement, weighting, origin, gauge):
-    """Choose the gauge where there is a choice; return what is open, noise and linear problem."""
-    if gauge == "minimal":
-        chosen, whitened = settled(BinProblem(measurement, weighting), origin)
-    else:
-        whitened = Problem(measurement, weighting).around()
-        chosen = open_parameters(measurement.free, whitened)
-    if len(whitened.data.null):
-        hold_silent(measurement, origin)
-    measurement.weighting = weighting.updated(measurement, whitened)
-    if measurement.weighting.weight is not None and weighting.from_residuals:
-        whitened = Problem(measurement, measurement.weighting).around()
-    return chosen, measurement.weighting, whitened
-
-
 def _check(measurement):
     if not measurement.free.size:
         raise FitError("nothing to fit: every parameter is fixed or tied")
@@ -295,7 +265,7 @@ def _check(measurement):
             f"{measurement.free.size} free parameters but only {measurement.n_data} data; "
             "fix some, or add frames"
         )
-    for name in _outside_bounds(measurement):
+    for name in outside_bounds(measurement):
         free, i = measurement.free, measurement.free.names.index(name)
         unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]
         value, low, high = (x[i] / factor for x in (measurement.vector(), *free.bounds()))
@@ -308,227 +278,6 @@ def _check(measurement):
         measurement.stand_at(inside)
 
 
-def _run(measurement, weighting, fitter):
-    """Fit in place until the noise agrees with the residuals; return how it went, and the noise."""
-    # one level for all data does not move the minimum, unless priors weigh against them
-    told = weighting.choice == "wavelength" or (weighting.from_residuals and measurement.n_priors)
-    if not told:
-        return _fit(measurement, weighting, fitter), weighting
-    if not weighting.is_known:
-        weighting = weighting.started(measurement)
-    # noise from the residuals of a fit whose weights come from that noise: a fixed point
-    for _ in range(ROUNDS):
-        outcome = _fit(measurement, weighting, fitter)
-        before, weighting = weighting, weighting.updated(measurement)
-        if not np.isfinite(weighting.sigma).all():
-            raise FitError(
-                f"{measurement.free.size} free parameters and {measurement.n_data} data leave none "
-                "for the noise, against which priors weigh; fix some, add frames, or take "
-                "weights='errors'"
-            )
-        if weighting.agrees(before):
-            return outcome, weighting
-    message = f"the noise from the residuals did not settle in {ROUNDS} fits"
-    return outcome | {"converged": False, "message": message}, weighting
-
-
-def _fit(measurement, weighting, fitter):
-    """Fit in place; return whether it arrived, what it said, and how long it took."""
-    stage(f"fitting {measurement.free.size} parameters")
-    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL:
-        # the same steps by triangular factors, for which the fitter has no place
-        vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
-        measurement.stand_at(vector)
-        return {
-            "converged": found.success,
-            "message": found.message,
-            "evaluations": int(found.nfev),
-        }
-    index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
-    canonical = measurement.canonical()
-    with warnings.catch_warnings(record=True) as caught:
-        # recorded, not shown: whether the fit arrived is told once, in the words of this package
-        warnings.simplefilter("always", AstropyWarning)
-        try:
-            fitter(
-                canonical,
-                index,
-                observed,
-                weights=weights,
-                maxiter=_MAX_EVALUATIONS,
-                inplace=True,
-            )
-        except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
-            said = one_line(str(error))
-            raise FitError(f"{type(fitter).__name__} failed: {said}") from error
-    measurement.stand_at(canonical.vector())
-    info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
-    said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]
-    outside = _outside_bounds(measurement)
-    if outside:
-        said.append(f"{type(fitter).__name__} left the bounds of {', '.join(outside)}")
-    evaluations = info.get("nfev")
-    return {
-        "converged": not said,
-        "message": said[-1] if said else str(info.get("message", "")).strip(),
-        "evaluations": None if evaluations is None else int(evaluations),
-    }
-
-
-def _outside_bounds(measurement):
-    """Return the names of parameters that a fitter without bounds left outside of theirs."""
-    low, high = measurement.free.bounds()
-    vector = measurement.vector()
-    # a fitter that minds the bounds ends on them only as exactly as rounding allows
-    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
-    outside = (vector < low - slack) | (vector > high + slack)
-    return [measurement.free.names[i] for i in np.flatnonzero(outside)]
-
-
-def _joint(measurement, weighting, fitter, search, prepare):
-    """Fit everything; where the residuals stand out, from other values of its laws, too."""
-    origin = measurement.vector()
-    best = _descend(measurement, weighting, fitter, search, prepare, origin)
-    if not search or not _stands_out(measurement):
-        return best
-    found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
-    least = np.sum(problem.residuals(found) ** 2)
-    for promised, start in other_laws(problem, found, origin)[:_STARTS]:
-        if promised > _HOPELESS * least:
-            break
-        start, left = _glanced(problem, start, origin)
-        if left >= _BETTER * least:
-            continue
-        measurement.stand_at(start)
-        outcome = _descend(measurement, weighting, fitter, search, prepare, origin, start)
-        left = np.sum(problem.residuals(measurement.vector()) ** 2)
-        if left < _BETTER * least:
-            best, found, least = outcome, measurement.vector(), left
-            if not _stands_out(measurement):
-                break
-    measurement.stand_at(found)
-    return best
-
-
-def _glanced(problem, start, origin):
-    """Return where a start leads in a few steps of everything, and what it leaves there.
-
-    Most starts lead to the minimum that is known, or crawl towards one that is no better.
-    """
-    start = problem.fit(start, evaluations=_GLANCE)[0]
-    start, moved = search_branches(problem, start, origin)
-    if moved.any():
-        start = problem.fit(start, evaluations=_GLANCE)[0]
-    return start, np.sum(problem.residuals(start) ** 2)
-
-
-def _stands_out(measurement):
-    """Whether the residuals are far above the noise that the frames show, or the table states."""
-    residuals = measurement.residuals(measurement.vector())[: measurement.n_data]
-    for method in (_noise_of_frames, noise_from_errors):
-        try:
-            sigma = method(measurement).sigma_of_data
-        except AstropolcalError:
-            continue  # few wavelengths, or no errors in the table
-        return bool(np.mean((residuals / np.maximum(sigma, _ROUNDED)) ** 2) > _STANDS_OUT**2)
-    return False
-
-
-def _descend(measurement, weighting, fitter, search, prepare, origin, start=None):
-    """Fit everything; go on as long as some bin finds a better mirror branch."""
-    small, noise = _thinned(measurement, weighting)
-    if search and start is None:
-        small.stand_at(_first_search(small, noise, origin))
-    prepare(small)
-    # branches are found on few frames, so the long table starts from their fit
-    if small is not measurement:
-        _run(small, noise, fitter)
-        measurement.stand_at(small.vector())
-    for left in reversed(range(_MAX_ROUNDS)):
-        outcome, weighting = _run(measurement, weighting, fitter)
-        # the last word belongs to the fit of all parameters, not to a search by bin
-        if not search or not left:
-            break
-        small, noise = _thinned(measurement, weighting)
-        better, moved = search_branches(BinProblem(small, noise), small.vector(), origin)
-        if not moved.any():
-            break
-        measurement.stand_at(better)
-    return _smoothed(measurement, weighting, fitter, outcome) if search else (outcome, weighting)
-
-
-def _smoothed(measurement, weighting, fitter, outcome):
-    """Fit again with single wavelengths in the branch of their neighbours, if nearly as good."""
-    problem, found = BinProblem(*_thinned(measurement, weighting)), measurement.vector()
-    start, moved = smooth_branches(problem, found)
-    if not moved.any():
-        return outcome, weighting
-    costs = problem.costs(found)[moved]
-    measurement.stand_at(start)
-    again = _run(measurement, weighting, fitter)
-    if np.all(problem.costs(measurement.vector())[moved] < _WORTH * costs):
-        return again
-    measurement.stand_at(found)
-    return outcome, weighting
-
-
-def _thinned(measurement, weighting):
-    """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
-    if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
-        return measurement, weighting
-    small, kept = measurement.thinned(_FEW)
-    return small, Weighting(weighting.choice, weighting.sigma[kept])
-
-
-def _first_search(measurement, weighting, origin):
-    """Return the best branches; where no noise is known yet, first without the priors."""
-    stage("looking for where to start")
-    problem = BinProblem(measurement, weighting)
-    found = search_branches(problem, origin)[0]
-    if weighting.is_known or not problem.has_priors:
-        return found
-    measurement.stand_at(found)
-    problem = BinProblem(measurement, weighting.started(measurement))
-    return search_branches(problem, origin)[0]
-
-
-class _Strategy:
-    """How a measurement is fitted: fitter, search of branches, and the order of steps."""
-
-    def __init__(self, fitter, search, weights, options):
-        self.fitter, self.search, self.weights, self.options = fitter, search, weights, options
-
-    def fit(self, strategy, measurement, weighting):
-        """Fit in place; return how it went, the noise, and the values after each step."""
-        if strategy == "joint":
-            return *self._joint(measurement, weighting, self._stars), []
-        if strategy == "two-step":
-            return two_step(measurement, weighting, self._joint, self._run, self.options)
-        outcome, stages = sequential(measurement, self._first, self._joint, self._run, self.options)
-        return outcome, noise_of(measurement, self.weights), stages
-
-    def _joint(self, measurement, weighting, prepare=lambda _: None):
-        return _joint(measurement, weighting, self.fitter, self.search, prepare)
-
-    def _stars(self, measurement):
-        # the law of a telescope's mirror is nearly degenerate: cheap steps with the rest held
-        alone = telescope_alone(measurement, self.options)
-        if alone is not None:
-            self._run(alone, first_weighting(alone, None))
-            copy_fitted(alone, measurement)
-
-    def _run(self, measurement, weighting):
-        return _run(measurement, weighting, self.fitter)
-
-    def _first(self, measurement):
-        if self.weights is not None and not isinstance(self.weights, str):
-            raise FitError(
-                "strategy='sequential' fits the datasets one by one, so the noise cannot be given "
-                "for all data; allowed are weights = None, 'wavelength', 'errors'"
-            )
-        return first_weighting(measurement, self.weights)
-
-
 def _robust(measurement, fitter, loss, outcome):
     """Fit with the weights of a robust loss until they settle."""
     before = None
@@ -537,10 +286,119 @@ def _robust(measurement, fitter, loss, outcome):
         weighting = Weighting("given", robust_sigma(measurement, loss))
         if before is not None and weighting.agrees(before):
             return outcome, weighting
-        outcome = _fit(measurement, weighting, fitter)
+        outcome = fit_once(measurement, weighting, fitter)
         before = weighting
     message = f"the weights of the robust fit did not settle in {_ROBUST_ROUNDS} fits"
     return outcome | {"converged": False, "message": message}, weighting
+
+
+# ---- choice of a gauge: one of the solutions that the data cannot tell apart ----
+
+
+_ROUNDS = 6
+# a gauge is reached when the leading parameters would move by less (deg, um, percent)
+_SETTLED = 1e-4
+# longest step along an open direction, in the same units: the surface of solutions is curved
+_LONGEST = 2.0
+# the solution is left alone if a move spoils it by more than this share
+_SPOILT = 1e-3
+# what changes the data by less than this (for a degree, micrometre, percent) changes none
+_SILENT = 1e-12
+
+
+def _at_gauge(measurement, weighting, origin, gauge):
+    """Choose the gauge where there is a choice; return what is open, and the linear problem.
+
+    The measurement keeps the noise that its residuals show there.
+    """
+    hold_silent(measurement, origin)
+    problem = BinProblem(measurement, weighting)
+    whitened = settled(problem, origin) if gauge == "minimal" else problem.around()
+    chosen = open_parameters(measurement.free, whitened)
+    if len(whitened.data.null):
+        hold_silent(measurement, origin)
+    measurement.weighting = weighting.updated(measurement, whitened)
+    if measurement.weighting.choice == "wavelength":
+        whitened = Problem(measurement, measurement.weighting).around()
+    return chosen, whitened
+
+
+def settled(problem, origin):
+    """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
+
+    ``origin`` is where the fit started. Returns the linear problem around the new solution.
+    """
+    measurement = problem.measurement
+    free, vector = measurement.free, measurement.vector()
+    scale, (low, high) = physical_scale(free), free.bounds()
+    # the elements whose moves are to be small: those common to all wavelengths
+    leaders = [slot.start for slot in free.slots if not slot.per_wavelength]
+    leaders = np.array(leaders or range(free.size), dtype=int)
+    whitened = problem.around(vector)
+    for _ in range(_ROUNDS):
+        null = whitened.together.null
+        if not len(null):
+            break
+        # least squares of what the leaders are away from home, over shifts along the null
+        # directions, which turn as one moves: in steps with a new null space each
+        away = ((vector - origin) / scale)[leaders]
+        step = np.linalg.lstsq(null[:, leaders].T, -away, rcond=1e-6)[0] @ null
+        step *= min(1.0, _LONGEST / max(np.abs(step).max(), 1e-300))
+        if np.abs(step[leaders]).max() < _SETTLED:
+            break
+        # a straight step leaves the curved surface of equal fits; the bins find back to it
+        trial = np.clip(vector + step * scale, low, high)
+        trial, _ = problem.polish(trial, iterations=8, still_gaining=1 - 1e-12)
+        before, after = (0.5 * np.sum(problem.residuals(x) ** 2) for x in (vector, trial))
+        # noise-free data are fitted to rounding: there, a share of nothing is nothing
+        if after > (1 + _SPOILT) * before + 1e-12 * measurement.n_data:
+            break
+        vector, whitened = trial, problem.around(trial)
+    measurement.stand_at(vector)
+    return whitened
+
+
+def open_parameters(free, whitened):
+    """Return the parameters common to all wavelengths that data and priors do not determine."""
+    known = whitened.together.determined
+    moving = [slot for slot in free.slots if not known[slot.slice].all()]
+    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
+
+
+def hold_silent(measurement, origin):
+    """Put back to the start what ended elsewhere although it changes no datum."""
+    vector, scale = measurement.vector(), physical_scale(measurement.free)
+    slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
+    still = (slopes < _SILENT) & (vector != origin)
+    for slot, prior in measurement.free.priors:
+        # a prior that is not flat has put it where it belongs
+        still[slot.slice] &= prior.is_flat
+    predicted = measurement.predict(vector)
+    for i in np.flatnonzero(still):
+        trial = vector.copy()
+        trial[i] = origin[i]
+        if np.abs(measurement.predict(trial) - predicted).max() < _SILENT:
+            vector = trial
+    if still.any():
+        measurement.stand_at(vector)
+
+
+def describe_gauge(gauge, chosen, free, held):
+    """Say which of the equivalent solutions a calibration reports, and why.
+
+    ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
+    """
+    parts = [f"held: {', '.join(held)}"] if held else []
+    if free.priors:
+        parts.append(f"prior on {', '.join(slot.name for slot, _ in free.priors)}")
+    if not chosen:
+        known = "data and priors determine" if free.priors else "the data determine"
+        parts.append(f"{known} every free parameter")
+    elif gauge is None:
+        parts.append(f"none for {', '.join(chosen)}: where the fit ended, an accident of its start")
+    else:
+        parts.append(f"minimal: of all equal fits, the least change of {', '.join(chosen)}")
+    return "; ".join(parts)
 
 
 # ---- the result ------------------------------------------------------------------
@@ -548,18 +406,23 @@ def _robust(measurement, fitter, loss, outcome):
 
 def _result(measurement, whitened, *, settings, fit, stages, cross_validate, covariance=None):
     """Return the calibration; ``covariance`` is that of more data than its own."""
-    vector = measurement.vector()
-    residuals, level = measurement.residuals(vector), measurement.weighting.level
+    vector, names = measurement.vector(), measurement.free.names
+    residuals, weighting = measurement.residuals(vector), measurement.weighting
     finding = finding_of(measurement.free, whitened)
     view = view_of_measurement(measurement, vector, settings["instrument"])
-    complete(finding, measurement, vector, whitened, level, view=view)
-    names = measurement.free.names
-    own, lacking = _errors(measurement, whitened, settings["errors"])
-    covariance = own if covariance is None else covariance
+    complete(finding, measurement, vector, whitened, weighting.level, view=view)
+    # the error of the model at a new setting
+    lacking = None
+    if settings["errors"] == "white":
+        own = white_covariance(measurement, whitened, weighting)
+    else:
+        scatter = Scatter(measurement, weighting, whitened)
+        own = covariance_around(measurement, whitened, weighting, scatter)
+        lacking = model_error(measurement, scatter)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
-        covariance=covariance,
+        covariance=own if covariance is None else covariance,
         identifiability=finding,
         at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
@@ -568,38 +431,38 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         ties=dict(measurement.free.ties),
         stages=stages,
         measurement=measurement,
-        provenance=_provenance(),
+        provenance={
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "astropolcal": version,
+            "astropy": astropy.__version__,
+            "numpy": np.__version__,
+            "scipy": installed("scipy"),
+            "python": platform.python_version(),
+        },
     )
     observations = (dataset.observations for dataset in measurement.datasets)
-    calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
-    calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
-    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
-    calibration.fit["outliers"] = _outliers(calibration)
-    calibration.fit["model_error"] = lacking
+    fit["masked"] = [dict(each.mask_reasons) for each in observations]
+    fit["bounds"] = errors_at_bounds(measurement, whitened)
+    fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
+    # the pairs of frames at odds with the fit, for summary, JSON and file
+    outliers = columns(outlying_data(calibration))
+    rows = zip(*outliers.values(), strict=True)
+    fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
+    fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
     stage("cross-validation")
     return calibration.cross_validate() if cross_validate else calibration
 
 
-def _errors(measurement, whitened, how):
-    """Return the covariance of the parameters, and the error of the model at a new setting."""
-    if how == "white":
-        return white_covariance(measurement, whitened, measurement.weighting), None
-    scatter = Scatter(measurement, measurement.weighting, whitened)
-    covariance = covariance_around(measurement, whitened, measurement.weighting, scatter)
-    return covariance, model_error(measurement, scatter)
-
-
 def _lack_of_fit(calibration, whitened):
     """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
-    live = calibration.measurement
-    for method in (noise_from_errors, _noise_of_frames):
+    # as the table states it first
+    for noise in reversed([*known_noises(calibration.measurement)]):
         try:
-            noise = method(live)
-            test = lack_of_fit(live, calibration, noise, whitened=whitened)
+            test = lack_of_fit(calibration.measurement, calibration, noise, whitened=whitened)
         except AstropolcalError:
-            continue  # no errors in the table, or too few frames: nothing to hold against
+            continue  # too few data: nothing to hold against
         # unknown where no degree of freedom is left
         ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(
@@ -614,29 +477,6 @@ def _lack_of_fit(calibration, whitened):
     return found
 
 
-def _noise_of_frames(measurement):
-    """Return the noise that a diagnosis compares with; of few wavelengths that of the null."""
-    try:
-        return noise_from_roughness(measurement)
-    except FitError:
-        return noise_from_null_channel(measurement, null_model="smooth")
-
-
-def _outliers(calibration):
-    """Return the pairs of frames at odds with the fit, for summary, JSON and file."""
-    table = outlying_data(calibration)
-    return [
-        {
-            "dataset": str(row["dataset"]),
-            "frames": str(row["frames"]),
-            "residual_percent": float(row["residual"].to_value("percent")),
-            "sigma": float(row["sigma"]),
-            "brightness": float(row["brightness"]),
-        }
-        for row in table
-    ]
-
-
 def _record(measurement, i, residuals):
     observations = measurement.datasets[i].observations
     return DatasetRecord(
@@ -648,14 +488,3 @@ def _record(measurement, i, residuals):
         n_masked=int(observations.mask.sum()),
         accuracy=accuracy_table(measurement, i, residuals),
     )
-
-
-def _provenance():
-    return {
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "astropolcal": version,
-        "astropy": astropy.__version__,
-        "numpy": np.__version__,
-        "scipy": installed("scipy"),
-        "python": platform.python_version(),
-    }

@@ -27,9 +27,10 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.calibration.fit.calibrate import ERRORS, _result, _stands_out, _Strategy
+from astropolcal.calibration.fit.calibrate import ERRORS, _result
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
+from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import (
     STILL,
@@ -261,7 +262,7 @@ class _Run:
         self.scatter = scatter if scatter is not None and scatter.is_known else None
         #: Of the fit of this run alone, canonical.
         self.fitted, self.level = measurement.vector(), weighting.level
-        self.stands_out = _stands_out(measurement)
+        self.stands_out = stands_out(measurement)
         if not np.isfinite(self.level):
             raise FitError(f"{tables[0].name}: no datum is left over to tell the noise of the run")
         # noise that rounding alone makes would give a run all the weight
@@ -277,10 +278,10 @@ class _Run:
             first = np.clip(first, *measurement.free.bounds())
             problem = Problem(measurement, weighting.started(measurement))
             measurement.stand_at(problem.fit(first)[0])
-            if not _stands_out(measurement):
+            if not stands_out(measurement):
                 return
             measurement.stand_at(measurement.free.start())
-        _Strategy(TRFLSQFitter(), True, None, options).fit("joint", measurement, weighting)
+        joint(measurement, weighting, TRFLSQFitter(), True, options)
 
     def around(self, vector):
         """Return the rows of the run around canonical values, in steps of a degree or so."""

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Starts, steps and gauges of a fit.
+Fits in place: their starts, the way to the minimum, and fits in steps.
 
 Starts: with the global parameters held, the bins of a calibration are independent of each other. So
 all are searched at once: a coarse scan along the main retardance of each optic finds the valleys,
@@ -10,26 +10,36 @@ start for the joint fit, and later a check whether a bin sits in the wrong valle
 Steps, each of which holds what the steps before have found. Two-step: the polarized internal source
 as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
 from the polarized source to the unpolarized one and to the star.
-
-Gauge: where the data do not determine all directions, every point along them fits equally well, and
-where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
-parameters common to all wavelengths (the misalignments) have moved least from where they started. A
-user names another gauge by holding parameters (``fix=``) or by a prior.
 """
 
-from itertools import groupby
+import warnings
+from functools import partial
 
 import astropy.units as u
 import numpy as np
+from astropy.modeling.fitting import TRFLSQFitter
+from astropy.utils.exceptions import AstropyWarning
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
+from astropolcal.calibration.noise.estimates import (
+    noise_from_errors,
+    noise_from_null_channel,
+    noise_from_roughness,
+)
 from astropolcal.calibration.noise.scatter import kind_of_source
-from astropolcal.calibration.noise.weighting import Problem
+from astropolcal.calibration.noise.weighting import (
+    ROUNDS,
+    TALL,
+    Problem,
+    Weighting,
+    first_weighting,
+    noise_of,
+)
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import FitError
+from astropolcal.exceptions import AstropolcalError, FitError
+from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.progress import steps
-from astropolcal.words import check_choice
+from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.progress import stage, steps
 
 __all__ = []
 
@@ -46,6 +56,20 @@ _STUCK = 1.0
 _LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
 # starts whose sums of squares differ by less are the same
 _APART = 1.001
+_MAX_EVALUATIONS = 500
+_MAX_ROUNDS = 4
+# residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
+# one counts that leaves less than this share
+_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
+# nor is one tried that leaves so many times as much before everything is fitted, or is not better
+# after so many evaluations
+_HOPELESS, _GLANCE = 100.0, 15
+# of data without noise, residuals below this are rounding
+_ROUNDED = 1e-6
+# branches are searched in so many groups of frames of a dataset, if it has several times as many
+_FEW, _LONG = 256, 4
+# a wavelength in the branch of its neighbours may have up to so many times the sum of squares
+_WORTH = 3.0
 
 
 class BinProblem(Problem):
@@ -60,20 +84,22 @@ class BinProblem(Problem):
         self.n_bins = len(measurement.wavelength)
         # with a single bin every parameter belongs to it
         self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
-        self._data, self._present = _data_of_bins(measurement, self.n_bins)
+        # the data of each bin, padded, and which of them are real
+        counts = np.bincount(measurement.bins, minlength=self.n_bins)
+        self._present = np.arange(counts.max()) < counts[:, None]
+        self._data = np.zeros(self._present.shape, dtype=int)
+        self._data[self._present] = np.argsort(measurement.bins, kind="stable")
         starts = np.array([slot.start for slot in self.slots], dtype=int)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
         self.elements = starts[:, None] + np.arange(self.n_bins)
         self._below, self._above = self._low[self.elements], self._high[self.elements]
         rows = {slot.name: row for row, slot in enumerate(self.slots)}
-        tight = [(slot, prior) for slot, prior in measurement.free.priors if not prior.is_flat]
-        self._priors = [(rows[slot.name], prior) for slot, prior in tight if slot.name in rows]
-        self._common = [(slot, prior) for slot, prior in tight if slot.name not in rows]
-
-    @property
-    def has_priors(self):
-        """Whether priors that are not flat enter the costs of the bins."""
-        return bool(self._priors)
+        #: Priors that enter the costs of the bins, with the slot of each.
+        self.priors = [
+            (rows[slot.name], prior)
+            for slot, prior in measurement.free.priors
+            if slot.name in rows and not prior.is_flat
+        ]
 
     def of_bins(self, vector):
         """Return weighted residuals by bin, zero where a bin has fewer data."""
@@ -84,16 +110,12 @@ class BinProblem(Problem):
     def costs(self, vector):
         """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
         costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
-        for row, prior in self._priors:
+        for row, prior in self.priors:
             costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs
 
-    def total(self, vector):
-        """Return half the sum of squares of all data and priors."""
-        common = [prior.residual(vector[slot.slice]) for slot, prior in self._common]
-        return self.costs(vector).sum() + 0.5 * self.noise**2 * sum(np.sum(r**2) for r in common)
-
-    def _normal_equations(self, vector):
+    def _step(self, vector, damping):
+        """Return the per-wavelength parameters after a damped step, within their bounds."""
         jacobian = self.measurement.jacobian(vector) * self.weights
         # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
@@ -101,12 +123,24 @@ class BinProblem(Problem):
         residual = self.of_bins(vector)
         normal = blocks @ np.swapaxes(blocks, 1, 2)
         gradient = np.einsum("bsd,bd->bs", blocks, residual)
-        for row, prior in self._priors:
+        for row, prior in self.priors:
             value = vector[self.elements[row]]
             slope = self.noise * prior.slope(value)
             normal[:, row, row] += slope**2
             gradient[:, row] += slope * self.noise * prior.residual(value)
-        return normal, gradient
+        here = vector[self.elements]
+        held = (
+            ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
+        ).T
+        # a parameter that leans against its bound must not slow down the others
+        normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
+        gradient = np.where(held, 0.0, gradient)
+        size = normal.shape[-1]
+        diagonal = np.einsum("bss->bs", normal)
+        # relative to the diagonal (Marquardt), plus a little for what changes nothing
+        ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
+        step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
+        return np.clip(here - step[..., 0].T, self._below, self._above)
 
     def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
         """Improve the per-wavelength parameters by batched Levenberg-Marquardt.
@@ -131,22 +165,6 @@ class BinProblem(Problem):
             if not np.any(gaining | (~better & (damping < _STUCK))):
                 break
         return vector, costs
-
-    def _step(self, vector, damping):
-        normal, gradient = self._normal_equations(vector)
-        here = vector[self.elements]
-        held = (
-            ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
-        ).T
-        # a parameter that leans against its bound must not slow down the others
-        normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
-        gradient = np.where(held, 0.0, gradient)
-        size = normal.shape[-1]
-        diagonal = np.einsum("bss->bs", normal)
-        # relative to the diagonal (Marquardt), plus a little for what changes nothing
-        ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
-        step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
-        return np.clip(here - step[..., 0].T, self._below, self._above)
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""
@@ -206,28 +224,6 @@ def search_branches(problem, vector, origin=None):
     return best, moved
 
 
-def smooth_branches(problem, vector):
-    """
-    Return a vector with single bins in the branch of their neighbours, and which bins moved there.
-
-    Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
-    well. Any error of the model then decides between them; their neighbours tell which is true.
-    """
-    start, moved = vector.copy(), np.zeros(problem.n_bins, dtype=bool)
-    for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
-        where = problem.elements[row]
-        turned = _turned(problem.measurement.wavelength, vector[where], low, high)
-        start[where] = np.where(np.isfinite(turned), turned, vector[where])
-        moved |= np.isfinite(turned)
-    if not moved.any():
-        return vector, moved
-    start, costs = problem.polish(start)
-    moved &= costs < _FAR_WORSE * problem.costs(vector)
-    best = vector.copy()
-    best[problem.elements[:, moved]] = start[problem.elements[:, moved]]
-    return best, moved
-
-
 def _turned(wavelength, phases, low, high):
     """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
     found = np.full(len(phases), np.nan)
@@ -274,15 +270,224 @@ def other_laws(problem, vector, origin):
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
 
 
-def _data_of_bins(measurement, n_bins):
-    """Return the data of each bin, padded, and which of them are real."""
-    bins = measurement.bins
-    counts = np.bincount(bins, minlength=n_bins)
-    order = np.argsort(bins, kind="stable")
-    present = np.arange(counts.max()) < counts[:, None]
-    data = np.zeros(present.shape, dtype=int)
-    data[present] = order
-    return data, present
+# ---- fits in place --------------------------------------------------------------
+
+
+def run(measurement, weighting, fitter):
+    """Fit in place until the noise agrees with the residuals; return how it went, and the noise."""
+    # one level for all data does not move the minimum, unless priors weigh against them
+    told = weighting.choice == "wavelength" or (weighting.from_residuals and measurement.n_priors)
+    if not told:
+        return fit_once(measurement, weighting, fitter), weighting
+    if not weighting.is_known:
+        weighting = weighting.started(measurement)
+    # noise from the residuals of a fit whose weights come from that noise: a fixed point
+    for _ in range(ROUNDS):
+        outcome = fit_once(measurement, weighting, fitter)
+        before, weighting = weighting, weighting.updated(measurement)
+        if not np.isfinite(weighting.sigma).all():
+            raise FitError(
+                f"{measurement.free.size} free parameters and {measurement.n_data} data leave none "
+                "for the noise, against which priors weigh; fix some, add frames, or take "
+                "weights='errors'"
+            )
+        if weighting.agrees(before):
+            return outcome, weighting
+    message = f"the noise from the residuals did not settle in {ROUNDS} fits"
+    return outcome | {"converged": False, "message": message}, weighting
+
+
+def fit_once(measurement, weighting, fitter):
+    """Fit in place; return whether it arrived, what it said, and how long it took."""
+    stage(f"fitting {measurement.free.size} parameters")
+    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL:
+        # the same steps by triangular factors, for which the fitter has no place
+        vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
+        measurement.stand_at(vector)
+        return {
+            "converged": found.success,
+            "message": found.message,
+            "evaluations": int(found.nfev),
+        }
+    index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
+    canonical = measurement.canonical()
+    with warnings.catch_warnings(record=True) as caught:
+        # recorded, not shown: whether the fit arrived is told once, in the words of this package
+        warnings.simplefilter("always", AstropyWarning)
+        try:
+            fitter(
+                canonical,
+                index,
+                observed,
+                weights=weights,
+                maxiter=_MAX_EVALUATIONS,
+                inplace=True,
+            )
+        except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+            said = one_line(str(error))
+            raise FitError(f"{type(fitter).__name__} failed: {said}") from error
+    measurement.stand_at(canonical.vector())
+    info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
+    said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]
+    outside = outside_bounds(measurement)
+    if outside:
+        said.append(f"{type(fitter).__name__} left the bounds of {', '.join(outside)}")
+    evaluations = info.get("nfev")
+    return {
+        "converged": not said,
+        "message": said[-1] if said else str(info.get("message", "")).strip(),
+        "evaluations": None if evaluations is None else int(evaluations),
+    }
+
+
+def outside_bounds(measurement):
+    """Return the names of parameters that a fitter without bounds left outside of theirs."""
+    low, high = measurement.free.bounds()
+    vector = measurement.vector()
+    # a fitter that minds the bounds ends on them only as exactly as rounding allows
+    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
+    outside = (vector < low - slack) | (vector > high + slack)
+    return [measurement.free.names[i] for i in np.flatnonzero(outside)]
+
+
+def joint(measurement, weighting, fitter, search, options=None):
+    """Fit everything; where the residuals stand out, from other values of its laws, too.
+
+    With ``options`` of the measurement what only stars see is fitted by itself first.
+    """
+    origin = measurement.vector()
+    how = fitter, search, options, origin
+    best = _descend(measurement, weighting, *how)
+    if not search or not stands_out(measurement):
+        return best
+    found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
+    least = np.sum(problem.residuals(found) ** 2)
+    for promised, start in other_laws(problem, found, origin)[:_STARTS]:
+        if promised > _HOPELESS * least:
+            break
+        # most starts lead to the minimum that is known, or crawl towards one that is no better:
+        # a few steps of everything tell
+        start = problem.fit(start, evaluations=_GLANCE)[0]
+        start, moved = search_branches(problem, start, origin)
+        if moved.any():
+            start = problem.fit(start, evaluations=_GLANCE)[0]
+        if np.sum(problem.residuals(start) ** 2) >= _BETTER * least:
+            continue
+        measurement.stand_at(start)
+        outcome = _descend(measurement, weighting, *how, is_searched=True)
+        left = np.sum(problem.residuals(measurement.vector()) ** 2)
+        if left < _BETTER * least:
+            best, found, least = outcome, measurement.vector(), left
+            if not stands_out(measurement):
+                break
+    measurement.stand_at(found)
+    return best
+
+
+def known_noises(measurement):
+    """Yield the noise that single frames show, and that which the table states, if they do."""
+    # of few wavelengths the noise is that of the null channel
+    smooth = partial(noise_from_null_channel, null_model="smooth")
+    for methods in ((noise_from_roughness, smooth), (noise_from_errors,)):
+        for method in methods:
+            try:
+                yield method(measurement)
+                break
+            except AstropolcalError:
+                continue  # few wavelengths, or no errors in the table
+
+
+def stands_out(measurement):
+    """Whether the residuals are far above the noise that the frames show, or the table states."""
+    residuals = measurement.residuals()
+    for noise in known_noises(measurement):
+        pulls = residuals / np.maximum(noise.sigma_of_data, _ROUNDED)
+        return bool(np.mean(pulls**2) > _STANDS_OUT**2)
+    return False
+
+
+def _descend(measurement, weighting, fitter, search, options, origin, is_searched=False):
+    """Fit everything; go on as long as some bin finds a better mirror branch."""
+    small, noise = _thinned(measurement, weighting)
+    if search and not is_searched:
+        stage("looking for where to start")
+        problem = BinProblem(small, noise)
+        found = search_branches(problem, origin)[0]
+        small.stand_at(found)
+        # where no noise is known yet, the first search is one without the priors
+        if problem.priors and not noise.is_known:
+            problem = BinProblem(small, noise.started(small))
+            small.stand_at(search_branches(problem, origin)[0])
+    alone = options and telescope_alone(small, options)
+    if alone:
+        # the law of a telescope's mirror is nearly degenerate: cheap steps with the rest held
+        run(alone, first_weighting(alone, None), fitter)
+        _copy_fitted(alone, small)
+    # branches are found on few frames, so the long table starts from their fit
+    if small is not measurement:
+        run(small, noise, fitter)
+        measurement.stand_at(small.vector())
+    for left in reversed(range(_MAX_ROUNDS)):
+        outcome, weighting = run(measurement, weighting, fitter)
+        # the last word belongs to the fit of all parameters, not to a search by bin
+        if not search or not left:
+            break
+        small, noise = _thinned(measurement, weighting)
+        better, moved = search_branches(BinProblem(small, noise), small.vector(), origin)
+        if not moved.any():
+            break
+        measurement.stand_at(better)
+    return _smoothed(measurement, weighting, fitter, outcome) if search else (outcome, weighting)
+
+
+def _smoothed(measurement, weighting, fitter, outcome):
+    """
+    Fit again with single wavelengths in the branch of their neighbours, if nearly as good.
+
+    Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
+    well. Any error of the model then decides between them; their neighbours tell which is true.
+    """
+    problem, found = BinProblem(*_thinned(measurement, weighting)), measurement.vector()
+    start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
+    for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
+        where = problem.elements[row]
+        turned = _turned(measurement.wavelength, found[where], low, high)
+        start[where] = np.where(np.isfinite(turned), turned, found[where])
+        moved |= np.isfinite(turned)
+    if not moved.any():
+        return outcome, weighting
+    before, (start, costs) = problem.costs(found), problem.polish(start)
+    moved &= costs < _FAR_WORSE * before
+    if not moved.any():
+        return outcome, weighting
+    best = found.copy()
+    best[problem.elements[:, moved]] = start[problem.elements[:, moved]]
+    measurement.stand_at(best)
+    again = run(measurement, weighting, fitter)
+    if np.all(problem.costs(measurement.vector())[moved] < _WORTH * before[moved]):
+        return again
+    measurement.stand_at(found)
+    return outcome, weighting
+
+
+def _turned(wavelength, phases, low, high):
+    """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
+    found = np.full(len(phases), np.nan)
+    for i in range(1, len(phases) - 1):
+        beside = np.interp(wavelength[i], wavelength[[i - 1, i + 1]], phases[[i - 1, i + 1]])
+        off = abs(phases[i] - beside)
+        for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
+            if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
+                found[i] = other
+    return found
+
+
+def _thinned(measurement, weighting):
+    """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
+    if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
+        return measurement, weighting
+    small, kept = measurement.thinned(_FEW)
+    return small, Weighting(weighting.choice, weighting.sigma[kept])
 
 
 # ---- calibrations in steps, each of which holds what the steps before have found ----
@@ -291,81 +496,65 @@ def _data_of_bins(measurement, n_bins):
 _ORDER = ("polarized", "unpolarized", "star")
 
 
-def two_step(measurement, weighting, joint, run, options):
+def two_step(measurement, weighting, fitter, search, options):
     """Fit per wavelength with misalignments held, then global, then per wavelength again.
 
-    ``joint`` and ``run`` fit a measurement in place, with and without a search of branches. Returns
-    how it went, the noise, and the values after each step.
+    Returns how the steps went, the noise, and the values after each step.
     """
-    parts = [dataset.observations for dataset in measurement.datasets]
-    _check_polarized(parts)
+    sources = [dataset.observations.source for dataset in measurement.datasets]
+    if "polarized" not in map(kind_of_source, sources):
+        raise FitError(
+            "strategy 'two-step' is for a polarized source, but the source is "
+            f"{', '.join(sorted(set(map(repr, sources))))}; allowed here are 'joint' and "
+            "'sequential'"
+        )
     single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
     several = {slot.name for slot in measurement.free.slots if slot.per_wavelength}
-    ties = measurement.free.ties
-    measurement.put_back()
-    options = options | {"wavelength": measurement.wavelength * u.um}
-    stages = []
-
-    # in the first step each wavelength has its own retardance, also of a plate that follows a law
     grid = measurement.wavelength * u.um
-    loose = [join(leaf.loosened(grid) for leaf in leaves(c.copy())) for c in measurement.chains]
-    first = _step_of(loose, single, parts, ties, options)
-    outcome, weighting = joint(first, weighting)
-    outcomes = [outcome]
-    stages.append(_stage("per wavelength, misalignments held", first))
-    _copy_values(first.put_back(), measurement.chains)
-
-    for title, held in (("global", several), ("per wavelength, global parameters held", single)):
-        step = _step_of(measurement.chains, held, parts, ties, options)
-        if step.free.size:
-            outcome, weighting = run(step, weighting)
-            outcomes.append(outcome)
-        stages.append(_stage(title, step))
-        _copy_values(step.put_back(), measurement.chains)
-    measurement.stand_at(measurement.free.start())
-    return _worst(outcomes), weighting, stages
-
-
-def _check_polarized(parts):
-    if not any(kind_of_source(part.source) == "polarized" for part in parts):
-        stated = ", ".join(sorted({repr(part.source) for part in parts}))
-        raise FitError(
-            f"strategy 'two-step' is for a polarized source, but the source is {stated}; "
-            "allowed here are 'joint' and 'sequential'"
-        )
+    # in the first step each wavelength has its own retardance, also of a plate that follows a law
+    loose = [join(leaf.loosened(grid) for leaf in leaves(c)) for c in measurement.put_back()]
+    outcomes, stages = [], []
+    for title, held in (
+        ("per wavelength, misalignments held", single),
+        ("global", several),
+        ("per wavelength, global parameters held", single),
+    ):
+        chains = measurement.put_back() if stages else loose
+        step = _step_of(measurement, chains, held, options)
+        if not stages:
+            outcome, weighting = joint(step, weighting, fitter, search)
+        elif step.free.size:
+            outcome, weighting = run(step, weighting, fitter)
+        outcomes.append(outcome)
+        stages.append(_taken(title, step, measurement))
+    return outcomes, weighting, stages
 
 
-def sequential(measurement, weights, joint, run, options):
+def sequential(measurement, weights, fitter, search, options):
     """Fit one kind of source after another and hold what was found: polarized, unpolarized, stars.
 
     Errors of the steps before do not enter the later ones, and later data do not improve what is
-    held: that is the paper's procedure. ``weights`` returns the first weighting of the measurement
-    of a step.
+    held: that is the paper's procedure. Returns the same as `two_step`.
     """
-    measurement.put_back()
-    ties, chains = measurement.free.ties, measurement.chains
-    positions = options["positions"] or [None] * len(chains)
-    options = options | {"wavelength": measurement.wavelength * u.um}
-    parts = [d.observations for d in measurement.datasets]
-    kinds = [kind_of_source(o.source) for o in parts]
-    # stable: datasets of one kind keep their order
-    order = sorted(range(len(parts)), key=lambda i: _ORDER.index(kinds[i]))
+    if weights is not None and not isinstance(weights, str):
+        raise FitError(
+            "strategy='sequential' fits the datasets one by one, so the noise cannot be given "
+            "for all data; allowed are weights = None, 'wavelength', 'errors'"
+        )
+    kinds = [kind_of_source(dataset.observations.source) for dataset in measurement.datasets]
     held, outcomes, stages = set(), [], []
-    for kind, group in groupby(order, key=lambda i: kinds[i]):
-        rows = list(group)
-        own = [chains[i] for i in rows]
-        known = {"positions": [positions[i] for i in rows]}
-        present = {n: tie for n, tie in ties.items() if n in parameter_table(own)}
-        step = _step_of(own, held, [parts[i] for i in rows], present, options | known)
+    for kind in (kind for kind in _ORDER if kind in kinds):
+        rows = [i for i, own in enumerate(kinds) if own == kind]
+        step = _step_of(measurement, measurement.put_back(), held, options, rows)
         if step.free.size:
-            outcome, _ = (run if stages else joint)(step, weights(step))
-            outcomes.append(outcome)
-        stages.append(_stage(f"{kind}, what came before held" if stages else kind, step))
-        _copy_values(step.put_back(), chains)
+            weighting = first_weighting(step, weights)
+            how = (fitter,) if stages else (fitter, search)
+            outcomes.append((run if stages else joint)(step, weighting, *how)[0])
+        title = f"{kind}, what came before held" if stages else kind
+        stages.append(_taken(title, step, measurement))
         # what this step has found is known for the next ones
         held |= {slot.name for slot in step.free.slots}
-    measurement.stand_at(measurement.free.start())
-    return _worst(outcomes), stages
+    return outcomes, noise_of(measurement, weights), stages
 
 
 def telescope_alone(measurement, options):
@@ -374,28 +563,39 @@ def telescope_alone(measurement, options):
     Such parameters can be nearly degenerate, so that a fit takes hundreds of steps; with all others
     held these are cheap. None where there is nothing of the kind.
     """
-    chains, parts = measurement.put_back(), [d.observations for d in measurement.datasets]
-    seen = [kind_of_source(part.source) == "star" for part in parts]
-    rows = [i for i, star in enumerate(seen) if star]
-    if not rows or all(seen):
+    seen = [kind_of_source(dataset.observations.source) for dataset in measurement.datasets]
+    rows = [i for i, kind in enumerate(seen) if kind == "star"]
+    if len(rows) in (0, len(seen)):
         return None
+    chains = measurement.put_back()
     # what a lamp sees as well is found better with it
-    lamps = {name for i, star in enumerate(seen) if not star for name in parameter_table(chains[i])}
-    own = {s.name for s in measurement.free.slots if not s.per_wavelength} - lamps
+    lamps = parameter_table([c for c, kind in zip(chains, seen, strict=True) if kind != "star"])
+    own = {s.name for s in measurement.free.slots if not s.per_wavelength} - set(lamps)
     # what has a prior is not degenerate
     if own <= {slot.name for slot, _ in measurement.free.priors}:
         return None
     held = {slot.name for slot in measurement.free.slots} - own
-    positions = options["positions"]
-    options = options | {
-        "wavelength": measurement.wavelength * u.um,
-        "positions": None if positions is None else [positions[i] for i in rows],
-    }
-    stars = [chains[i] for i in rows]
-    return _step_of(stars, held, [parts[i] for i in rows], measurement.free.ties, options)
+    return _step_of(measurement, chains, held, options, rows)
 
 
-def copy_fitted(origin, target):
+def _step_of(measurement, chains, held, options, rows=None):
+    """Return the measurement of one step; what follows a held parameter is held too."""
+    rows, ties = range(len(chains)) if rows is None else rows, measurement.free.ties
+    copies = [chains[i].copy() for i in rows]
+    table = parameter_table(copies)
+    # a tie needs a source that is free in this step
+    live = {n: tie for n, tie in ties.items() if {n, tie.source} <= set(table) - held}
+    for name in (held | set(ties) - set(live)) & set(table):
+        for parameter in table[name]:
+            parameter.fixed = True
+    parts = [measurement.datasets[i].observations for i in rows]
+    given = options.get("positions")
+    own = {"positions": given and [given[i] for i in rows]}
+    own["wavelength"] = measurement.wavelength * u.um
+    return Measurement(copies, parts, ties=live, copy=False, **(options | own))
+
+
+def _copy_fitted(origin, target):
     """Give the measurement ``target`` the values that ``origin`` has found, name by name."""
     vector = target.vector()
     for slot in origin.free.slots:
@@ -405,154 +605,10 @@ def copy_fitted(origin, target):
     target.stand_at(vector)
 
 
-def _worst(outcomes):
-    """Return the first step that did not converge, which makes the next useless, or the last."""
-    return next((o for o in outcomes if not o["converged"]), outcomes[-1])
-
-
-def _step_of(chains, held, parts, ties, options):
-    """Return the measurement of one step; what follows a held parameter is held too."""
-    known = set(parameter_table(chains))
-    # a tie needs a source that is free in this step
-    live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
-    return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
-
-
-def _held(chains, names):
-    """Return copies of the chains with more parameters fixed."""
-    copies = [chain.copy() for chain in chains]
-    for name, parameters in parameter_table(copies).items():
-        if name in names:
-            for parameter in parameters:
-                parameter.fixed = True
-    return copies
-
-
-def _copy_values(origin, target):
-    """Copy the values of parameters that both have, name by name."""
-    known = parameter_table(origin)
-    for name, parameters in parameter_table(target).items():
-        for parameter in parameters:
-            if name in known and np.shape(known[name][0].value) == np.shape(parameter.value):
-                parameter.value = known[name][0].value
-
-
-def _stage(title, measurement):
-    """Record the values of one stage, with units, and its residuals."""
-    measurement.put_back()
-    values = {slot.name: measurement.free.values_of(slot.name) for slot in measurement.free.slots}
-    rms = float(np.sqrt(np.mean(measurement.residuals() ** 2)))
+def _taken(title, step, measurement):
+    """Take over what a step has found; return its values, with units, and its residuals."""
+    _copy_fitted(step, measurement)
+    step.put_back()
+    values = {slot.name: step.free.values_of(slot.name) for slot in step.free.slots}
+    rms = float(np.sqrt(np.mean(step.residuals() ** 2)))
     return {"title": title, "parameters": values, "residual_rms": rms}
-
-
-# ---- choice of a gauge: one of the solutions that the data cannot tell apart ----
-
-
-GAUGES = ("minimal", None)
-_ROUNDS = 6
-# a gauge is reached when the leading parameters would move by less (deg, um, percent)
-_SETTLED = 1e-4
-# longest step along an open direction, in the same units: the surface of solutions is curved
-_LONGEST = 2.0
-# the solution is left alone if a move spoils it by more than this share
-_SPOILT = 1e-3
-# what changes the data by less than this (for a degree, micrometre, percent) changes none
-_SILENT = 1e-12
-
-
-def settled(problem, origin):
-    """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
-
-    ``origin`` is where the fit started. Returns the parameters that were not determined, and the
-    linear problem around the new solution.
-    """
-    measurement = problem.measurement
-    vector = measurement.vector()
-    scale, leaders = physical_scale(measurement.free), _leaders(measurement.free)
-    whitened = problem.around(vector)
-    for _ in range(_ROUNDS):
-        null = whitened.together.null
-        if not len(null):
-            break
-        # open directions turn as one moves along them, so in steps with a new null space each
-        step = _step(null, leaders, scale, vector - origin)
-        if np.abs(step[leaders] / scale[leaders]).max() < _SETTLED:
-            break
-        moved = _move(problem, vector, step)
-        if moved is None:
-            break
-        vector = moved
-        whitened = problem.around(vector)
-    measurement.stand_at(vector)
-    return open_parameters(measurement.free, whitened), whitened
-
-
-def open_parameters(free, whitened):
-    """Return the parameters common to all wavelengths that data and priors do not determine."""
-    known = whitened.together.determined
-    moving = [slot for slot in free.slots if not known[slot.slice].all()]
-    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
-
-
-def hold_silent(measurement, origin):
-    """Put back to the start what ended elsewhere although it changes no datum."""
-    vector, scale = measurement.vector(), physical_scale(measurement.free)
-    slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
-    still = (slopes < _SILENT) & (vector != origin)
-    for slot, prior in measurement.free.priors:
-        # a prior that is not flat has put it where it belongs
-        still[slot.slice] &= prior.is_flat
-    predicted = measurement.predict(vector)
-    for i in np.flatnonzero(still):
-        trial = vector.copy()
-        trial[i] = origin[i]
-        if np.abs(measurement.predict(trial) - predicted).max() < _SILENT:
-            vector = trial
-    if still.any():
-        measurement.stand_at(vector)
-
-
-def _leaders(free):
-    """Return the elements whose moves are to be small: those common to all wavelengths."""
-    single = [slot.start for slot in free.slots if not slot.per_wavelength]
-    return np.array(single if single else range(free.size), dtype=int)
-
-
-def _step(null, leaders, scale, moved):
-    """Return the step along the open directions that brings the leaders nearest to home."""
-    # least squares of what the leaders are away from home, over shifts along the null directions
-    along, *_ = np.linalg.lstsq(null[:, leaders].T, -(moved / scale)[leaders], rcond=1e-6)
-    step = along @ null
-    longest = np.abs(step).max()
-    return step * scale * min(1.0, _LONGEST / longest if longest else 1.0)
-
-
-def _move(problem, vector, step):
-    """Take the step and let the bins follow; None where that corrupts the solution."""
-    low, high = problem.measurement.free.bounds()
-    before = problem.total(vector)
-    trial = np.clip(vector + step, low, high)
-    # a straight step leaves the curved surface of equal fits; the bins find back to it
-    trial, _ = problem.polish(trial, iterations=8, still_gaining=1 - 1e-12)
-    # noise-free data are fitted to rounding: there, a share of nothing is nothing
-    spoilt = problem.total(trial) > (1 + _SPOILT) * before + 1e-12 * problem.measurement.n_data
-    return None if spoilt else trial
-
-
-def describe_gauge(gauge, chosen, free, held):
-    """Say which of the equivalent solutions a calibration reports, and why.
-
-    ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
-    """
-    check_choice("gauge", gauge, GAUGES, FitError)
-    parts = [f"held: {', '.join(held)}"] if held else []
-    if free.priors:
-        parts.append(f"prior on {', '.join(slot.name for slot, _ in free.priors)}")
-    if not chosen:
-        known = "data and priors determine" if free.priors else "the data determine"
-        parts.append(f"{known} every free parameter")
-    elif gauge is None:
-        parts.append(f"none for {', '.join(chosen)}: where the fit ended, an accident of its start")
-    else:
-        parts.append(f"minimal: of all equal fits, the least change of {', '.join(chosen)}")
-    return "; ".join(parts)
