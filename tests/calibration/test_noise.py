@@ -276,17 +276,17 @@ def test_too_few_angles_for_the_null_model(make, chain):
         noise_from_null_channel(Measurement(chain, data), null_model="cubic")
 
 
-# --- choice, several datasets, table ------------------------------------------------
+# --- choice, several datasets ------------------------------------------------
 
 
 def test_each_dataset_has_its_own_noise(make, chain, faint):
     brighter = simulate(chain, LAM, make.frames(), seed=9, **(FAINT | {"flux": 1e8}))
     both = Measurement(chain, [faint.datasets[0].observations, brighter])
-    table = noise_from_null_channel(both).table
-    assert table["dataset"].tolist() == [0, 0, 0, 1, 1, 1]
-    np.testing.assert_allclose(table["sigma"][:3], noise_from_null_channel(faint).sigma)
-    assert (table["sigma"][3:] < 0.1 * table["sigma"][:3]).all()
-    assert "upper limit" in table.meta["words"]
+    noise = noise_from_null_channel(both)
+    assert noise.dataset.tolist() == [0, 0, 0, 1, 1, 1]
+    np.testing.assert_allclose(noise.sigma[:3], noise_from_null_channel(faint).sigma)
+    assert (noise.sigma[3:] < 0.1 * noise.sigma[:3]).all()
+    assert "upper limit" in noise.words
 
 
 # --- real measurements --------------------------------------------------------------

@@ -33,7 +33,7 @@ from astropolcal.calibration.fit.strategies import (
     sequential,
     two_step,
 )
-from astropolcal.calibration.identifiability.analysis import complete, finding_of, physical_scale
+from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
@@ -408,9 +408,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     """Return the calibration; ``covariance`` is that of more data than its own."""
     vector, names = measurement.vector(), measurement.free.names
     residuals, weighting = measurement.residuals(vector), measurement.weighting
-    finding = finding_of(measurement.free, whitened)
     view = view_of_measurement(measurement, vector, settings["instrument"])
-    complete(finding, measurement, vector, whitened, weighting.level, view=view)
+    finding = complete(measurement, whitened, weighting.level, view)
     # the error of the model at a new setting
     lacking = None
     if settings["errors"] == "white":

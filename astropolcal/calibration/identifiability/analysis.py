@@ -180,28 +180,27 @@ def examine(measurement, weights=None):
     data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
     whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector))
     level = np.nan if weights is None else 1.0
-    finding = finding_of(free, whitened)
     name = measurement.datasets[0].observations.instrument
     view = view_of_measurement(measurement, vector, name)
-    return complete(finding, measurement, vector, whitened, level, view=view)
+    return complete(measurement, whitened, level, view)
 
 
-def complete(finding, measurement, vector, whitened=None, level=1.0, *, view=None):
-    """Add to a finding what it means on sky, the sampling and the mirror solutions.
+def complete(measurement, whitened, level, view):
+    """Return the finding with what it means on sky, the sampling and the mirror solutions.
 
-    With the problem ``whitened`` around the solution also the directions that are badly determined
-    for the noise ``level`` of a datum of weight one.
+    The problem ``whitened`` around the present values gives the directions that are badly
+    determined for the noise ``level`` of a datum of weight one, if that is known.
     """
-    free = measurement.free
+    free, vector = measurement.free, measurement.vector()
+    finding = finding_of(free, whitened)
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
     # one degree, micrometre or percent of the leading parameter
     canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
-    view = view_of_measurement(measurement, vector) if view is None else view
     for direction, sky in zip(finding.directions, consequences_along(view, canonical), strict=True):
         if sky is not None:
             direction["sky"] = sky
             direction["words"] += f"; {sky_words(sky)}"
-    if whitened is not None and np.isfinite(level):
+    if np.isfinite(level):
         finding.near_null = near_null_directions(
             free, whitened, level, lambda changes: consequences_along(view, changes)
         )
@@ -213,24 +212,19 @@ def complete(finding, measurement, vector, whitened=None, level=1.0, *, view=Non
         for angle in dataset.observations.position("hwp")
     }
     finding.sampling = harmonic_words(np.array(sorted(angles))) if angles else []
-    finding.sampling += telescope_words(finding, measurement) + _settled_by_a_star(finding, view)
-    finding.branches = mirror_branches(measurement, vector, view)
-    finding.mirrors = [branch["words"] for branch in finding.branches]
-    return finding
-
-
-def _settled_by_a_star(finding, view):
-    """Say which open directions a star of known polarization would close, and which star."""
-    if view is None or view.telescope == LEFT_OUT:
-        return []
+    finding.sampling += telescope_words(finding, measurement)
+    # open directions that a star of known polarization would close
     leads = [
         re.split(" by | changes ", direction["words"])[0]
         for direction in finding.directions
         if "sky" in direction and max(map(abs, direction["sky"]["aolp_deg"])) > _TURNS
     ]
-    if not leads:
-        return []
-    return [f"{', '.join(leads)}: {star_words(view.site)} determines the angle on sky"]
+    if leads and view.telescope != LEFT_OUT:
+        star = star_words(view.site)
+        finding.sampling.append(f"{', '.join(leads)}: {star} determines the angle on sky")
+    finding.branches = mirror_branches(measurement, vector, view)
+    finding.mirrors = [branch["words"] for branch in finding.branches]
+    return finding
 
 
 def physical_scale(free):
@@ -326,28 +320,26 @@ _POOR = 10.0
 
 def harmonic_conditions(angles):
     """Return the condition number of each set of harmonics for plate angles in radian."""
-    return {
-        harmonics: _condition(np.asarray(angles, dtype=float), harmonics) for harmonics, _ in SETS
-    }
-
-
-def _condition(angles, harmonics):
-    columns = []
-    for k in harmonics:
+    found = {}
+    for harmonics, _ in SETS:
         # the frames' brightness or polarization as a Fourier series of the plate angle
-        columns += [np.cos(k * angles), np.sin(k * angles)] if k else [np.ones_like(angles)]
-    singular = np.linalg.svd(np.column_stack(columns), compute_uv=False)
-    if len(angles) < len(columns) or singular[-1] < 1e-12 * singular[0]:
-        return np.inf
-    return float(singular[0] / singular[-1])
+        waves = [
+            wave(k * np.asarray(angles, float)) for k in harmonics for wave in (np.cos, np.sin)
+        ]
+        # harmonic 0 has no sine
+        columns = np.column_stack(waves[:1] + waves[2:])
+        singular = np.linalg.svd(columns, compute_uv=False)
+        poor = len(angles) < columns.shape[1] or singular[-1] < 1e-12 * singular[0]
+        found[harmonics] = np.inf if poor else float(singular[0] / singular[-1])
+    return found
 
 
 def harmonic_words(angles):
     """Say which harmonics plate angles in radian cannot separate, and which angles to add."""
     degrees = np.unique(np.round(np.rad2deg(angles), 3))
-    words = []
+    words, conditions = [], harmonic_conditions(np.deg2rad(degrees))
     for harmonics, origin in SETS:
-        condition = _condition(np.deg2rad(degrees), harmonics)
+        condition = conditions[harmonics]
         if condition > _POOR:
             span = f"{degrees[0]:g} to {degrees[-1]:g} deg"
             new = ", ".join(str(k) for k in harmonics if k not in (0, 4)) or "4"
@@ -392,23 +384,29 @@ def mirror_branches(measurement, vector, view):
     With them the other hand of the whole instrument, if only bounds or models exclude it and it
     matters on sky.
     """
-    retarders = _retarders(measurement)
+    retarders, branches = _retarders(measurement), []
     candidates = [
         (
             f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
-            {name: _other_turn},
+            [name],
+            _other_turn,
         )
         for name in retarders
     ]
-    if retarders:
-        flip = dict.fromkeys(retarders, _other_hand)
-        candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", flip))
-    others = [(words, _mirrored(measurement, vector, edits)) for words, edits in candidates]
-    branches = [{"words": words, "vector": other} for words, other in others if other is not None]
-    for branch in branches:
-        other = branch.pop("vector")
-        chains = None if view is None else measurement.put_back(other)
-        branch["sky"] = view and consequences_of(view, view.with_optics_of(chains))
+    candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", retarders, _other_hand))
+    low, high = measurement.free.bounds()
+    for words, names, edit in candidates:
+        other = np.array(vector, dtype=float)
+        for slots in (retarders[name] for name in names):
+            changed = edit(np.array([vector[slot.slice] for slot in slots]))
+            for slot, values in zip(slots, changed, strict=True):
+                other[slot.slice] = values
+        inside = np.all((other >= low) & (other <= high))
+        change = np.abs(measurement.predict(other) - measurement.predict(vector)).max()
+        if inside and change < _SAME and not np.allclose(other, vector):
+            chains = None if view is None else measurement.put_back(other)
+            sky = view and consequences_of(view, view.with_optics_of(chains))
+            branches.append({"words": words, "sky": sky})
     if not any(_SAME_DATA in branch["words"] for branch in branches):
         branches += _other_instrument(measurement, vector, view)
     for branch in branches:
@@ -464,21 +462,6 @@ def _retarders(measurement):
                 if all(slot is not None for slot in slots):
                     found[leaf.name] = slots
     return found
-
-
-def _mirrored(measurement, vector, edits):
-    """Return the values of a mirror solution, None if it is none."""
-    slots = _retarders(measurement)
-    other = np.array(vector, dtype=float)
-    for name, edit in edits.items():
-        changed = edit(np.array([vector[slot.slice] for slot in slots[name]]))
-        for slot, values in zip(slots[name], changed, strict=True):
-            other[slot.slice] = values
-    low, high = measurement.free.bounds()
-    inside = np.all((other >= low) & (other <= high))
-    moved = not np.allclose(other, vector)
-    same = np.abs(measurement.predict(other) - measurement.predict(vector)).max() < _SAME
-    return other if inside and moved and same else None
 
 
 def _other_turn(retardance):

@@ -241,8 +241,17 @@ def open_directions(free, null):
     """Rewrite open directions so that each is led by one parameter; say them in words."""
     directions = []
     for vector, lead in led(free, null):
-        moved = _moved(free, vector)
-        directions.append({"words": _open_words(free, moved, lead), "parameters": plain(moved)})
+        moved, stem = _moved(free, vector), lead.split("[")[0]
+        others = [_change(free, name, value) for name, value in moved.items() if name != stem]
+        _, size, unit = step_of(free.by_name[stem].unit)
+        words = f"{lead} by +{size:g}{unit} cannot be distinguished from {', '.join(others)}"
+        if not others:
+            with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
+            known = (
+                "by them, only its prior tells it" if with_prior else "and keeps its start value"
+            )
+            words = f"{lead} changes no datum: it cannot be determined {known}"
+        directions.append({"words": words, "parameters": plain(moved)})
     return directions
 
 
@@ -259,51 +268,40 @@ def _moved(free, vector):
 
 
 def led(free, null):
-    """Yield each open direction, led by a parameter that the others do not move."""
+    """Yield each open direction, led by a parameter that the others do not move.
+
+    Those common to all wavelengths come first.
+    """
     if not len(null):
         return
-    leads = _leads(free, null)
-    # a basis in which each leading parameter moves by one step in its own direction only
-    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
-        yield vector, free.names[lead]
-
-
-def _leads(free, null):
-    """Choose a leading parameter for each open direction, those for all wavelengths first."""
-    order = np.argsort(
-        [slot.per_wavelength for slot in free.slots for _ in range(slot.size)], kind="stable"
-    )
-    n_single = sum(not slot.per_wavelength for slot in free.slots)
+    several = np.repeat([s.per_wavelength for s in free.slots], [s.size for s in free.slots])
+    order, n_single = np.argsort(several, kind="stable"), int(np.sum(~several))
     columns, leads = null.copy(), []
     while len(leads) < len(null):
         size = np.linalg.norm(columns, axis=0)
-        single = size[order[:n_single]]
         # the first that moves about as much as any: small changes of the data do not reorder
-        pool = order[:n_single] if single.size and single.max() > 1e-3 else order
+        pool = order[:n_single]
+        if size[pool].max(initial=0.0) <= 1e-3:
+            pool = order
         lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
         direction = columns[:, lead] / size[lead]
         # take out what this lead explains, as in a QR decomposition with pivots
         columns -= np.outer(direction, direction @ columns)
         leads.append(int(lead))
-    return leads
-
-
-def _open_words(free, moved, lead):
-    stem = lead.split("[")[0]
-    others = [_change(free, name, value) for name, value in moved.items() if name != stem]
-    step = step_of(free.by_name[stem].unit)
-    if not others:
-        with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
-        known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
-        return f"{lead} changes no datum: it cannot be determined {known}"
-    return f"{lead} by +{step[1]:g}{step[2]} cannot be distinguished from {', '.join(others)}"
+    # a basis in which each leading parameter moves by one step in its own direction only
+    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
+        yield vector, free.names[lead]
 
 
 def first_of_each_kind(directions):
     """Return the words of open directions; of one at each wavelength, of the first few."""
     kinds = {}
     for direction in directions:
-        kinds.setdefault(_kind(direction), []).append(direction["words"])
+        # what leads and what else moves; a lead for all wavelengths has no likes
+        lead, bracket, _ = direction["words"].partition("[")
+        kind = lead if bracket and " " not in lead else direction["words"]
+        key = (kind, *sorted(direction.get("parameters", ())))
+        kinds.setdefault(key, []).append(direction["words"])
     words = []
     for alike in kinds.values():
         # a line that counts a single one would be as long as that one
@@ -311,13 +309,6 @@ def first_of_each_kind(directions):
         words += alike[:n]
         words += [f"and {len(alike) - n} more of the same kind"] if n < len(alike) else []
     return words
-
-
-def _kind(direction):
-    """Return what leads and what else moves; a lead for all wavelengths has no likes."""
-    lead, bracket, _ = direction["words"].partition("[")
-    is_element = bracket and " " not in lead
-    return (lead if is_element else direction["words"], *sorted(direction.get("parameters", ())))
 
 
 def _change(free, name, value):
@@ -371,31 +362,22 @@ def near_null_directions(free, whitened, level, sky_of):
 def _near_null(free, error, times_large, condition, sky):
     """Return one direction: words, what it changes at one standard error, and on sky."""
     lead = int(ranked(times_large)[0])
-    words = f"{_uncertain(free, free.names[lead], error)} at the noise of this fit"
-    stem = free.names[lead].split("[")[0]
-    much = np.where(times_large > _PART * times_large[lead], error, 0.0)
-    others = [
-        _change(free, name, value) for name, value in _moved(free, much).items() if name != stem
-    ]
+    slot = free.by_name[free.names[lead].split("[")[0]]
+    _, size, unit = step_of(slot.unit)
+    part = np.abs(error[slot.slice]) * size
+    most = part[part > 0.5 * part.max()]
+    words = f"{free.names[lead]} is uncertain by {most[0]:.2g}{unit}"
+    if most.size > 1:
+        words = (
+            f"{slot.name} is uncertain by {most.min():.2g} to {most.max():.2g}{unit} at "
+            f"{most.size} wavelengths together"
+        )
+    words += " at the noise of this fit"
+    moved = _moved(free, np.where(times_large > _PART * times_large[lead], error, 0.0))
+    others = [_change(free, name, value) for name, value in moved.items() if name != slot.name]
     if others:
         words += f", together with {', '.join(others)}"
     if condition > _CONDITION:
         words += f" (condition {condition:.1g})"
     found = {"words": words, "parameters": plain(_moved(free, error))}
-    if sky is not None:
-        found["words"] += f"; {sky_words(sky)}"
-        found["sky"] = sky
-    return found
-
-
-def _uncertain(free, name, error):
-    slot = free.by_name[name.split("[")[0]]
-    _, size, unit = step_of(slot.unit)
-    part = np.abs(error[slot.slice]) * size
-    much = part[part > 0.5 * part.max()]
-    if much.size == 1:
-        return f"{name} is uncertain by {much[0]:.2g}{unit}"
-    return (
-        f"{slot.name} is uncertain by {much.min():.2g} to {much.max():.2g}{unit} at "
-        f"{much.size} wavelengths together"
-    )
+    return found if sky is None else found | {"words": f"{words}; {sky_words(sky)}", "sky": sky}

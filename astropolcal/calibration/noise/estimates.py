@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
@@ -76,13 +75,6 @@ class NoiseEstimate:
     words: str
     sigma_of_data: np.ndarray
 
-    @property
-    def table(self):
-        """One row per dataset and wavelength, a `~astropy.table.QTable`."""
-        columns = {"dataset": self.dataset, "wavelength": self.wavelength}
-        meta = {"method": self.method, "words": self.words}
-        return QTable(columns | {"sigma": self.sigma, "dof": self.dof}, meta=meta)
-
 
 def data_by_wavelength(measurement):
     """Return number of the dataset, wavelength, and indices of unmasked data of each cell.
@@ -104,18 +96,22 @@ def rms(values):
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
-def noise_of_cells(measurement, sigma, dof, method, words):
-    """Return an estimate with one noise for each cell of `data_by_wavelength`.
-
-    Without any degree of freedom the noise of a cell is not known.
-    """
+def _of_data(measurement, sigma, dof, method, words):
+    """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    sigma = np.where(np.asarray(dof) > 0, sigma, np.nan)
-    of_data = np.empty(measurement.n_data)
-    for row, value in zip(rows, sigma, strict=True):
-        of_data[row] = value
-    percent = 100 * sigma * u.percent
-    return NoiseEstimate(numbers, wavelength, percent, np.asarray(dof), method, words, of_data)
+    percent = 100 * np.array([rms(sigma[row]) for row in rows]) * u.percent
+    dof = np.broadcast_to(dof, len(rows))
+    return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
+
+
+def _of_cells(measurement, squares, dof, method, words):
+    """Return an estimate from sums of squares and freedom at each wavelength of each dataset.
+
+    Without any degree of freedom the noise there is not known.
+    """
+    sigma = np.sqrt(np.where(dof > 0, squares / np.maximum(dof, 1), np.nan))
+    sizes = [row.size for row in data_by_wavelength(measurement)[2]]
+    return _of_data(measurement, np.repeat(sigma, sizes), dof, method, words)
 
 
 # ---- known ------------------------------------------------------------------------------
@@ -164,7 +160,18 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     if gain is None:
         sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
-        sigma = _photon_sigma(measurement, _number("gain", gain, 0, False), read_noise)
+        gain, read_noise = _number("gain", gain, False), _number("read_noise", read_noise, True)
+        parts = []
+        for part in measurement.datasets:
+            obs = part.observations
+            fluxes = [
+                np.moveaxis(f.T[:, part.frames], 2, 0) for f in (obs.flux_right, obs.flux_left)
+            ]
+            # Poisson: var(F) = F / gain, plus the read noise in the same units
+            variances = [flux / gain + (read_noise / gain) ** 2 for flux in fluxes]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                parts.append(part.observable.variance(*fluxes, *variances)[part.valid])
+        sigma = np.sqrt(np.concatenate(parts))
         words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons per beam"
     bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
@@ -176,34 +183,10 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     return _of_data(measurement, sigma.copy(), np.inf, "errors", words)
 
 
-def _of_data(measurement, sigma, dof, method, words):
-    """Return an estimate with a noise for each datum, (n_data,)."""
-    numbers, wavelength, rows = data_by_wavelength(measurement)
-    percent = 100 * np.array([rms(sigma[row]) for row in rows]) * u.percent
-    dof = np.broadcast_to(dof, len(rows))
-    return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
-
-
-def _number(name, value, low, closed):
-    if not np.isfinite(value) or value < low or (value == low and not closed):
+def _number(name, value, closed):
+    if not (np.isfinite(value) and (value > 0 or (closed and value == 0))):
         raise FitError(f"{name} = {value}; allowed are numbers {'from' if closed else 'above'} 0")
     return float(value)
-
-
-def _photon_sigma(measurement, gain, read_noise):
-    extra = (_number("read_noise", read_noise, 0, True) / gain) ** 2
-    found = []
-    for part in measurement.datasets:
-        obs = part.observations
-        fluxes = obs.flux_right, obs.flux_left
-        right, left = (np.moveaxis(f.T[:, part.frames], 2, 0) for f in fluxes)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            # Poisson: var(F) = F / gain, plus the read noise in the same units
-            variance = part.observable.variance(
-                right, left, right / gain + extra, left / gain + extra
-            )
-        found.append(np.sqrt(variance[part.valid]))
-    return np.concatenate(found)
 
 
 # ---- replicates ---------------------------------------------------------------------------
@@ -273,24 +256,24 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
             f"{names}: no two data at the same settings within {np.rad2deg(limit):g} deg; "
             "repeat a half-wave-plate cycle, or use the null channel"
         )
-    sigma = np.sqrt(squares / np.maximum(dof, 1))
     words = (
         "scatter among repeated data: photon and read noise, flicker, repeatability of the "
         "stages; not what is the same in every repetition"
     )
-    return noise_of_cells(measurement, sigma, dof, "replicates", words)
+    return _of_cells(measurement, squares, dof, "replicates", words)
 
 
 def _same_settings(part, tolerance):
     """Return a number for the settings of every group of frames of a dataset."""
-    columns = [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
-    frames = part.observations.frames
-    if "flc_state" in frames.colnames:
-        columns.append(np.unique(np.asarray(frames["flc_state"]), return_inverse=True)[1])
-        columns[-1] = columns[-1][part.frames[:, 0]]
-    if not columns:
-        return np.zeros(len(part.frames), dtype=int)
+    columns = [_states(part.observations)[part.frames[:, 0]]]
+    columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
     return np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
+
+
+def _states(observations):
+    """Return the number of the state of a modulator of every frame, zero without one."""
+    column = observations.frames.columns.get("flc_state", np.zeros(observations.n_frames))
+    return np.unique(np.asarray(column), return_inverse=True)[1]
 
 
 def equal_axes(angle, tolerance):
@@ -383,18 +366,15 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
             "two plate angles per derotator angle (constant) or six derotator angles per plate "
             "angle (smooth) are needed"
         )
-    per_datum = [
-        # z is a mean of two frames: its variance is half that of a frame, as is that of a double
-        # difference; an observable of m frames has 2 / m of the null's
-        np.full(len(part.bins), 2.0 / part.observable.frames_per_datum)
-        for part in measurement.datasets
-    ]
-    sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
+    # z is a mean of two frames: its variance is half that of a frame, as is that of a double
+    # difference; an observable of m frames has 2 / m of the null's
+    shares = [2.0 / part.observable.frames_per_datum for part in measurement.datasets]
+    squares = np.repeat(shares, [len(part.bins) for part in measurement.datasets]) * squares
     words = (
         f"how far the null channel scatters beyond the null of the chain and a {null_model} term; "
         "this is an upper limit: photon and read noise, flicker and what the chain lacks are in it"
     )
-    return noise_of_cells(measurement, sigma, dof, "null channel", words)
+    return _of_cells(measurement, squares, dof, "null channel", words)
 
 
 def _need_two_beams(measurement, what):
@@ -439,24 +419,17 @@ def _predicted_differences(part, vector):
 
 def _null_design(observations, frames, null_model):
     angle = angle_or_zero(observations, "derotator")[frames]
-    state = np.zeros(len(frames), dtype=int)
-    if "flc_state" in observations.frames.colnames:
-        column = np.asarray(observations.frames["flc_state"])
-        state = np.unique(column, return_inverse=True)[1][frames]
+    state = _states(observations)[frames]
     if null_model == "constant":
         curves, setting = np.ones((1, len(angle))), equal_axes(angle, _SAME_DEROTATOR)
     else:
-        twice = 2 * angle
-        curves = np.stack([np.ones_like(twice), *_harmonics(twice), *_harmonics(2 * twice)])
+        waves = [wave(k * angle) for k in (2, 4) for wave in (np.cos, np.sin)]
+        curves = np.stack([np.ones_like(angle), *waves])
         setting = equal_axes(observations.position("hwp")[frames], _SAME_PLATE)
     _, setting = np.unique(np.stack([setting, state], axis=1), axis=0, return_inverse=True)
     # one column for each setting and curve
     steps = setting.ravel()[:, None] == np.arange(setting.max() + 1)
     return np.concatenate([curve[:, None] * steps for curve in curves], axis=1)
-
-
-def _harmonics(angle):
-    return np.cos(angle), np.sin(angle)
 
 
 # ---- noise of frames: what is rough in wavelength ----
@@ -516,13 +489,14 @@ def noise_from_roughness(measurement, vector=None):
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_rough_frames(part, vector) for part in measurement.datasets]
     sigma_of_data = np.concatenate([sigma for sigma, _ in parts])
-    freedom = [dof for part, (_, dof) in zip(measurement.datasets, parts, strict=True)
-               for _ in part.bins]  # fmt: skip
+    freedom = np.repeat(
+        [dof for _, dof in parts], [len(part.bins) for part in measurement.datasets]
+    )
     words = (
         "the stated errors, or more where single frames are rough along the wavelengths: photon "
         "and read noise, flicker, and what is sharp in wavelength"
     )
-    return _of_data(measurement, sigma_of_data, np.array(freedom), "roughness", words)
+    return _of_data(measurement, sigma_of_data, freedom, "roughness", words)
 
 
 def _rough_frames(part, vector):
@@ -563,18 +537,34 @@ def frame_noise(channel, residual, angles):
     harmonics of the stages' angles, sharp in wavelength or not; everything else
     is smooth in wavelength. So noise is what is left without either.
     """
-    sigma = np.sqrt(channel.variance)
-    basis = _turning(angles, channel.valid)
+    sigma, valid = np.sqrt(channel.variance), channel.valid
+    basis = _turning(angles, valid)
+    whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
+    # neighbours in wavelength of which none is masked
+    three = valid[:-2] & valid[1:-1] & valid[2:]
+    keep = three & whole
     for i in range(len(residual)):
-        rough = _roughness(residual[i], channel.valid, basis)
-        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
+        rough = np.nan
+        if len(valid) >= _FEWEST_ROUGH and keep.any():
+            left = np.where(whole, residual[i], 0.0)
+            left = left - (left @ basis) @ basis.T
+            # white noise of unit variance has second differences of variance 1 + 4 + 1
+            second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
+            # what is constant at a wavelength, as its brightness, is not noise
+            second = second - np.median(second, axis=1, keepdims=True)
+            # projection takes the freedom of its columns from the scatter
+            shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
+            # a median, lest a few sharp features of the optics count as noise
+            rough = MAD_TO_SIGMA * np.median(np.abs(second[keep])) / shrunk
+        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & valid
         if not stated.any():
             if not rough > 0:
                 raise FitError("no errors in the table, and the residuals tell no noise")
             sigma[i] = rough
             continue
         if np.isfinite(rough):
-            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
+            total = (sigma[i][:-2] ** 2 + 4 * sigma[i][1:-1] ** 2 + sigma[i][2:] ** 2) / 6
+            sigma[i] *= max(1.0, rough / np.median(np.sqrt(total)[three]))
         sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
     return sigma
 
@@ -606,27 +596,3 @@ def _whole(valid):
     """Return which frames have a datum at every wavelength, (F,)."""
     # a wavelength that is masked through the run, as in a band of water, makes no frame incomplete
     return valid[valid.any(axis=1)].all(axis=0)
-
-
-def _roughness(residual, valid, basis):
-    """Return the scatter of second differences along the wavelengths, per datum."""
-    if len(residual) < _FEWEST_ROUGH:
-        return np.nan
-    whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
-    left = np.where(whole, residual, 0.0)
-    left = left - (left @ basis) @ basis.T
-    # white noise of unit variance has second differences of variance 1 + 4 + 1
-    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
-    # what is constant at a wavelength, as its brightness, is not noise
-    second = second - np.median(second, axis=1, keepdims=True)
-    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
-    # projection takes the freedom of its columns from the scatter
-    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
-    # a median, lest a few sharp features of the optics count as noise
-    return float(MAD_TO_SIGMA * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
-
-
-def _roughness_of(sigma, valid):
-    total = np.sqrt((sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2) / 6)
-    keep = valid[:-2] & valid[1:-1] & valid[2:]
-    return float(np.median(total[keep]))

@@ -38,77 +38,58 @@ GROUPS = {
 _RUNS = 8
 
 
-def leave_out_groups(measurement):
-    """Return the group of each datum for cross-validation: its derotator angle, per dataset.
+def leave_out_groups(measurement, by="derotator"):
+    """Return the group of each datum for cross-validation, numbered from 0: see `GROUPS`.
 
-    On sky the derotator turns slowly, so there, and without one, a group is one of eight runs of
-    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
+    By default its derotator angle, per dataset. On sky the derotator turns slowly, so there, and
+    without one, a group is one of eight runs of consecutive cycles of the half-wave plate, or one
+    cycle where there are fewer. A cycle is the column ``cycle`` of the frames where there is one;
+    otherwise it ends where a plate angle (of one state of a modulator) comes again or the derotator
+    moves. The plus frame of a datum counts. By "pair" each group of frames is its own.
     """
     groups, first = [], 0
     for dataset in measurement.datasets:
-        turns = "derotator" in dataset.observations.frames.colnames
-        if "parallactic" in dataset.positions or not turns:
-            cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
-            rank = np.unique(cycle, return_inverse=True)[1]
-            count = int(rank.max()) + 1
-            group = runs_of_frames(count, min(_RUNS, count))[rank]
+        plus, table = dataset.frames[:, 0], dataset.observations
+        turns = "derotator" in table.frames.colnames and "parallactic" not in dataset.positions
+        if by in ("dataset", "pair"):
+            number = np.arange(len(plus)) * (by == "pair")
+        elif by == "derotator" and turns:
+            number = clusters(table.position("derotator")[plus])
         else:
-            group = clusters(dataset.observations.position("derotator")[dataset.frames[:, 0]])
-        groups.append(first + group[dataset.group_of_datum])
-        first += int(group.max()) + 1
-    return np.concatenate(groups)
-
-
-def groups_by(measurement, by="derotator"):
-    """Return the group of each datum, numbered from 0, by "derotator", "cycle" or "dataset".
-
-    A cycle is the column ``cycle`` of the frames where there is one; otherwise it ends where a
-    plate angle (of one state of a modulator) comes again or the derotator moves. The plus frame of
-    a datum counts.
-    """
-    check_choice("groups", by, GROUPS, FitError)
-    groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
-    names = _members(measurement, groups, by)
-    if len(names) < 2:
-        raise FitError(f"cross-validation by {by}: all data are in one group, {names[0][0]}")
-    for name, count in names:
-        if count < 2:
-            raise FitError(
-                f"cross-validation by {by}: group {name} has a single member; at least 2 data per "
-                "wavelength are needed, group by something else or leave it out"
-            )
-    return groups
-
-
-def _groups(measurement, by):
-    groups, first = [], 0
-    for part in measurement.datasets:
-        number = np.zeros(len(part.frames), dtype=int)
-        if by == "cycle":
-            number = cycle_numbers(part.observations)[part.frames[:, 0]]
-        number = np.unique(number, return_inverse=True)[1]
-        groups.append(first + number[part.group_of_datum])
+            number = np.unique(cycle_numbers(table)[plus], return_inverse=True)[1]
+            if by == "derotator":
+                count = int(number.max()) + 1
+                number = runs_of_frames(count, min(_RUNS, count))[number]
         # groups of different datasets never share a number
+        groups.append(first + number[dataset.group_of_datum])
         first += int(number.max()) + 1
     return np.concatenate(groups)
 
 
-def _members(measurement, groups, by):
-    """Return name and largest number of data at one wavelength of every group."""
-    found = []
+def groups_by(measurement, by="derotator"):
+    """Return the same by "derotator", "cycle" or "dataset"; refuse a group of a single member."""
+    check_choice("groups", by, GROUPS, FitError)
+    groups, found = leave_out_groups(measurement, by), []
     for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
         angle = np.rad2deg(angle_or_zero(part.observations, "derotator"))[part.frames[:, 0]]
-        own, bins = groups[where], measurement.bins[where]
-        for k, label in enumerate(np.unique(own)):
-            rows = own == label
+        for k, label in enumerate(np.unique(groups[where])):
+            rows = groups[where] == label
             what = {
                 "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
                 "cycle": f"number {k}",
                 "dataset": f"number {i}",
             }[by]
-            count = int(np.bincount(bins[rows]).max())
-            found.append((f"{by} {what} of {part.observations.name}", count))
-    return found
+            most = int(np.bincount(measurement.bins[where][rows]).max())
+            found.append((f"{by} {what} of {part.observations.name}", most))
+    if len(found) < 2:
+        raise FitError(f"cross-validation by {by}: all data are in one group, {found[0][0]}")
+    for name, most in found:
+        if most < 2:
+            raise FitError(
+                f"cross-validation by {by}: group {name} has a single member; at least 2 data per "
+                "wavelength are needed, group by something else or leave it out"
+            )
+    return groups
 
 
 def what_is_left_out(calibration):
@@ -235,9 +216,14 @@ class Scatter:
             (np.eye(log.size), np.exp(-distance / _LENGTH), np.ones_like(distance)),
             _amplitude(bins, residuals[rows], 1 - leverage[rows]),
         )
-        errors = _errors_at_settings(part, residuals[rows] / part.amplitude)
-        if errors is not None:
-            part.kernels += _found(errors)
+        scaled = residuals[rows] / part.amplitude
+        if part.patterns.shape[1] and np.isfinite(scaled).all():
+            # q and u of the residuals at each setting, (2 n_settings, n_wavelengths)
+            errors = part.patterns.T @ part.dense(scaled[:, None])[..., 0]
+            seen = np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
+            # of one plate angle q or u may not show at all
+            errors = np.divide(errors, seen, out=np.zeros_like(errors), where=seen > 0)
+            part.kernels += _correlation(errors)
             size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
             part.patterns = part.patterns * np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
         return part
@@ -303,17 +289,7 @@ class Scatter:
         return found
 
 
-def _errors_at_settings(part, scaled):
-    """Return q and u of the residuals at each setting, (2 n_settings, n_wavelengths)."""
-    if not part.patterns.shape[1] or not np.isfinite(scaled).all():
-        return None
-    errors = part.patterns.T @ part.dense(scaled[:, None])[..., 0]
-    size = np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
-    # of one plate angle q or u may not show at all
-    return np.divide(errors, size, out=np.zeros_like(errors), where=size > 0)
-
-
-def _found(errors):
+def _correlation(errors):
     """Return the correlation of wavelengths that the errors at the settings have, if there is one.
 
     Of principal components with more variance than independent wavelengths would have by chance
@@ -358,15 +334,12 @@ def _amplitude(bins, residuals, spare):
     """Return the rms of the residuals at the wavelength of each, for the freedom left there."""
     total, freedom = np.sum(residuals**2), spare.sum()
     whole = np.sqrt(total / freedom) if freedom >= _LEAST_FREEDOM else np.nan
-    levels = {}
-    for b in np.unique(bins):
-        own = bins == b
-        left = spare[own].sum()
-        levels[b] = np.sqrt(np.sum(residuals[own] ** 2) / left) if left >= _LEAST_FREEDOM else whole
-    floor = _FLOOR * np.median(list(levels.values()))
-    return (
-        np.array([max(levels[b], floor) for b in bins]) if total > 0 else np.full(len(bins), np.nan)
-    )
+    left = np.bincount(bins, spare)
+    told = left >= _LEAST_FREEDOM
+    rms = np.sqrt(np.bincount(bins, residuals**2) / np.where(told, left, 1.0))
+    levels = np.where(told, rms, whole)
+    least = _FLOOR * np.median(levels[np.unique(bins)])
+    return np.maximum(levels, least)[bins] if total > 0 else np.full(len(bins), np.nan)
 
 
 def model_error(measurement, scatter):
@@ -406,9 +379,4 @@ BLOCKS = ("derotator", "pair")
 def labels_of(measurement, block):
     """Return the number of the block of each datum; datasets have their own blocks."""
     check_choice("block", block, BLOCKS, FitError)
-    if block == "derotator":
-        return leave_out_groups(measurement)
-    sizes = [len(dataset.frames) for dataset in measurement.datasets]
-    first = np.cumsum([0, *sizes[:-1]])
-    parts = zip(first, measurement.datasets, strict=True)
-    return np.concatenate([start + dataset.group_of_datum for start, dataset in parts])
+    return leave_out_groups(measurement, block)

@@ -22,7 +22,7 @@ from astropolcal.calibration.identifiability.linearized import Whitened, triangl
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
-from astropolcal.words import check_choice, did_you_mean
+from astropolcal.words import did_you_mean
 
 __all__ = ["outlying_data"]
 
@@ -46,7 +46,6 @@ LOSSES = {
 
 def robust_sigma(measurement, loss):
     """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
-    check_choice("loss", loss, LOSSES, FitError)
     residuals = measurement.residuals()
     scale = _scales(measurement, residuals)
     # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
@@ -55,10 +54,9 @@ def robust_sigma(measurement, loss):
 
 def _scales(measurement, residuals):
     """Return the robust standard deviation of each datum's dataset and wavelength."""
-    scale = np.empty(residuals.size)
-    _, _, rows = data_by_wavelength(measurement)
-    for row in rows:
-        scale[row] = MAD_TO_SIGMA * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
+    rows = data_by_wavelength(measurement)[2]
+    levels = [np.median(np.abs(residuals[row])) if row.size else 0.0 for row in rows]
+    scale = MAD_TO_SIGMA * np.repeat(levels, [row.size for row in rows])
     for where in measurement.segments:
         least = _FLOOR * np.median(scale[where]) if scale[where].size else 0.0
         scale[where] = np.maximum(scale[where], max(least, 1e-12))
@@ -110,38 +108,32 @@ def outlying_data(calibration, limit=_FAR):
     residuals = live.residuals()
     scaled = residuals / _scales(live, residuals)
     for part, where in zip(live.datasets, live.segments, strict=True):
-        rows += _outliers(part, residuals[where], scaled[where], limit)
+        groups = np.unique(part.group_of_datum)
+        members = [where.start + np.flatnonzero(part.group_of_datum == g) for g in groups]
+        # one number a pair of frames, the median over its wavelengths
+        common = np.array([np.median(scaled[own]) for own in members])
+        off = common - np.median(common)
+        # what noise alone gives a median of so many wavelengths
+        least = np.array([1.25 / np.sqrt(own.size) for own in members])
+        spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off)), least)
+        bright = brightness(part.observations)
+        for i in np.flatnonzero(np.abs(off) > limit * spread):
+            frames = part.frames[groups[i]]
+            numbers = part.observations.frames["frame"][frames]
+            rows.append(
+                (
+                    part.observations.name,
+                    ", ".join(str(n) for n in numbers),
+                    100 * float(np.median(residuals[members[i]])),
+                    float(np.abs(off[i]) / spread[i]),
+                    float(bright[frames].min()),
+                )
+            )
     rows.sort(key=lambda row: -row[3])
     names = ("dataset", "frames", "residual", "sigma", "brightness")
     table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
     table["residual"].unit = "percent"
     return QTable(table)
-
-
-def _outliers(part, residuals, scaled, limit):
-    groups = np.unique(part.group_of_datum)
-    members = [part.group_of_datum == g for g in groups]
-    # one number a pair of frames, the median over its wavelengths
-    common = np.array([np.median(scaled[rows]) for rows in members])
-    off = common - np.median(common)
-    # what noise alone gives a median of so many wavelengths
-    least = np.array([1.25 / np.sqrt(rows.sum()) for rows in members])
-    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off)), least)
-    bright = brightness(part.observations)
-    numbers = np.asarray(part.observations.frames["frame"])
-    found = []
-    for i in np.flatnonzero(np.abs(off) > limit * spread):
-        frames = part.frames[groups[i]]
-        found.append(
-            (
-                part.observations.name,
-                ", ".join(str(n) for n in numbers[frames]),
-                100 * float(np.median(residuals[members[i]])),
-                float(np.abs(off[i]) / spread[i]),
-                float(bright[frames].min()),
-            )
-        )
-    return found
 
 
 # ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----
@@ -323,9 +315,21 @@ def first_weighting(measurement, weights):
     if isinstance(weights, Weighting):
         return weights
     if isinstance(weights, NoiseEstimate):
-        return Weighting(GIVEN, _of_estimate(measurement, weights))
+        sigma = weights.sigma_of_data
+        if sigma.shape != (measurement.n_data,):
+            raise FitError(
+                f"the noise is that of {sigma.size} data, the measurement has "
+                f"{measurement.n_data}; estimate it from this measurement"
+            )
+        return _known(GIVEN, sigma, f"noise from {weights.method}: {{}} of {{}} data have none")
     if weights is not None and not isinstance(weights, str):
-        return Weighting(GIVEN, _checked(given_noise(measurement, weights)))
+        sigma = given_noise(measurement, weights)
+        if np.median(sigma) > _LARGEST:
+            raise ParameterError(
+                f"a noise of {100 * np.median(sigma):.3g} %: weights takes the noise of the data, "
+                "not one over it"
+            )
+        return Weighting(GIVEN, sigma)
     if weights == GIVEN:
         raise FitError("weights='given': this measurement was not fitted with a noise given to it")
     if weights not in CHOICES:
@@ -336,10 +340,14 @@ def first_weighting(measurement, weights):
         )
     if weights != "errors":
         return Weighting(weights, np.full(measurement.n_data, np.nan))
-    bad = ~(np.isfinite(measurement.sigma) & (measurement.sigma > 0))
+    return _known("errors", measurement.sigma, "weights='errors', but {} of {} data have no error")
+
+
+def _known(choice, sigma, words):
+    bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
-        raise FitError(f"weights='errors', but {bad.sum()} of {bad.size} data have no error")
-    return Weighting("errors", measurement.sigma)
+        raise FitError(words.format(bad.sum(), bad.size))
+    return Weighting(choice, sigma)
 
 
 def assumed(measurement, weights):
@@ -383,22 +391,16 @@ def weighting_of(calibration):
     """Return the noise that a calibration, which needs its data, assumes of them."""
     measurement, settings = calibration.live_measurement(), calibration.settings
     if measurement.weighting is None:
-        given = settings.get("weights") == GIVEN
-        noise = _from_settings(measurement, settings) if given else settings.get("weights")
+        noise = settings.get("weights")
+        if noise == GIVEN and settings.get("loss", "linear") != "linear":
+            noise = Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
+        elif noise == GIVEN:
+            # as far as `describe` has kept it
+            kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
+            sizes = [row.size for row in data_by_wavelength(measurement)[2]]
+            noise = Weighting(GIVEN, np.repeat(np.array(kept, dtype=float) / 100, sizes))
         measurement.weighting = noise_of(measurement, noise)
     return measurement.weighting
-
-
-def _from_settings(measurement, settings):
-    """Return a noise given to a fit of the same data, as far as `describe` has kept it."""
-    if settings.get("loss", "linear") != "linear":
-        return Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
-    _, _, rows = data_by_wavelength(measurement)
-    kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
-    sigma = np.empty(measurement.n_data)
-    for row, percent in zip(rows, kept, strict=True):
-        sigma[row] = np.nan if percent is None else percent / 100
-    return Weighting(GIVEN, sigma)
 
 
 def _told(measurement, weighting):
@@ -438,23 +440,21 @@ def _by_wavelength(measurement, leverage):
     """
     squares, spare = measurement.residuals() ** 2, 1 - leverage
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    sigma, levels = np.empty(measurement.n_data), np.full(len(rows), np.nan)
+    levels = np.full(len(rows), np.nan)
     for i, row in enumerate(rows):
-        if row.size:
-            freedom, total = spare[row].sum(), squares[row].sum()
-            if freedom < 1 or not total > 0:
-                name = measurement.datasets[numbers[i]].observations.name
-                raise FitError(
-                    f"{name}, {wavelength[i].to_value(u.nm):.1f} nm: {row.size} data leave "
-                    f"{max(freedom, 0):.1f} degrees of freedom and an rms residual of "
-                    f"{np.sqrt(total / row.size):.3g}, which tell no noise; give noise= or other "
-                    "weights"
-                )
-            levels[i] = np.sqrt(total / freedom)
-    for i, row in enumerate(rows):
-        floor = _FLOOR * np.nanmedian(levels[numbers == numbers[i]]) if row.size else 0.0
-        sigma[row] = max(levels[i], floor)
-    return sigma
+        freedom, total = spare[row].sum(), squares[row].sum()
+        if row.size and (freedom < 1 or not total > 0):
+            name = measurement.datasets[numbers[i]].observations.name
+            raise FitError(
+                f"{name}, {wavelength[i].to_value(u.nm):.1f} nm: {row.size} data leave "
+                f"{max(freedom, 0):.1f} degrees of freedom and an rms residual of "
+                f"{np.sqrt(total / row.size):.3g}, which tell no noise; give noise= or other "
+                "weights"
+            )
+        levels[i] = np.sqrt(total / freedom) if row.size else np.nan
+    for own in (numbers == i for i in np.unique(numbers[np.isfinite(levels)])):
+        levels[own] = np.fmax(levels[own], _FLOOR * np.nanmedian(levels[own]))
+    return np.repeat(levels, [row.size for row in rows])
 
 
 # ---- from the user ------------------------------------------------------------------------
@@ -476,25 +476,3 @@ def given_noise(measurement, noise):
             f"(one per wavelength) or {measurement.n_data} (one per datum)"
         )
     return np.broadcast_to(noise, measurement.n_data).astype(float)
-
-
-def _checked(sigma):
-    if np.median(sigma) > _LARGEST:
-        raise ParameterError(
-            f"a noise of {100 * np.median(sigma):.3g} %: weights takes the noise of the data, "
-            "not one over it"
-        )
-    return sigma
-
-
-def _of_estimate(measurement, noise):
-    sigma = noise.sigma_of_data
-    if sigma.shape != (measurement.n_data,):
-        raise FitError(
-            f"the noise is that of {sigma.size} data, the measurement has {measurement.n_data}; "
-            "estimate it from this measurement"
-        )
-    bad = ~(np.isfinite(sigma) & (sigma > 0))
-    if bad.any():
-        raise FitError(f"noise from {noise.method}: {bad.sum()} of {bad.size} data have none")
-    return sigma
