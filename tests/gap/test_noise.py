@@ -94,29 +94,21 @@ def test_what_is_smooth_in_wavelength_is_no_noise():
 
 
 def test_roughness_is_the_standard_deviation_of_white_noise():
-    values = np.random.default_rng(2).normal(size=(W, 3000))
-    valid = np.ones(values.shape, dtype=bool)
-    found = estimates._roughness(values, valid, np.zeros((3000, 0)))
-    assert found == pytest.approx(1.0, abs=0.02)
+    values = np.random.default_rng(2).normal(size=(1, W, 3000))
+    bare = SimpleNamespace(variance=np.full(values.shape, np.nan), valid=np.isfinite(values[0]))
+    np.testing.assert_allclose(estimates.frame_noise(bare, values, {}), 1.0, atol=0.02)
 
 
 def test_few_wavelengths_tell_no_roughness():
-    four = np.ones((4, 9), dtype=bool)
-    assert np.isnan(estimates._roughness(np.ones((4, 9)), four, np.zeros((9, 0))))
-    none = np.zeros((W, 9), dtype=bool)
-    assert np.isnan(estimates._roughness(np.ones((W, 9)), none, np.zeros((9, 0))))
+    four = SimpleNamespace(variance=np.full((1, 4, F), 1e-6), valid=np.ones((4, F), dtype=bool))
+    np.testing.assert_allclose(estimates.frame_noise(four, draws(1.0)[:1, :4], {}), 1e-3)
 
 
 def test_masked_neighbours_are_left_out():
-    values, valid = np.zeros((W, F)), np.ones((W, F), dtype=bool)
-    values[5] = 1e6
-    valid[5] = False
-    assert estimates._roughness(values, valid, np.zeros((F, 0))) == 0
-
-
-def test_roughness_of_equal_errors_is_their_size():
-    valid = np.ones((W, F), dtype=bool)
-    assert estimates._roughness_of(np.full((W, F), 0.3), valid) == pytest.approx(0.3)
+    values, valid = draws(1e-4)[:1], np.ones((W, F), dtype=bool)
+    values[:, 5], valid[5] = 1e6, False
+    masked = SimpleNamespace(variance=np.full(values.shape, 1e-6), valid=valid)
+    np.testing.assert_allclose(estimates.frame_noise(masked, values, {})[0, valid], 1e-3)
 
 
 # ---- harmonics of the stages ---------------------------------------------------------------

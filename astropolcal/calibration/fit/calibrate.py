@@ -224,13 +224,10 @@ def calibrate(
         whitened,
         settings={
             "instrument": instrument,
-            "observable": measurement.observable.name,
             "fitter": type(fitter).__name__,
             "strategy": strategy,
-            "weights": measurement.weighting.choice,
             "loss": loss,
             "errors": errors,
-            "noise": describe(measurement, measurement.weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
             **({"own": copies} if copies else {}),
         },
@@ -425,7 +422,12 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         identifiability=finding,
         at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
-        settings=settings,
+        settings=settings
+        | {
+            "observable": measurement.observable.name,
+            "weights": weighting.choice,
+            "noise": describe(measurement),
+        },
         fit=fit,
         ties=dict(measurement.free.ties),
         stages=stages,

@@ -144,28 +144,21 @@ class Model:
             start += term.size
         return out
 
-    def _prior_rows(self):
-        """Return rows and targets of what is known beforehand of the coefficients."""
+    def _system(self):
+        """Return the triangular factor of all rows and priors, and its targets."""
         sizes = [np.full(len(self.shared), np.inf)]
         sizes = np.concatenate(sizes + [np.full(term.size, term.prior) for term in self.terms])
-        rows, seen = [np.diag(1 / sizes)[np.isfinite(sizes)]], set()
-        aims = [np.zeros(len(rows[0]))]
+        own = np.diag(1 / sizes)[np.isfinite(sizes)]
+        total, seen = np.column_stack([own, -own @ self.value]), set()
         for i, names in enumerate(self.names):
+            # what is known beforehand of what runs share is taken from the first that has it
             fresh = np.array([n not in seen for n in names]) & ~self.own[i]
             seen |= set(names)
-            one, targets = self._known(i, fresh)
-            rows.append(one @ self._shares(i))
-            aims.append(targets)
-        return np.concatenate(rows), np.concatenate(aims)
-
-    def _system(self):
-        """Return the triangular factor of all rows and its targets."""
-        rows, aims = self._prior_rows()
-        total = np.column_stack([rows, aims - rows @ self.value])
-        for i in range(len(self.rows)):
-            own, targets = self._split(i)
-            own = own @ self._shares(i)
-            total = np.concatenate([total, np.column_stack([own, targets - own @ self.value])])
+            shares = self._shares(i)
+            for rows, targets in (self._known(i, fresh), self._split(i)):
+                rows = rows @ shares
+                rows = np.column_stack([rows, targets - rows @ self.value])
+                total = np.concatenate([total, rows])
             if len(total) > max(4 * total.shape[1], _MANY):
                 total = np.linalg.qr(total, mode="r")
         return total[:, :-1], total[:, -1]

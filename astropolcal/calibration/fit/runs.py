@@ -37,7 +37,7 @@ from astropolcal.calibration.identifiability.linearized import (
     Whitened,
 )
 from astropolcal.calibration.noise.scatter import Scatter
-from astropolcal.calibration.noise.weighting import Problem, describe, first_weighting
+from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
@@ -176,13 +176,11 @@ def _dates(parts, needed):
             raise ParameterError(f"run {i + 1} ({tables[0].name}) has no date in its meta")
     if None in told:
         return None
-    seen = {}
     for i, day in enumerate(told):
-        if needed and day in seen:
+        if needed and day in told[:i]:
             raise ParameterError(
-                f"runs {seen[day] + 1} and {i + 1} are both of {day}: neither comes first"
+                f"runs {told.index(day) + 1} and {i + 1} are both of {day}: neither comes first"
             )
-        seen[day] = i
     return Time(told, scale="tai")
 
 
@@ -524,13 +522,10 @@ class RunsCalibration:
             whitened,
             settings={
                 "instrument": None,
-                "observable": measurement.observable.name,
                 "fitter": "calibrate_runs",
                 "strategy": "runs",
-                "weights": measurement.weighting.choice,
                 "loss": "linear",
                 "errors": "scatter" if one.scatter is not None else "white",
-                "noise": describe(measurement, measurement.weighting),
                 "gauge": "least change from the first run",
                 "runs": {"count": len(self), "varying": varying},
             },

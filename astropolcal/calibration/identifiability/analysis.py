@@ -420,18 +420,8 @@ def mirror_branches(measurement, vector, view):
 
 def _other_instrument(measurement, vector, view):
     """Return the other handedness downstream of the telescope, if it matters and no datum tells."""
-    if view is None or view.telescope == LEFT_OUT or _knows_hand(measurement, vector):
+    if view is None or view.telescope == LEFT_OUT:
         return []
-    telescope, instrument = split_chain(view.chain)
-    # V -> -V in front of everything behind it: the fluxes are of I alone, and have no hand
-    turned = MuellerElement.from_matrix(np.diag([1.0, 1.0, 1.0, -1.0]), name="other_hand")
-    sky = consequences_of(view, join([*telescope, turned, *instrument]))
-    words = f"downstream of the telescope: {_SAME_DATA}, only bounds or models exclude them"
-    return [{"words": words, "sky": sky}] if matters(sky) else []
-
-
-def _knows_hand(measurement, vector):
-    """Return whether circularly polarized light enters the instrument in some dataset."""
     lam = measurement.wavelength * u.um
     for chain, dataset in zip(measurement.put_back(vector), measurement.datasets, strict=True):
         front, _ = split_chain(without_nuisance(chain))
@@ -439,16 +429,21 @@ def _knows_hand(measurement, vector):
             continue
         source = join(front)
         step = max(1, dataset.frames.shape[0] // _FEW)
-        places = standing(source)
-        positions = places | {
-            stage: dataset.positions[stage][:, ::step].ravel() * u.rad
-            for stage in stages(source)
-            if stage not in places
+        moving = {
+            stage: angle[:, ::step].ravel() * u.rad for stage, angle in dataset.positions.items()
         }
+        places = standing(source)
+        positions = places | {s: moving[s] for s in stages(source) if s not in places}
         light = system_mueller(source, lam, positions)[..., :, 0]
+        # circularly polarized light that enters the instrument tells its hand
         if np.abs(light[..., 3]).max() > _SAME * np.abs(light[..., 0]).max():
-            return True
-    return False
+            return []
+    telescope, instrument = split_chain(view.chain)
+    # V -> -V in front of everything behind it: the fluxes are of I alone, and have no hand
+    turned = MuellerElement.from_matrix(np.diag([1.0, 1.0, 1.0, -1.0]), name="other_hand")
+    sky = consequences_of(view, join([*telescope, turned, *instrument]))
+    words = f"downstream of the telescope: {_SAME_DATA}, only bounds or models exclude them"
+    return [{"words": words, "sky": sky}] if matters(sky) else []
 
 
 def _retarders(measurement):

@@ -439,6 +439,7 @@ def _null_design(observations, frames, null_model):
 _MOST_TURNING = 0.7
 # second differences of fewer wavelengths tell nothing
 _FEWEST_ROUGH = 5
+_SINGLE = OBSERVABLES["normalized_single_difference"]
 # independent data that tell a spread as well as the median of second differences along wavelengths
 _TELLS = 0.19
 
@@ -487,43 +488,37 @@ def noise_from_roughness(measurement, vector=None):
     """
     _need_two_beams(measurement, "roughness of differences")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    parts = [_rough_frames(part, vector) for part in measurement.datasets]
-    sigma_of_data = np.concatenate([sigma for sigma, _ in parts])
-    freedom = np.repeat(
-        [dof for _, dof in parts], [len(part.bins) for part in measurement.datasets]
-    )
+    sigmas, freedom = [], []
+    for part in measurement.datasets:
+        obs = part.observations
+        if obs.n_bins < _FEWEST_ROUGH:
+            raise FitError(
+                f"{obs.name}: {obs.n_bins} wavelengths tell no roughness; {_FEWEST_ROUGH} are "
+                "needed"
+            )
+        fluxes = obs.flux_right.T, obs.flux_left.T
+        errors = obs.variance_right.T, obs.variance_left.T, obs.covariance.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = _SINGLE.variance(*(x[None] for x in (*fluxes, *errors)))
+            difference = _SINGLE.evaluate(*(x[None] for x in fluxes))
+            residual = difference - _predicted_differences(part, vector).T
+        frames = SimpleNamespace(variance=variance[None], valid=np.isfinite(residual))
+        angles = {}
+        for stage, angle in part.positions.items():
+            angles[stage] = np.zeros(obs.n_frames)
+            angles[stage][part.frames.T] = angle
+        residual = np.where(frames.valid, residual, 0.0)
+        (sigma,) = frame_noise(frames, residual[None], angles)
+        of_data = np.mean(sigma[:, part.frames] ** 2, axis=-1)[part.valid]
+        sigmas.append(np.sqrt(of_data / part.observable.frames_per_datum))
+        known = np.isfinite(variance) & (variance > 0) & frames.valid
+        stands = np.allclose(sigma[known], np.sqrt(variance[known])) and known.any()
+        freedom += [np.inf if stands else _TELLS * frames.valid.sum()] * len(part.bins)
     words = (
         "the stated errors, or more where single frames are rough along the wavelengths: photon "
         "and read noise, flicker, and what is sharp in wavelength"
     )
-    return _of_data(measurement, sigma_of_data, freedom, "roughness", words)
-
-
-def _rough_frames(part, vector):
-    """Return the noise of each datum of a dataset, and its degrees of freedom."""
-    obs = part.observations
-    if obs.n_bins < _FEWEST_ROUGH:
-        raise FitError(
-            f"{obs.name}: {obs.n_bins} wavelengths tell no roughness; {_FEWEST_ROUGH} are needed"
-        )
-    right, left = obs.flux_right.T, obs.flux_left.T
-    single = OBSERVABLES["normalized_single_difference"]
-    errors = (obs.variance_right.T, obs.variance_left.T, obs.covariance.T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = single.variance(right[None], left[None], *(error[None] for error in errors))
-        residual = single.evaluate(right[None], left[None]) - _predicted_differences(part, vector).T
-    frames = SimpleNamespace(variance=variance[None], valid=np.isfinite(residual))
-    angles = {}
-    for stage, angle in part.positions.items():
-        angles[stage] = np.zeros(obs.n_frames)
-        angles[stage][part.frames.T] = angle
-    residual = np.where(frames.valid, residual, 0.0)
-    (sigma,) = frame_noise(frames, residual[None], angles)
-    of_data = np.mean(sigma[:, part.frames] ** 2, axis=-1)[part.valid]
-    known = np.isfinite(variance) & (variance > 0) & frames.valid
-    stands = np.allclose(sigma[known], np.sqrt(variance[known])) and known.any()
-    dof = np.inf if stands else _TELLS * frames.valid.sum()
-    return np.sqrt(of_data / part.observable.frames_per_datum), dof
+    return _of_data(measurement, np.concatenate(sigmas), freedom, "roughness", words)
 
 
 def frame_noise(channel, residual, angles):

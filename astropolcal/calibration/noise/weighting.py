@@ -414,10 +414,10 @@ def _told(measurement, weighting):
     return weighting
 
 
-def describe(measurement, weighting):
+def describe(measurement):
     """Return the noise of each dataset and wavelength as plain lists, for the settings."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    sizes = [rms(weighting.sigma[row]) for row in rows]
+    sizes = [rms(measurement.weighting.sigma[row]) for row in rows]
     nm = wavelength.to_value(u.nm)
     return [
         {
