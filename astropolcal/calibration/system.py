@@ -44,7 +44,11 @@ class Rows:
 
         Of a parameter given per wavelength it is that to the value at the wavelength of the row.
         """
-        wanted = self._wanted()
+        places = [
+            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
+        ]
+        named = zip(places, self._names(), strict=True)
+        wanted = {place: name for place, name in named if self._slot(name) is not None}
         if not wanted:
             return {}
         values, shape = self._values(None), self._light[0].shape
@@ -87,13 +91,6 @@ class Rows:
 
     def _slot(self, name):
         return None if self.free is None else self.free.lookup(name)[0]
-
-    def _wanted(self):
-        places = (
-            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
-        )
-        named = zip(places, self._names(), strict=True)
-        return {place: name for place, name in named if self._slot(name) is not None}
 
     def _values(self, vector):
         """Return the values of every optic at the wavelengths of the data."""

@@ -238,19 +238,21 @@ def physical_scale(free):
 
 def telescope_words(finding, measurement):
     """Say which parameters of mirrors upstream of the half-wave plate stars do not determine."""
-    open_names = {
-        name
-        for direction in (*finding.directions, *finding.near_null)
-        for name in direction["parameters"]
-    }
+    free = measurement.free
+    found = (*finding.directions, *finding.near_null)
+    moving = {name for direction in found for name in direction["parameters"]}
     # what ran to a bound is as open as what drifts
-    at_bound = []
-    if measurement.datasets:
-        held = measurement.free.at_bounds(measurement.vector())
-        at_bound = [measurement.free.names[i] for i in np.flatnonzero(held)]
-    words = []
-    for mirror in sorted(_mirrors(measurement)):
-        own = sorted(n for n in {*open_names, *at_bound} if n.startswith(f"{mirror}."))
+    moving |= {free.names[i] for i in np.flatnonzero(free.at_bounds(measurement.vector()))}
+    words, mirrors = [], set()
+    for train in map(leaves, measurement.chains):
+        places = [leaf.stage for leaf in train]
+        # the plate ends the telescope, or where there is none its last axis
+        last = next((s for s in ("hwp", "altitude") if s in places), None)
+        if "parallactic" in places and last is not None:
+            inner = train[places.index("parallactic") + 1 : places.index(last)]
+            mirrors |= {leaf.name for leaf in inner if not isinstance(leaf, Rotator)}
+    for mirror in sorted(mirrors):
+        own = sorted(name for name in moving if name.startswith(f"{mirror}."))
         if own:
             words.append(
                 f"{', '.join(own)}: an unpolarized star shows the diattenuation of {mirror} and "
@@ -259,20 +261,6 @@ def telescope_words(finding, measurement):
                 "a measured film or index (a prior) does the rest"
             )
     return words
-
-
-def _mirrors(measurement):
-    """Return the names of what stands between the parallactic angle and the half-wave plate."""
-    found = set()
-    for chain, _ in zip(getattr(measurement, "chains", ()), measurement.datasets, strict=False):
-        train = leaves(chain)
-        stages = [leaf.stage for leaf in train]
-        # the plate ends the telescope, or where there is none its last axis
-        last = next((s for s in ("hwp", "altitude") if s in stages), None)
-        if "parallactic" in stages and last is not None:
-            inner = train[stages.index("parallactic") + 1 : stages.index(last)]
-            found |= {leaf.name for leaf in inner if not isinstance(leaf, Rotator)}
-    return found
 
 
 # ---- ambiguities ---------------------------------------------------------------------------
@@ -384,7 +372,14 @@ def mirror_branches(measurement, vector, view):
     With them the other hand of the whole instrument, if only bounds or models exclude it and it
     matters on sky.
     """
-    retarders, branches = _retarders(measurement), []
+    # the free retarders by name, with the slots of their retardances
+    retarders, branches = {}, []
+    for leaf in (leaf for chain in measurement.chains for leaf in leaves(chain)):
+        if isinstance(leaf, (LinearRetarder, EllipticalRetarder)):
+            # with one component held the others cannot go to the mirror solution
+            slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
+            if None not in slots:
+                retarders[leaf.name] = slots
     candidates = [
         (
             f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
@@ -404,8 +399,12 @@ def mirror_branches(measurement, vector, view):
         inside = np.all((other >= low) & (other <= high))
         change = np.abs(measurement.predict(other) - measurement.predict(vector)).max()
         if inside and change < _SAME and not np.allclose(other, vector):
-            chains = None if view is None else measurement.put_back(other)
-            sky = view and consequences_of(view, view.with_optics_of(chains))
+            sky = None
+            if view is not None:
+                # the chain from the sky, with those optics that are in the other solution
+                known = {o.name: o for chain in measurement.put_back(other) for o in leaves(chain)}
+                chain = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
+                sky = consequences_of(view, chain)
             branches.append({"words": words, "sky": sky})
     if not any(_SAME_DATA in branch["words"] for branch in branches):
         branches += _other_instrument(measurement, vector, view)
@@ -444,19 +443,6 @@ def _other_instrument(measurement, vector, view):
     sky = consequences_of(view, join([*telescope, turned, *instrument]))
     words = f"downstream of the telescope: {_SAME_DATA}, only bounds or models exclude them"
     return [{"words": words, "sky": sky}] if matters(sky) else []
-
-
-def _retarders(measurement):
-    """Return the free retarders by name, with the slots of their retardances."""
-    found = {}
-    for chain in measurement.chains:
-        for leaf in leaves(chain):
-            if isinstance(leaf, (LinearRetarder, EllipticalRetarder)):
-                # with one component held the others cannot go to the mirror solution
-                slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
-                if all(slot is not None for slot in slots):
-                    found[leaf.name] = slots
-    return found
 
 
 def _other_turn(retardance):

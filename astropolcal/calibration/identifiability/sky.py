@@ -27,8 +27,8 @@ from astropolcal.optics import COORDINATES, LinearPolarizer
 
 __all__ = []
 
-_ALTITUDES, _PARALLACTIC = np.deg2rad([30.0, 50.0, 70.0]), np.deg2rad([-60.0, 0.0, 60.0])
-_TELESCOPE = ("parallactic", "altitude")
+_GRID = np.meshgrid(np.deg2rad([30.0, 50.0, 70.0]), np.deg2rad([-60.0, 0.0, 60.0]))
+_POINTINGS = {"altitude": _GRID[0].ravel(), "parallactic": _GRID[1].ravel()}
 # frames 0 and 1, and 2 and 3, are pairs
 _CYCLE = np.deg2rad([0.0, 45.0, 22.5, 67.5])
 # a modulator takes both states in each of them
@@ -82,7 +82,7 @@ def settings_of(measurement):
     if not any("hwp" in one for one in stood) or any(
         "=" in stage for one in stood for stage in one
     ):
-        shared = set.intersection(*map(set, stood)) - {*_TELESCOPE, *COORDINATES}
+        shared = set.intersection(*map(set, stood)) - {*_POINTINGS, *COORDINATES}
         if not shared:
             return {}
         each = [[np.round(p[s], 6).ravel() for s in sorted(shared)] for p in stood]
@@ -91,7 +91,7 @@ def settings_of(measurement):
         return {stage: angle.tolist() for stage, angle in zip(sorted(shared), frames, strict=True)}
     for dataset in measurement.datasets:
         for stage, angle in dataset.positions.items():
-            if stage not in ("hwp", *_TELESCOPE):
+            if stage not in ("hwp", *_POINTINGS):
                 angles.setdefault(stage, []).append(np.round(angle, 6).ravel())
     return {
         stage: _spread_out(np.unique(np.concatenate(several))).tolist()
@@ -154,18 +154,16 @@ def sequence_of(wanted, settings):
 
     They are repeated for each pointing of the telescope.
     """
-    own = [stage for stage in wanted if stage not in (*_TELESCOPE, *COORDINATES)]
+    own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
     if not own or not {*own} <= {*settings}:
         return None
     if len({len(settings[stage]) for stage in own}) > 1:
         return None
     frames = np.unique(np.transpose([settings[stage] for stage in own]), axis=0)
     frames = _spread_out(frames, _LONGEST)
-    altitude, parallactic = (grid.ravel() for grid in np.meshgrid(_ALTITUDES, _PARALLACTIC))
-    count = altitude.size if set(_TELESCOPE) & set(wanted) else 1
+    count = _MOST if set(_POINTINGS) & set(wanted) else 1
     placed = dict(zip(own, np.tile(frames, (count, 1)).T, strict=True))
-    placed |= {"altitude": np.repeat(altitude, len(frames))}
-    placed |= {"parallactic": np.repeat(parallactic, len(frames))}
+    placed |= {stage: np.repeat(angle, len(frames)) for stage, angle in _POINTINGS.items()}
     placed |= {stage: np.zeros(1) for stage in wanted if stage not in placed}
     return {stage: placed[stage] for stage in wanted}, count
 
@@ -177,18 +175,17 @@ def _positions(chain, settings, law):
         # a file of before does not say where the derotator stood
         stage: np.asarray(settings.get(stage) or np.linspace(0, np.pi, _MOST, endpoint=False))
         for stage in wanted
-        if stage not in ("hwp", *_TELESCOPE) and stage not in COORDINATES
+        if stage not in ("hwp", *_POINTINGS) and stage not in COORDINATES
     }
-    altitude, parallactic = (grid.ravel() for grid in np.meshgrid(_ALTITUDES, _PARALLACTIC))
-    on_sky = bool(set(_TELESCOPE) & set(wanted))
+    on_sky = bool(set(_POINTINGS) & set(wanted))
     count = _MOST if on_sky else max([len(a) for a in angles.values()], default=1)
     # in another order than the telescope's, so that the two do not go together
     order = np.arange(count) * (_STRIDE if on_sky else 1)
     each = {stage: angle[order % len(angle)] for stage, angle in angles.items()}
     plate = np.zeros(count)
     if on_sky:
-        each |= {"altitude": altitude, "parallactic": parallactic}
-        plate = law[0] * parallactic + law[1] * altitude
+        each |= _POINTINGS
+        plate = law[0] * each["parallactic"] + law[1] * each["altitude"]
     n_states = len(_STATES) if _MODULATOR in wanted else 1
     cycle, n_frames = np.tile(_CYCLE, n_states), n_states * len(_CYCLE)
     placed = {stage: np.repeat(angle, n_frames) for stage, angle in each.items()}
@@ -229,16 +226,6 @@ class SkyView:
         block[:, own, :, :, own] = np.moveaxis(self._gain, 1, 0)
         found = self._model.changes(block.reshape(n_wavelengths, 3 * count, 2, -1))
         return found.reshape(n_wavelengths, count, 3, 3, -1)
-
-    def along(self, directions):
-        """Return the changes for steps along directions in canonical units, (..., w, s, 3, 3)."""
-        steps = np.asarray(directions) / self.free.factors()
-        return np.moveaxis(self.changes @ steps.T, -1, 0)
-
-    def with_optics_of(self, chains):
-        """Return the chain from the sky with those optics that other chains have from them."""
-        known = {leaf.name: leaf for chain in chains for leaf in leaves(chain)}
-        return join(known.get(leaf.name, leaf) for leaf in leaves(self.chain))
 
     def against(self, chain):
         """Return what another chain finds of what this one measures, less the truth."""
@@ -284,7 +271,8 @@ def consequences_along(view, directions):
     """
     if view is None or not len(directions):
         return [None] * len(directions)
-    return [_consequences(change[view.good], _small) for change in view.along(directions)]
+    steps = np.asarray(directions) / view.free.factors()
+    return [_consequences((view.changes @ step)[view.good], _small) for step in steps]
 
 
 def consequences_of(view, chain):
