@@ -6,6 +6,7 @@ Values that all runs share, values of one run only, which are eliminated run by 
 time; see `astropolcal.calibration.fit.runs`.
 """
 
+from collections import Counter
 from copy import copy
 from dataclasses import dataclass
 
@@ -70,12 +71,8 @@ class Model:
         frees = [shape.free for shape in work.shapes]
         self.names = [free.names for free in frees]
         self.scales = [physical_scale(free) for free in frees]
-        count = {}
-        for names in self.names:
-            for name in names:
-                count[name] = count.get(name, 0) + 1
-        known = {key for name in count for key in (stem(name), optic(name))}
-        _check_known(own, known, "own")
+        count = Counter(name for names in self.names for name in names)
+        _check_known(own, count, "own")
         self.own = [
             np.array([count[n] == 1 or _is_of(n, own) for n in names]) for names in self.names
         ]
@@ -85,19 +82,17 @@ class Model:
             np.array([place[n] for n in np.array(names)[~mine]], dtype=int)
             for names, mine in zip(self.names, self.own, strict=True)
         ]
-        first = {name: i for i in reversed(range(len(frees))) for name in self.names[i]}
-        self.limits = self._of_shared(first, lambda i: np.array(frees[i].bounds()) / self.scales[i])
-        self.value = self._of_shared(first, lambda i: work.alone[i][None] / self.scales[i])[0]
-        self.held = np.zeros(self.value.size, dtype=bool)
+        # bounds and start of what runs share are those of the first run that has it
+        self.limits, self.value = np.empty((2, len(place))), np.empty(len(place))
+        parts = zip(frees, work.alone, self.scales, self.own, self.columns, strict=True)
+        for free, vector, scale, mine, columns in reversed(list(parts)):
+            self.limits[:, columns] = (np.array(free.bounds()) / scale)[:, ~mine]
+            self.value[columns] = (vector / scale)[~mine]
         self.chances = None if dates is None else chances_of_runs(dates, events)
         self.vectors = work.alone
         #: Rows around the parameters of each run alone, with its residuals there.
         self.alone = self.rows = work.around(self.vectors)
         self.value = self._solved()[0]
-
-    def _of_shared(self, first, values):
-        where = [(first[name], self.names[first[name]].index(name)) for name in self.shared]
-        return np.array([values(i)[:, k] for i, k in where]).reshape(len(where), -1).T
 
     @property
     def varying(self):
@@ -227,10 +222,7 @@ class Model:
         """Add the courses that the user asks for."""
         if not isinstance(vary, dict):
             raise ParameterError(f"vary = {vary!r}; allowed are 'evidence' or a dict of courses")
-        known = {
-            key for names in self.varying.values() for n in names for key in (optic(n), stem(n))
-        }
-        _check_known(vary, known, "vary")
+        _check_known(vary, [n for names in self.varying.values() for n in names], "vary")
         for what, course in vary.items():
             check_choice(f"vary: {what}", course, COURSES, ParameterError)
             names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
@@ -396,7 +388,8 @@ class Model:
 _NEVER = Weighed({course: float(course == "constant") for course in COURSES}, -np.inf, [])
 
 
-def _check_known(wanted, known, what):
+def _check_known(wanted, names, what):
+    known = {key for name in names for key in (stem(name), optic(name))}
     for name in wanted:
         if name not in known:
             raise ParameterError(f"{what}: no free optic or parameter {name!r} in the runs")

@@ -304,11 +304,7 @@ def fit_once(measurement, weighting, fitter):
         # the same steps by triangular factors, for which the fitter has no place
         vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
         measurement.stand_at(vector)
-        return {
-            "converged": found.success,
-            "message": found.message,
-            "evaluations": int(found.nfev),
-        }
+        return {"converged": found.success, "message": found.message, "evaluations": found.nfev}
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
     with warnings.catch_warnings(record=True) as caught:
@@ -316,12 +312,7 @@ def fit_once(measurement, weighting, fitter):
         warnings.simplefilter("always", AstropyWarning)
         try:
             fitter(
-                canonical,
-                index,
-                observed,
-                weights=weights,
-                maxiter=_MAX_EVALUATIONS,
-                inplace=True,
+                canonical, index, observed, weights=weights, maxiter=_MAX_EVALUATIONS, inplace=True
             )
         except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
             said = one_line(str(error))
