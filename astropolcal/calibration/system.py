@@ -94,26 +94,22 @@ class Rows:
 
     def _values(self, vector):
         """Return the values of every optic at the wavelengths of the data."""
-        names = iter(self._names())
-        values = []
+        names, size, values = iter(self._names()), self._mix.shape[1], []
         for own in self._own:
-            values.append([self._at(next(names), value, vector) for value in own])
+            values.append([])
+            for value in own:
+                name = next(names)
+                if vector is not None and self._slot(name) is not None:
+                    # a tied parameter follows its source: value = factor * source + offset
+                    slot, factor, offset = self.free.lookup(name)
+                    value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
+                if value.size not in (1, size):
+                    raise ParameterError(
+                        f"{name} has {value.size} values; allowed are 1 or {size}, one per "
+                        "wavelength"
+                    )
+                values[-1].append(self._mix @ value if value.size > 1 else value.reshape(()))
         return values
-
-    def _at(self, name, value, vector):
-        slot = None if vector is None else self._slot(name)
-        if slot is not None:
-            _, factor, offset = self.free.lookup(name)
-            # a tied parameter follows its source: value = factor * source + offset
-            value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
-        if value.size == 1:
-            return value.reshape(())
-        if value.size != self._mix.shape[1]:
-            raise ParameterError(
-                f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
-                "one per wavelength"
-            )
-        return self._mix @ value
 
     def _over_nodes(self, array):
         """Average over the nodes of the exposures, the last axis but one of columns."""

@@ -351,10 +351,6 @@ class _Work:
         """Return the rows of all runs around canonical values."""
         return list(steps(self._map(_rows_of, self.jobs, vectors), "runs", len(self.jobs)))
 
-    def run(self, i):
-        """Return a run, in this process."""
-        return _prepared(*self.jobs[i])
-
 
 # ---- the result -------------------------------------------------------------------------------
 
@@ -508,7 +504,7 @@ class RunsCalibration:
             Its chains have the values of the solution of all runs, its covariance is that of all
             runs.
         """
-        one, model = self._model.work.run(run), self._model
+        one, model = _prepared(*self._model.work.jobs[run]), self._model
         measurement = one.measurement
         measurement.stand_at(model.vectors[run])
         whitened = Problem(measurement, measurement.weighting).around()

@@ -134,19 +134,18 @@ def _view(chains, free, lam, metas, name, settings):
             chain, telescope = chain_from_sky(chains)
         except ChainError:
             return None
-    wanted = stages(chain)
+    wanted, site = stages(chain), None
     if "hwp" not in wanted or any("=" in stage for stage in wanted):
         placed = sequence_of(wanted, settings)
-        view = placed and SkyView(chain, telescope, free, lam, placed)
-        return view if view and view.good.any() else None
-    law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
-    stated = [meta.get("tracking") for meta in metas if meta.get("tracking") in law.modes]
-    mode = stated[0] if stated else next(iter(law.modes), None)
-    placed = _positions(chain, settings, law.plate_law(mode))
-    site = None if instrument is None else instrument.location
-    view = SkyView(chain, telescope, free, lam, placed, site)
+    else:
+        law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
+        stated = [meta.get("tracking") for meta in metas if meta.get("tracking") in law.modes]
+        mode = stated[0] if stated else next(iter(law.modes), None)
+        placed = _positions(chain, settings, law.plate_law(mode))
+        site = None if instrument is None else instrument.location
+    view = placed and SkyView(chain, telescope, free, lam, placed, site)
     # optics that never determine q and u say nothing of the sky
-    return view if view.good.any() else None
+    return view if view and view.good.any() else None
 
 
 def sequence_of(wanted, settings):
