@@ -75,28 +75,23 @@ def settings_of(measurement):
     Without a half-wave plate, or with devices that have states, they are those of the frames, so
     that what varies together stays together.
     """
-    angles, stood = {}, []
+    stood = []
     for dataset in measurement.datasets:
         states = {s: x[..., dataset.frames.T] for s, x in dataset._given.items() if "=" in s}
-        stood.append(dataset.positions | states)
-    if not any("hwp" in one for one in stood) or any(
-        "=" in stage for one in stood for stage in one
-    ):
-        shared = set.intersection(*map(set, stood)) - {*_POINTINGS, *COORDINATES}
+        stood.append({s: np.round(x, 6).ravel() for s, x in (dataset.positions | states).items()})
+    wanted = dict.fromkeys(stage for one in stood for stage in one)
+    if "hwp" not in wanted or any("=" in stage for stage in wanted):
+        shared = sorted(set.intersection(*map(set, stood)) - {*_POINTINGS, *COORDINATES})
         if not shared:
             return {}
-        each = [[np.round(p[s], 6).ravel() for s in sorted(shared)] for p in stood]
-        frames = np.hstack([np.vstack(one) for one in each])
+        frames = np.hstack([np.vstack([one[stage] for stage in shared]) for one in stood])
         frames = _spread_out(np.unique(frames, axis=1).T, _KEPT).T
-        return {stage: angle.tolist() for stage, angle in zip(sorted(shared), frames, strict=True)}
-    for dataset in measurement.datasets:
-        for stage, angle in dataset.positions.items():
-            if stage not in ("hwp", *_POINTINGS):
-                angles.setdefault(stage, []).append(np.round(angle, 6).ravel())
-    return {
-        stage: _spread_out(np.unique(np.concatenate(several))).tolist()
-        for stage, several in angles.items()
-    }
+        return {stage: angle.tolist() for stage, angle in zip(shared, frames, strict=True)}
+    found = {}
+    for stage in (stage for stage in wanted if stage not in ("hwp", *_POINTINGS)):
+        angles = np.concatenate([one[stage] for one in stood if stage in one])
+        found[stage] = _spread_out(np.unique(angles)).tolist()
+    return found
 
 
 def _spread_out(values, most=_MOST):
