@@ -391,15 +391,12 @@ def free_of(calibration):
 def from_first_stage(chain, wanted=None):
     """Return the optics from the first on a stage, or on one of those that are wanted."""
     found = leaves(chain)
-    for i, leaf in enumerate(found):
-        on_stage = (
-            leaf.stage is not None and leaf.stage not in COORDINATES
-            if wanted is None
-            else leaf.stage in wanted
-        )
-        if on_stage:
+    places = [leaf.stage for leaf in found]
+    for i, place in enumerate(places):
+        is_first = place and place not in COORDINATES if wanted is None else place in wanted
+        if is_first:
             return join(found[i:])
-    if wanted is None and any(leaf.stage in COORDINATES for leaf in found):
+    if wanted is None and any(place in COORDINATES for place in places):
         # whatever is in several states is not a source
         return chain
     raise ChainError("the chain has no optic on a stage; give the chain from the sky")

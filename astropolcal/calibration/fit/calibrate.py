@@ -269,10 +269,8 @@ def _check(measurement):
         # fitters tell neither name nor value
         allowed = f"{low:.7g} to {high:.7g} {unit}".strip()
         raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
-    vector, inside = measurement.vector(), np.clip(measurement.vector(), *measurement.free.bounds())
     # fitters refuse a start that is outside by a rounding error, too
-    if (vector != inside).any():
-        measurement.stand_at(inside)
+    measurement.stand_at(np.clip(measurement.vector(), *measurement.free.bounds()))
 
 
 def _robust(measurement, fitter, loss, outcome):

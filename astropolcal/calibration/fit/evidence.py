@@ -23,8 +23,8 @@ COURSES = ("constant", "steps", "drift", "walk", "scatter")
 SIZES, LAWS = (3.0, 10.0, 30.0, 100.0, 1000.0), (1, 3, None)
 #: Prior probability of a change between two runs where something was done in between.
 EVENT = 0.5
-# those of a drift, a walk and a scatter each, and of a step anywhere
-_OTHER, _CHANGED, _MOST_CHANGED = 0.1, 0.3, 0.05
+# those of a drift, a walk and a scatter each
+_OTHER = 0.1
 # a walk or a scatter of more numbers than this is looked for with simpler laws only
 _MOST_NUMBERS = 600
 _RANK = 1e-12
@@ -53,11 +53,6 @@ def chances_of(dates, events, usual):
                 )
             found[gap] = EVENT
     return found
-
-
-def chances_of_runs(dates, events):
-    """Return the same where one change in all runs is thought as probable as in a few."""
-    return chances_of(dates, events, min(_CHANGED / (len(dates) - 1), _MOST_CHANGED))
 
 
 def law_of(names, count):
@@ -161,11 +156,6 @@ class Weighed:
     chances: dict
     constant: float
     tries: list = field(repr=False)
-
-    @property
-    def varies(self):
-        """Probability that it is not constant."""
-        return 1 - self.chances["constant"]
 
     def odds_of(self, courses):
         """Return the log of how much more probable than constant some courses are together."""

@@ -18,7 +18,7 @@ from astropolcal.calibration.fit.evidence import (
     Deviation,
     Try,
     Weighed,
-    chances_of_runs,
+    chances_of,
     laws_of,
     waves_of,
     weigh,
@@ -37,6 +37,8 @@ _ENOUGH = float(np.log(_SURE / (1 - _SURE)))
 # others that explain it nearly as well are named: log evidence
 _RIVAL = 5.0
 _MOST_TERMS, _MOST_SEARCHES = 12, 5
+# prior probability of a step anywhere, and between two runs at the most
+_CHANGED, _MOST_CHANGED = 0.3, 0.05
 # courses that follow a law
 _SIMPLE = ("steps", "drift")
 # the solution has arrived where no determined direction moves by this share of its error
@@ -88,7 +90,11 @@ class Model:
         for free, vector, scale, mine, columns in reversed(list(parts)):
             self.limits[:, columns] = (np.array(free.bounds()) / scale)[:, ~mine]
             self.value[columns] = (vector / scale)[~mine]
-        self.chances = None if dates is None else chances_of_runs(dates, events)
+        self.chances = None
+        if dates is not None:
+            # one change in all runs is thought as probable as in a few
+            usual = min(_CHANGED / (len(dates) - 1), _MOST_CHANGED)
+            self.chances = chances_of(dates, events, usual)
         self.vectors = work.alone
         #: Rows around the parameters of each run alone, with its residuals there.
         self.alone = self.rows = work.around(self.vectors)

@@ -414,7 +414,8 @@ class RunsCalibration:
             # of several steps the last one is judged
             told, rivals, share = model.final(terms[-1])
             gaps = sorted(term.gap for term in terms if term.gap is not None)
-            row = {"what": what, "course": terms[-1].course, "probability": told.varies * share}
+            row = {"what": what, "course": terms[-1].course}
+            row["probability"] = (1 - told.chances["constant"]) * share
             row |= told.chances
             row["when"] = ", ".join(self._between(gap) for gap in gaps)
             rows.append(row | {"or": ", ".join(rivals)})
@@ -426,16 +427,16 @@ class RunsCalibration:
 
     def _runs(self):
         model = self._model
-        alone = [one.rms for one in model.alone]
-        table = QTable()
-        table["date"] = (
-            [""] * len(self) if self.dates is None else [d[:10] for d in self.dates.isot]
+        days = [""] * len(self) if self.dates is None else [d[:10] for d in self.dates.isot]
+        return QTable(
+            {
+                "date": days,
+                "tables": [", ".join(o.name for o in tables) for _, tables in model.work.parts],
+                "rms": [100 * one.rms for one in model.rows] * u.percent,
+                "rms_alone": [100 * one.rms for one in model.alone] * u.percent,
+                "stands_out": [one.stands_out for one in model.rows],
+            }
         )
-        table["tables"] = [", ".join(o.name for o in tables) for _, tables in model.work.parts]
-        table["rms"] = [100 * one.rms for one in model.rows] * u.percent
-        table["rms_alone"] = 100 * np.array(alone) * u.percent
-        table["stands_out"] = [one.stands_out for one in model.rows]
-        return table
 
     def _between(self, gap):
         days = sorted(self.dates.isot)
