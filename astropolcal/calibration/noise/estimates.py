@@ -82,10 +82,9 @@ def data_by_wavelength(measurement):
     A cell is a wavelength of a dataset.
     """
     numbers, wavelengths, rows = [], [], []
-    for i, part in enumerate(measurement.datasets):
-        bins = measurement.bins[measurement.segments[i]]
-        first = measurement.segments[i].start
-        rows += [first + np.flatnonzero(bins == b) for b in part.bins]
+    for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
+        bins = measurement.bins[where]
+        rows += [where.start + np.flatnonzero(bins == b) for b in part.bins]
         wavelengths.append(part.observations.wavelength.to_value(u.nm))
         numbers += [i] * len(part.bins)
     return np.array(numbers), np.concatenate(wavelengths) * u.nm, rows
@@ -279,20 +278,16 @@ def _states(observations):
 def equal_axes(angle, tolerance):
     """Number axes (radian, modulo 180 deg) so that those of one number lie within a tolerance."""
     axis = np.mod(angle, np.pi)
-    order = np.argsort(axis, kind="stable")
-    gaps = np.diff(axis[order], append=axis[order[0]] + np.pi)
+    ordered = np.sort(axis)
+    gaps = np.diff(ordered, append=ordered[0] + np.pi)
     # begin behind the largest gap, lest 0 and 180 deg be torn apart
-    start = (int(np.argmax(gaps)) + 1) % len(axis)
-    order = np.roll(order, -start)
-    along = np.mod(axis[order] - axis[order[0]], np.pi)
-    label, first = np.zeros(len(axis), dtype=int), along[0]
-    for i, value in enumerate(along[1:], start=1):
-        new = value - first > tolerance
-        first = value if new else first
-        label[i] = label[i - 1] + new
-    result = np.empty_like(label)
-    result[order] = label
-    return result
+    along = np.mod(axis - ordered[(np.argmax(gaps) + 1) % len(axis)], np.pi)
+    found, number, first = np.empty(len(axis), dtype=int), -1, -np.inf
+    for i in np.argsort(along, kind="stable"):
+        if along[i] - first > tolerance:
+            number, first = number + 1, along[i]
+        found[i] = number
+    return found
 
 
 # ---- noise of the data from the null channel, which the double difference cancels ----
