@@ -3,7 +3,6 @@
 
 from collections import defaultdict
 from functools import cached_property
-from typing import NamedTuple
 
 import astropy.units as u
 import numpy as np
@@ -24,28 +23,17 @@ _BLOCK = 4096
 STILL = 1e-5
 
 
-class Directions(NamedTuple):
+class Directions:
     """Singular values, right singular vectors as rows, and the rank."""
 
-    singular: np.ndarray
-    right: np.ndarray
-    rank: int
-
-    @property
-    def null(self):
-        """Rows along which nothing changes."""
-        return self.right[self.rank :]
-
-    @property
-    def determined(self):
-        """Whether each column is static along all open directions."""
-        return (np.abs(self.null) < STILL).all(axis=0)
-
-    @property
-    def half(self):
-        """Determined rows, each as long as its standard error for unit noise."""
-        # covariance = V S^-2 V^T = half^T half
-        return self.right[: self.rank] / self.singular[: self.rank, None]
+    def __init__(self, singular, right, rank):
+        self.singular, self.right, self.rank = singular, right, rank
+        #: Rows along which nothing changes.
+        self.null = right[rank:]
+        #: Whether each column is static along all open directions.
+        self.determined = (np.abs(self.null) < STILL).all(axis=0)
+        #: Determined rows, each as long as its standard error for unit noise.
+        self.half = right[:rank] / singular[:rank, None]  # covariance = V S^-2 V^T = half^T half
 
 
 def decompose(rows):

@@ -11,8 +11,6 @@ residual r has the noise that a least-squares fit would need to give it the weig
 Nothing is dropped; `outlying_data` says which frames depart.
 """
 
-from dataclasses import dataclass
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -153,7 +151,6 @@ _MAX_EVALUATIONS = 100
 _LARGEST = 1.0
 
 
-@dataclass(frozen=True, eq=False)
 class Weighting:
     """Noise that a fit assumes of its data.
 
@@ -162,28 +159,14 @@ class Weighting:
     determined it.
     """
 
-    choice: str | None
-    sigma: np.ndarray
-
-    @property
-    def is_known(self):
-        """Whether every datum has a noise."""
-        return not np.isnan(self.sigma).any()
-
-    @property
-    def weight(self):
-        """One over the noise of each datum; None where all weigh the same."""
-        return None if self.choice is None or not self.is_known else 1 / self.sigma
-
-    @property
-    def level(self):
-        """Standard deviation of a datum of weight one, against which priors weigh."""
-        return float(self.sigma[0]) if self.weight is None else 1.0
-
-    @property
-    def from_residuals(self):
-        """Whether the noise comes from the residuals of the fit."""
-        return self.choice in (None, "wavelength")
+    def __init__(self, choice, sigma):
+        self.choice, self.sigma = choice, sigma
+        #: Whether every datum has a noise, and whether it comes from the residuals of the fit.
+        self.is_known, self.from_residuals = not np.isnan(sigma).any(), choice in CHOICES[:2]
+        #: One over the noise of each datum; None where all weigh the same.
+        self.weight = 1 / sigma if choice is not None and self.is_known else None
+        #: Standard deviation of a datum of weight one, against which priors weigh.
+        self.level = float(sigma[0]) if self.weight is None else 1.0
 
     def agrees(self, other):
         """Return whether another noise is the same to a hundredth."""
