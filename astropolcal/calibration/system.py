@@ -297,6 +297,8 @@ class MuellerMatrices:
         self._chain, self._lam, self._positions, self.which = chain, lam, positions, which
         # where a law gives all wavelengths no parameter has a value at each
         self._mix = np.zeros((len(lam), len(calibration.wavelength))) if mix is None else mix
+        names = [f"{leaf.name}.{key}" for leaf in leaves(chain) for key in leaf.param_names]
+        self._names = [name for name in names if self._free.lookup(name)[0] is not None]
 
     def of(self, which):
         """Return the same for other frames."""
@@ -349,11 +351,6 @@ class MuellerMatrices:
     @cached_property
     def _local(self):
         return _reduced(self._along[0] * self._axes.sigmas)
-
-    @cached_property
-    def _names(self):
-        names = [f"{leaf.name}.{key}" for leaf in leaves(self._chain) for key in leaf.param_names]
-        return [name for name in names if self._free.lookup(name)[0] is not None]
 
     def _slopes(self, at):
         """Return derivatives at some settings, (n_settings, n_wavelengths, 16, n_parameters)."""

@@ -196,12 +196,10 @@ class Scatter:
         ]
         for part in self.parts:
             part.shares = self._shares(part, residuals[part.rows])
-
-    @property
-    def is_known(self):
-        """Whether the residuals of all datasets tell how they scatter."""
-        known = (np.isfinite(part.amplitude).all() for part in self.parts)
-        return bool(np.isfinite(self._level).all()) and all(known)
+        #: Whether the residuals of all datasets tell how they scatter.
+        self.is_known = all(
+            np.isfinite(x).all() for x in (self._level, *(p.amplitude for p in self.parts))
+        )
 
     def _part(self, i, groups, residuals, leverage):
         dataset, rows = self.measurement.datasets[i], self.measurement.segments[i]
