@@ -42,7 +42,6 @@ HEAVY = (
     "distributed",
     "emcee",
     "jinja2",
-    "h5py",
     "matplotlib",
     "photutils",
     "specutils",

@@ -1,19 +1,17 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Ways to spoil the structure of FITS and HDF5 files."""
+"""Ways to spoil the structure of FITS files."""
 
 import gzip
 import io
-import os
-from contextlib import suppress
 from functools import lru_cache
 
 import numpy as np
 from astropy.io import fits
 
 from astropolcal.fitscheck import MOST_HDUS, _walk
-from tests.fuzz.mutate import HOSTILE, NUMBERS, mutate_bytes, mutate_json, some
+from tests.fuzz.mutate import HOSTILE, NUMBERS, mutate_bytes, some
 
-__all__ = ["forge_checksums", "mutate_fits", "mutate_hdf5"]
+__all__ = ["forge_checksums", "mutate_fits"]
 
 BLOCK, CARD = 2880, 80
 SIZES = ("0", "1", "-1", "2", "3", "999", "99999", "1000000000", "9223372036854775807", "4.5", "T")
@@ -200,91 +198,3 @@ def forge_checksums(content):
             head = head.replace(key, b"COMMENT  ")
         content = content[:start] + head + content[end:]
     return content
-
-
-# ---- HDF5 --------------------------------------------------------------------------
-
-
-def mutate_hdf5(rng, content):
-    """Replace datasets, links, attributes or records of an HDF5 file."""
-    import h5py
-
-    if rng.random() < 0.3:
-        return mutate_bytes(rng, content)
-    buffer = io.BytesIO(content)
-    # a file that was spoiled already may not close
-    with suppress(ValueError, OSError, RuntimeError), h5py.File(buffer, "r+") as file:
-        for _ in range(int(rng.integers(1, 3))):
-            names = []
-            file.visit(names.append)
-            # a file that was spoiled already may not take more
-            with suppress(ValueError, TypeError, OSError, KeyError, OverflowError, RuntimeError):
-                _hdf5_step(rng, h5py, file, some(rng, names))
-    return buffer.getvalue()
-
-
-def _hdf5_step(rng, h5py, file, name):
-    kinds = ("delete", "soft", "loop", "link", "outside", "virtual", "type", "shape", "huge")
-    kind = some(rng, (*kinds, "values", "values", "group", "text", "format", "record", "packed"))
-    old = file.get(name)
-    small = isinstance(old, h5py.Dataset) and old.size < 10**6
-    old = old[...] if small else np.zeros(3)
-    if kind == "values":
-        _values(rng, file, name, old)
-        return
-    if kind == "format":
-        file.attrs["format"] = some(rng, (3.0, b"x", "astropolcal", np.arange(4)))
-        return
-    if kind == "text":
-        text = file.get("description")
-        small = isinstance(text, h5py.Dataset) and text.size < 10**6
-        text = mutate_json(rng, text[...].tobytes() if small else b"{}")
-        name, old = "description", np.frombuffer(text, dtype=np.uint8)
-    if name in file:
-        del file[name]
-    if kind == "delete":
-        return
-    try:
-        _put(rng, h5py, file, name, old, kind)
-    except (ValueError, TypeError, OSError, OverflowError):
-        file[name] = old
-
-
-def _put(rng, h5py, file, name, old, kind):
-    if kind == "link":
-        file[name] = h5py.ExternalLink("canary.h5", "chain")
-    elif kind in ("soft", "loop"):
-        file[name] = h5py.SoftLink(f"/{name}" if kind == "loop" else "/record")
-    elif kind == "outside":
-        target = os.path.abspath(some(rng, ("canary.h5", "canary.txt", "/etc/hostname")))
-        file.create_dataset(name, old.shape, old.dtype, external=[(target, 0, old.nbytes)])
-    elif kind == "virtual":
-        layout = h5py.VirtualLayout(old.shape, old.dtype)
-        layout[...] = h5py.VirtualSource("canary.h5", "chain", shape=old.shape)
-        file.create_virtual_dataset(name, layout)
-    elif kind == "huge":
-        shape = some(rng, ((10**9,), (10**5, 10**5), (10**9, *old.shape[1:]), (2**40,)))
-        file.create_dataset(name, shape, old.dtype, chunks=tuple(min(n, 64) for n in shape))
-    elif kind == "type":
-        kinds = (np.float32, np.int64, "S8", h5py.string_dtype(), h5py.ref_dtype, np.complex128)
-        file.create_dataset(name, old.shape, some(rng, kinds))
-    elif kind == "shape":
-        shape = some(rng, ((), (0,), (1,), old.shape[::-1], (*old.shape, 2), old.shape[1:]))
-        file.create_dataset(name, shape, old.dtype)
-    elif kind == "group":
-        file.create_group(name)
-    elif kind == "packed":
-        file.create_dataset(name, data=old, compression="gzip")
-    else:
-        file[name] = old
-
-
-def _values(rng, file, name, old):
-    if not old.size or old.dtype.kind not in "fiu":
-        return
-    flat = old.reshape(-1).copy()
-    place = int(rng.integers(flat.size))
-    new = some(rng, (np.nan, np.inf, 1e308, -1.0, 0.0, 1.0, 127.0))
-    with np.errstate(all="ignore"):
-        flat[place : place + some(rng, (1, 1, 10**6))] = np.array(new).astype(old.dtype)
-    file[name][...] = flat.reshape(old.shape)

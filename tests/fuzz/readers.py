@@ -857,7 +857,7 @@ class Described(Reader):
 class Checkpoint(Reader):
     """Checkpoints of a sampler."""
 
-    suffix = ".h5"
+    suffix = ".chain"
     shape, every = (8, 4, 2), 2
     description = {"parameters": [["hwp.theta", "deg"]], "seed": 1, "moves": ["DEMove"]}
     arrays = {"noise": np.ones(5), "bounds": np.zeros((2, 2))}
@@ -879,7 +879,10 @@ class Checkpoint(Reader):
         }
 
     def mutate(self, rng, content):
-        return binary.mutate_hdf5(rng, content)
+        if rng.random() < 0.5:
+            return mutate.mutate_bytes(rng, content)
+        kind, stated, steps = content.split(b"\n", 2)
+        return b"\n".join([kind, mutate.mutate_json(rng, stated), steps])
 
     def read(self, path):
         return self._run(path, 8)

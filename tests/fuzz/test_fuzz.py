@@ -27,7 +27,6 @@ FAILED = {
     "forged": {0: (14, 17, 18, 21), 1: (58, 333, 1231, 717, 2987, 3133, 3222, 5030)},
     "observations": {0: (33, 45), 1: (3869, 5501, 6332, 8381)},
     "spectra": {0: (84,), 5: (8038,)},
-    "checkpoint": {0: (58, 137, 168, 184), 1: (222, 274, 306, 387)},
     "csv": {5: (2376, 2800)},
     "cube": {5: (12, 4446), 6: (15,)},
     "star": {6: (482,), 8: (822,)},
@@ -42,7 +41,7 @@ FAILED = {
 #: Slow ones take a part of that.
 SHARE = {"calibration": 2, "forged": 2, "loaded": 4, "observations": 2, "spectra": 2}
 SHARE |= dict.fromkeys(("cube", "star", "cameras", "header", "science", "info", "product"), 3)
-NEEDS = {"checkpoint": "h5py", "spectra": "specutils"}
+NEEDS = {"spectra": "specutils"}
 
 
 @pytest.fixture(params=READERS)

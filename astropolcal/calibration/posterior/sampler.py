@@ -94,7 +94,13 @@ class LogPosterior:
         #: Bounds of what varies, canonical.
         self.low, self.high = low[self.sampled], high[self.sampled]
         #: Noise of each datum, shape (n_data,).
-        self.sigma = _sigma(measurement, weights, noise)
+        if noise is not None:
+            self.sigma = given_noise(measurement, noise)
+        else:
+            if isinstance(weights, str) and weights == FIT:
+                known = measurement.weighting
+                weights = None if known is None else known.choice
+            self.sigma = noise_of(measurement, weights).sigma
 
     @property
     def centre(self):
@@ -121,36 +127,27 @@ class LogPosterior:
                 f"values of shape {values.shape} for {self.sampled.size} parameters; allowed are "
                 f"({self.sampled.size},) and (n_walkers, {self.sampled.size})"
             )
-        found = self._of_rows(np.atleast_2d(values))
-        return float(found[0]) if values.ndim == 1 else found
-
-    def _of_rows(self, rows):
+        rows = np.atleast_2d(values)
         # an optic outside of its bounds may not exist, so nothing is evaluated there
         inside = ((rows >= self.low) & (rows <= self.high)).all(axis=1)
-        found = np.full(len(rows), -np.inf)
-        if not inside.any():
-            return found
         vectors = np.tile(self.fitted, (int(inside.sum()), 1))
         vectors[:, self.sampled] = rows[inside]
-        likelihood = np.array([self._log_likelihood(vector) for vector in vectors])
-        total = likelihood + sum(
-            prior.log_densities(vectors[:, slot.slice]).sum(axis=1)
-            for slot, prior in self.measurement.free.priors
-        )
+        total = -0.5 * np.array([self._chi2(vector) for vector in vectors])
+        for slot, prior in self.measurement.free.priors:
+            total += prior.log_densities(vectors[:, slot.slice]).sum(axis=1)
+        found = np.full(len(rows), -np.inf)
         # emcee stops at NaN; a model that fails somewhere makes that place impossible
         found[inside] = np.where(np.isnan(total), -np.inf, total)
-        return found
+        return float(found[0]) if values.ndim == 1 else found
 
-    def _log_likelihood(self, vector):
+    def _chi2(self, vector):
         # not through Measurement.predict, which keeps its last sweep for the fitters
-        chi2 = 0.0
-        for dataset, segment in zip(
-            self.measurement.datasets, self.measurement.segments, strict=True
-        ):
+        chi2, measurement = 0.0, self.measurement
+        for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
             residual = dataset.observed - dataset.values(dataset.forward(vector))
             residual /= self.sigma[segment]
             chi2 += residual @ residual
-        return -0.5 * chi2
+        return chi2
 
     def whitened_jacobian(self):
         """Return derivatives of data and priors over their noise, (n, n_data + n_priors)."""
@@ -182,15 +179,6 @@ def _elements(free, parameters):
     if not found or len(set(found)) < len(found):
         raise ParameterError(f"parameters = {parameters} must name something, and nothing twice")
     return np.array(found)
-
-
-def _sigma(measurement, weights, noise):
-    """Return the noise of every datum: given, that of the fit, or for a choice of weights."""
-    if noise is not None:
-        return given_noise(measurement, noise)
-    if isinstance(weights, str) and weights == FIT:
-        weights = measurement.weighting.choice if measurement.weighting is not None else None
-    return noise_of(measurement, weights).sigma
 
 
 # ---- where the walkers of a sampler start, and how they move ----
@@ -289,26 +277,14 @@ def _inward(log_posterior):
 def default_moves(emcee, laplace):
     """Return what moves the walkers, with the share of each.
 
-    Steps around the fit, as good in a hundred parameters as in one; steps of what sits at a bound
-    alone; and differential evolution, which needs no fit.
+    Steps around the fit, as good in a hundred parameters as in one, accepted as far as the
+    posterior is the normal distribution around it (Cotter et al. 2013, Statistical Science 28, 424,
+    doi:10.1214/13-STS421); steps of what sits at a bound alone; and differential evolution, which
+    needs no fit.
     """
-    moves = [(emcee.moves.DEMove(), 0.3)]
-    if laplace.determined.any():
-        moves.append((_crank_nicolson(emcee, laplace), 0.5))
-    if not laplace.free.all():
-        moves.append((_bound_move(emcee, laplace), 0.2))
-    return moves
+    moved, held = laplace.determined, ~laplace.free
 
-
-def _crank_nicolson(emcee, laplace):
-    """Return a step that keeps the normal distribution around the fit.
-
-    It is accepted as far as the posterior is that distribution (Cotter et al. 2013, Statistical
-    Science 28, 424, doi:10.1214/13-STS421).
-    """
-    moved = laplace.determined
-
-    def proposal(coords, random):
+    def around_the_fit(coords, random):
         before = laplace.normal(coords)
         after = before.copy()
         anew = random.uniform(_LEAST_ANEW, 1.0, size=(len(coords), 1))
@@ -321,23 +297,21 @@ def _crank_nicolson(emcee, laplace):
     class CrankNicolsonMove(emcee.moves.MHMove):
         """Steps around the fit."""
 
-    return CrankNicolsonMove(proposal)
-
-
-def _bound_move(emcee, laplace):
-    """Return differential evolution of what sits at a bound, the rest held."""
-    held = ~laplace.free
-
     class BoundDEMove(emcee.moves.DEMove):
-        """Differential evolution of some parameters."""
+        """Differential evolution of what sits at a bound, the rest held."""
 
         def get_proposal(self, s, c, random):
-            moved, factors = super().get_proposal(s, c, random)
-            return np.where(held, moved, s), factors
+            proposed, factors = super().get_proposal(s, c, random)
+            return np.where(held, proposed, s), factors
 
-    # the optimal scale for as many dimensions as move
-    # (ter Braak 2006, doi:10.1007/s11222-006-8769-1)
-    return BoundDEMove(gamma0=2.38 / np.sqrt(2 * int(held.sum())))
+    moves = [(emcee.moves.DEMove(), 0.3)]
+    if moved.any():
+        moves.append((CrankNicolsonMove(around_the_fit), 0.5))
+    if held.any():
+        # the optimal scale for as many dimensions as move
+        # (ter Braak 2006, doi:10.1007/s11222-006-8769-1)
+        moves.append((BoundDEMove(gamma0=2.38 / np.sqrt(2 * int(held.sum()))), 0.2))
+    return moves
 
 
 def move_names(moves):
@@ -405,7 +379,7 @@ def sample(
     seed : int, optional
         Makes the run repeatable.
     checkpoint : path-like, optional
-        HDF5 file that the run is written to.
+        File that the run is written to.
     checkpoint_every : int
         Number of kept steps between two writes, which is the most that a killed run loses.
     resume : bool
@@ -428,7 +402,7 @@ def sample(
     Raises
     ------
     AstropolcalError
-        If emcee, or h5py for a checkpoint, is not installed.
+        If emcee is not installed.
     FitError
         If the numbers of walkers or steps make no sense, a move is known to
         sample wrongly, the walkers find no place to start, or the checkpoint
@@ -472,7 +446,13 @@ def sample(
     n_walkers = max(2 * n, _FEWEST_WALKERS) if n_walkers is None else n_walkers
     thin = max(n // _PARAMETERS_A_STEP_KEPT, 1) if thin is None else thin
     _check(n, n_walkers, n_steps, thin, checkpoint_every)
-    left_out = _kept_burn_in(burn_in, n_steps, thin)
+    if burn_in is not None:
+        # two kept steps at least must be left, for a standard deviation
+        most = (n_steps // thin - 2) * thin
+        if not _is_whole(burn_in) or not 0 <= burn_in <= most:
+            allowed = f"{n_steps} steps allow whole numbers from 0 to {most}"
+            raise _refused("burn_in", burn_in, allowed)
+        burn_in = -(-int(burn_in) // thin)
     laplace = Laplace(log_posterior)
     moves = default_moves(emcee, laplace) if moves is None else moves
     refuse_biased(moves, emcee.__version__)
@@ -482,43 +462,45 @@ def sample(
     description, arrays = _fingerprint(log_posterior, n_walkers, thin, moves, seed)
     with chain.open(checkpoint, description, arrays, resume):
         _run(emcee, sampler, laplace, chain, thin, seed, progress)
-    settings = _settings(log_posterior, moves, weights, emcee.__version__)
-    posterior = _result(log_posterior, chain, thin, seed, left_out, settings)
-    _warn(posterior)
+    kept = chain.count
+    posterior = Posterior(
+        log_posterior.names,
+        log_posterior.units,
+        # from canonical to declared units
+        chain.coords[:kept] / log_posterior.factors,
+        chain.log_prob[:kept],
+        acceptance=chain.accepted / (kept * thin),
+        fitted=log_posterior.centre / log_posterior.factors,
+        thin=thin,
+        seed=seed,
+        settings=_settings(log_posterior, moves, weights, emcee.__version__),
+        burn_in=burn_in,
+    )
+    if not posterior.converged:
+        short = posterior.n_times < ENOUGH
+        problem = (
+            f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
+        )
+        complaints = "; ".join(posterior.convergence.complaints(posterior.names))
+        warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=2)
     return posterior
-
-
-def _warn(posterior):
-    if posterior.converged:
-        return
-    short = posterior.n_times < ENOUGH
-    problem = f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
-    complaints = "; ".join(posterior.convergence.complaints(posterior.names))
-    warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=3)
-
-
-def _kept_burn_in(burn_in, n_steps, thin):
-    """Return the number of kept steps to leave out, None for the usual one."""
-    if burn_in is None:
-        return None
-    # two kept steps at least must be left, for a standard deviation
-    most = (n_steps // thin - 2) * thin
-    if not isinstance(burn_in, (int, np.integer)) or not 0 <= burn_in <= most:
-        raise _refused("burn_in", burn_in, f"{n_steps} steps allow whole numbers from 0 to {most}")
-    return -(-int(burn_in) // thin)
 
 
 def _check(n, n_walkers, n_steps, thin, every):
     for name, value in (("n_steps", n_steps), ("thin", thin), ("checkpoint_every", every)):
-        if not isinstance(value, (int, np.integer)) or value < 1:
+        if not _is_whole(value) or value < 1:
             raise _refused(name, value, "allowed are whole numbers from 1 up")
     if n_steps < 2 * thin:
         kept = f", as one in {thin} is kept" if thin > 1 else ""
         raise _refused("n_steps", n_steps, f"allowed are whole numbers from {2 * thin} up{kept}")
     fewest = max(2 * n, 4)
-    if not isinstance(n_walkers, (int, np.integer)) or n_walkers < fewest:
+    if not _is_whole(n_walkers) or n_walkers < fewest:
         reason = f"{n} parameters need a whole number from {fewest} up"
         raise _refused("n_walkers", n_walkers, reason)
+
+
+def _is_whole(value):
+    return isinstance(value, (int, np.integer))
 
 
 def _refused(name, value, reason):
@@ -527,10 +509,19 @@ def _refused(name, value, reason):
 
 def _run(emcee, sampler, laplace, chain, thin, seed, progress):
     """Advance the walkers until the chain is full."""
-    total = len(chain.coords) * thin
-    state = _first_state(emcee, laplace, chain, sampler.nwalkers, seed)
+    if chain.count:
+        coords, log_prob = chain.coords[chain.count - 1], chain.log_prob[chain.count - 1]
+        random_state = chain.random_state
+    else:
+        # independent streams: the start does not depend on how many numbers the steps draw
+        start, moving = np.random.SeedSequence(seed).spawn(2)
+        coords = laplace.start(sampler.nwalkers, np.random.default_rng(start))
+        log_prob = laplace.log_posterior(coords)
+        # emcee takes the state of numpy's old generator only
+        random_state = np.random.RandomState(np.random.MT19937(moving)).get_state()
+    state = emcee.State(coords, log_prob=log_prob, random_state=random_state)
     previous, accepted = state.coords.copy(), chain.accepted.copy()
-    done = chain.count * thin
+    total, done = len(chain.coords) * thin, chain.count * thin
     states = sampler.sample(state, iterations=total - done, store=False)
     with shown(progress):
         for step, state in enumerate(steps(states, "steps", total, done), done + 1):
@@ -539,20 +530,6 @@ def _run(emcee, sampler, laplace, chain, thin, seed, progress):
             previous[...] = state.coords
             if step % thin == 0:
                 chain.append(state.coords, state.log_prob, state.random_state, accepted)
-
-
-def _first_state(emcee, laplace, chain, n_walkers, seed):
-    if chain.count:
-        last = chain.count - 1
-        return emcee.State(
-            chain.coords[last], log_prob=chain.log_prob[last], random_state=chain.random_state
-        )
-    # independent streams: the start does not depend on how many numbers the steps draw
-    start, steps = np.random.SeedSequence(seed).spawn(2)
-    coords = laplace.start(n_walkers, np.random.default_rng(start))
-    # emcee takes the state of numpy's old generator only
-    legacy = np.random.RandomState(np.random.MT19937(steps)).get_state()
-    return emcee.State(coords, log_prob=laplace.log_posterior(coords), random_state=legacy)
 
 
 # ---- what a checkpoint must agree with -----------------------------------------------
@@ -567,12 +544,18 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
     # what varies starts at the fit, but does not define the run
     held[log_posterior.sampled] = 0.0
     description = {
-        "parameters": [[n, str(u or "")] for n, u in _pairs(log_posterior)],
+        "parameters": [
+            [name, str(unit or "")]
+            for name, unit in zip(log_posterior.names, log_posterior.units, strict=True)
+        ],
         "model": [[_optic(leaf) for leaf in leaves(chain)] for chain in measurement.chains],
         "ties": [[name, t.source, t.factor, str(t.offset)] for name, t in free.ties.items()],
         "data": [dataset.observations.content_hash for dataset in measurement.datasets],
         "observable": measurement.observable.name,
-        "priors": [[slot.name, *_distribution(prior)] for slot, prior in free.priors],
+        "priors": [
+            [slot.name, f.dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
+            for slot, f in _distributions(free)
+        ],
         "n_walkers": int(n_walkers),
         "thin": int(thin),
         "moves": move_names(moves),
@@ -587,10 +570,6 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
     return description, arrays
 
 
-def _pairs(log_posterior):
-    return zip(log_posterior.names, log_posterior.units, strict=True)
-
-
 def _optic(leaf):
     """Return class, name and stage of an optic, and the values of what is fixed."""
     fixed = {
@@ -601,26 +580,9 @@ def _optic(leaf):
     return [type(leaf).__name__, leaf.name, leaf.mount, fixed]
 
 
-def _distribution(prior):
-    frozen = prior.distribution
-    return frozen.dist.name, repr(frozen.args), repr(sorted(frozen.kwds.items()))
-
-
-def _result(log_posterior, chain, thin, seed, burn_in, settings):
-    kept = chain.count
-    return Posterior(
-        log_posterior.names,
-        log_posterior.units,
-        # from canonical to declared units
-        chain.coords[:kept] / log_posterior.factors,
-        chain.log_prob[:kept],
-        acceptance=chain.accepted / (max(chain.accepted_over, kept) * thin),
-        fitted=log_posterior.centre / log_posterior.factors,
-        thin=thin,
-        seed=seed,
-        settings=settings,
-        burn_in=burn_in,
-    )
+def _distributions(free):
+    """Return each slot that has a prior, with the frozen distribution of scipy."""
+    return [(slot, prior.distribution) for slot, prior in free.priors]
 
 
 def _settings(log_posterior, moves, weights, version):
@@ -636,19 +598,16 @@ def _settings(log_posterior, moves, weights, version):
             "median": float(np.median(sigma)),
             "largest": float(sigma.max()),
         },
-        "priors": [_prior(slot, prior) for slot, prior in free.priors],
+        "priors": [
+            {
+                "parameter": slot.name,
+                "unit": str(slot.unit or ""),
+                "distribution": frozen.dist.name,
+                "mean": np.asarray(frozen.mean(), dtype=float).tolist(),
+                "std": np.asarray(frozen.std(), dtype=float).tolist(),
+            }
+            for slot, frozen in _distributions(free)
+        ],
         "moves": move_names(moves),
         "emcee": version,
-    }
-
-
-def _prior(slot, prior):
-    name, *_ = _distribution(prior)
-    frozen = prior.distribution
-    return {
-        "parameter": slot.name,
-        "unit": str(slot.unit or ""),
-        "distribution": name,
-        "mean": np.asarray(frozen.mean(), dtype=float).tolist(),
-        "std": np.asarray(frozen.std(), dtype=float).tolist(),
     }
