@@ -100,9 +100,9 @@ def test_groups_in_one_step_are_as_fits_without_them(monkeypatch):
             chain, data, cross_validate=False, weights="errors" if weighted else None
         )
         vector = fitted.measurement.vector()
-        linear = cross_validated_residuals(measurement, vector, weights)
+        linear = cross_validated_residuals(measurement, weights)
         monkeypatch.setattr(accuracy, "_MANY", 1000)
-        exact = cross_validated_residuals(measurement, vector, weights)
+        exact = cross_validated_residuals(measurement, weights)
         assert np.isfinite(linear).all(), weighted
         # larger than the residuals of the fit, by the same
         change = exact - measurement.residuals(vector)
@@ -116,7 +116,7 @@ def test_group_that_alone_determines_something_is_not_predicted(monkeypatch):
     # one group holds all data of the first wavelength
     labels = np.where(measurement.bins == 0, 0, 1 + np.arange(measurement.n_data) % 20)
     with pytest.raises(FitError, match="the others do not determine"):
-        cross_validated_residuals(measurement, measurement.vector(), groups=labels)
+        cross_validated_residuals(measurement, groups=labels)
 
 
 # --- nearly degenerate parameters of stars -----------------------------------------------------

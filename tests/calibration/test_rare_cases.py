@@ -249,10 +249,10 @@ def test_linear_steps_are_what_refits_give(cal, monkeypatch):
     from astropolcal.calibration.validation import cross_validation as accuracy
 
     (part,) = cal.measurement.datasets
-    groups, vector = part.group_of_datum // 2, cal.measurement.vector()
-    exact = cross_validated_residuals(cal.measurement, vector, groups=groups)
+    groups = part.group_of_datum // 2
+    exact = cross_validated_residuals(cal.measurement, groups=groups)
     monkeypatch.setattr(accuracy, "_MANY", 2)
-    linear = cross_validated_residuals(cal.measurement, vector, groups=groups)
+    linear = cross_validated_residuals(cal.measurement, groups=groups)
     scatter = np.sqrt(np.mean(exact**2))
     assert np.abs(linear - exact).max() < 0.02 * scatter
     # what was left out is predicted worse than it was fitted
@@ -271,7 +271,7 @@ def test_a_group_that_alone_determines_something_is_named(make, chain, monkeypat
     groups = (part.group_of_datum // 4).astype(int)
     monkeypatch.setattr(accuracy, "_MANY", 2)
     with pytest.raises(FitError, match=r"without group 0 .*do not determine .*efficiency"):
-        cross_validated_residuals(measurement, measurement.vector(), groups=groups)
+        cross_validated_residuals(measurement, groups=groups)
 
 
 # --- derived quantities, stars, targets -----------------------------------------------------

@@ -13,14 +13,12 @@ from astropolcal.calibration import calibrate
 from astropolcal.calibration.result.summary import (
     _accuracy_lines,
     _bound_lines,
-    _global_lines,
     _goodness_lines,
     _heading,
     _rows,
     _standard_lines,
     _target_row,
     _wavelength_blocks,
-    _with_wavelengths,
     _wrap,
     mirror_lines,
     open_lines,
@@ -73,7 +71,7 @@ AT = np.array(True)
 
 def test_long_lines_are_broken_behind_their_bullet():
     long = "  - " + "word " * 30
-    lines = list(_wrap([long, "short", ""]))
+    lines = _wrap(_calibration(), [long, "short", ""])
     assert all(len(line) <= 80 for line in lines)
     assert lines[0].startswith("  - word")
     assert lines[1].startswith("    word")
@@ -115,14 +113,13 @@ def test_a_parameter_for_all_wavelengths():
         (_entry(1.5, np.nan, u.deg), "     1.50000 deg (open: not determined alone)"),
         (_entry(1.5, 0.25, u.deg, tied="b.c"), "     1.50000 deg (follows b.c)"),
     ]:
-        head, line = _global_lines({"a.theta": entry})
-        assert head == "Parameters for all wavelengths"
+        (line,) = parameter_lines({"a.theta": entry}, several=False)
         assert line == f"  {'a.theta':<28}{words}"
 
 
 def test_fixed_ones_and_those_of_a_wavelength_are_not_among_them():
     known = {"a.b": _entry(1.0, fixed=True), "c.d": _entry([1.0, 2.0], [0.01, np.nan])}
-    assert _global_lines(known) == []
+    assert parameter_lines(known, several=False) == []
     (line,) = parameter_lines(known)
     assert line.split() == ["c.d", *"1.0000 to 2.0000 +- 0.01 (1 open)".split()]
 
@@ -245,7 +242,7 @@ def test_some_outliers_are_named_and_the_others_counted():
     for count, more in [(1, None), (5, None), (6, 1), (9, 4)]:
         cal = _calibration(fit={"outliers": [_outlier(i) for i in range(count)]})
         text = " ".join(" ".join(_goodness_lines(cal)).split())
-        assert text.startswith("Goodness of fit - frames 0, 1 of night are at odds with the fit"), (
+        assert text.startswith("- frames 0, 1 of night are at odds with the fit"), (
             count,
             more,
         )
@@ -257,7 +254,7 @@ def test_some_outliers_are_named_and_the_others_counted():
 
 def test_nothing_tested_nothing_said():
     assert _goodness_lines(_calibration()) == []
-    assert _bound_lines(_calibration(), {"a.b": _entry(1.0, 0.1)}) == []
+    assert _bound_lines({"a.b": _entry(1.0, 0.1)}) == []
 
 
 def test_what_is_at_a_bound_and_what_hangs_on_it():
@@ -269,17 +266,17 @@ def test_what_is_at_a_bound_and_what_hangs_on_it():
         "w.eff": _entry([2.0, 1.0, 1.0], 0.01, at_bound=at, std_inward=np.full(3, np.inf)),
         "b.q": _entry([1.0, 1.0, 1.0], 0.01, **hanging),
     }
-    lines = _bound_lines(_calibration(), known)
+    lines = _wrap(_calibration(), _bound_lines(known))
     assert all(len(line) <= 80 for line in lines)
     assert " ".join(" ".join(lines).split()) == (
-        "At a bound - a.theta: above 1.50 - w.eff (1200.0 nm): not limited - the "
+        "- a.theta: above 1.50 - w.eff (1200.0 nm): not limited - the "
         "error of b.q at 2 wavelengths is conditional on w.eff (1200.0 nm) at its bound; without "
         "it 2 to 5 times as large"
     )
 
 
 def test_elements_in_words_are_named_by_their_wavelength():
-    words = _with_wavelengths("hwp.retardance[1] by +1 deg, a.b[9]", _calibration())
+    (words,) = _wrap(_calibration(), ["hwp.retardance[1] by +1 deg, a.b[9]"])
     assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
 
 

@@ -459,7 +459,7 @@ def test_cross_validation_by_chosen_groups(make, chain):
     before = cal.accuracy["s_cv"].copy()
     table = four_accuracies(cal, groups="cycle")
     m = cal.measurement
-    held_out = cross_validated_residuals(m, m.vector(), groups=groups_by(m, "cycle"))
+    held_out = cross_validated_residuals(m, groups=groups_by(m, "cycle"))
     rms = [np.sqrt(np.mean(held_out[m.bins == b] ** 2)) for b in range(3)]
     np.testing.assert_allclose(percent(table["s_cv"]), 100 * np.array(rms), rtol=1e-6)
     assert table.meta["groups"] == "cycle"

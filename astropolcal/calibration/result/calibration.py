@@ -15,14 +15,12 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import instruments
-from astropolcal.calibration.noise.scatter import groups_by
-from astropolcal.calibration.noise.weighting import weighting_of
 from astropolcal.calibration.result.summary import summary, to_dict
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
-    cross_validated_residuals,
+    held_out_residuals,
 )
 from astropolcal.chain import leaves
 from astropolcal.exceptions import (
@@ -294,9 +292,7 @@ class Calibration:
         self.fit.pop("groups", None)
         if groups is not None:
             self.fit["groups"] = groups if isinstance(groups, str) else "given"
-        if isinstance(groups, str):
-            groups = groups_by(live, groups)
-        held_out = cross_validated_residuals(live, live.vector(), self._weights(), groups)
+        held_out = held_out_residuals(self, groups)
         residuals = live.residuals()
         for i, record in enumerate(self.datasets):
             before, record.accuracy = record.accuracy, accuracy_table(live, i, residuals, held_out)
@@ -304,10 +300,6 @@ class Calibration:
             if before is not None and "s_standard" in before.colnames:
                 record.accuracy["s_standard"] = before["s_standard"]
         return self
-
-    def _weights(self):
-        """Return one over the noise of each datum, None where all weigh the same."""
-        return None if self.settings.get("weights") is None else weighting_of(self).weight
 
     @property
     def accuracy(self):

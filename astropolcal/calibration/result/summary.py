@@ -23,11 +23,10 @@ from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
 from astropolcal.chain import leaves
 from astropolcal.files import columns, plain
-from astropolcal.words import counted
+from astropolcal.words import WIDTH, counted
 
 __all__ = []
 
-_WIDTH = 80
 # logarithm of the Bayes factor from which on something is said to be so
 _STRONG = 3.0
 # value and error of so many parameters fill the 80 columns
@@ -50,62 +49,69 @@ def summary(calibration, targets=TARGETS, full=False):
     if not full:
         return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
     known, stars = calibration.parameter_values(), fitted_stars(calibration)
+    fit, gauge, posterior = calibration.fit, calibration.settings.get("gauge"), []
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
-    gauge, posterior = calibration.settings.get("gauge"), []
     if calibration.posterior is not None:
-        posterior = calibration.posterior.words().split("\n")
-    lines = []
-    for name, copies in (calibration.settings.get("own") or {}).items():
-        evidence = _evidence(calibration, copies)
-        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
-        words = words if np.isfinite(evidence) else "is not determined"
-        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
-    parts = [
-        [*found.words, *(list(_wrap(f"  - {words}" for words in told)) if hidden else [])],
+        posterior = [f"  {line}" for line in calibration.posterior.words().split("\n")]
+    pairs = zip(calibration.datasets, _masked(calibration), strict=True)
+    before = [
         _heading(calibration),
-        _global_lines(without_stars(known, stars)),
-        _law_lines(calibration),
-        (list(_wrap(["Parameters with values of their own", *lines])) if lines else []),
-        _stars(stars),
-        *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
-        _accuracy_words(calibration),
-        *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
-        *(
-            [*star_lines(entry), *_wrap([f"  {entry['words']}"])]
-            for entry in calibration.fit.get("stars", [])
+        _titled(
+            "Parameters for all wavelengths",
+            parameter_lines(without_stars(known, stars), several=False),
         ),
+        _titled("Laws that are added to parameters", _law_lines(calibration)),
+        _titled("Parameters with values of their own", _own_lines(calibration)),
+        # what was found of the stars, and how far it rests on the catalogue
+        _titled("Standard stars", [f"  {' '.join(s.meta['words'].split())}" for s in stars]),
+        *(_accuracy_lines(*pair) for pair in pairs),
+        [
+            "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
+            "paper's s_rel",
+            f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
+            "  s_standard: rms error on datasets that were not fitted"
+            + ("" if fit.get("standards") else " (none given)"),
+        ],
+        *(_standard_lines(entry) for entry in fit.get("standards", [])),
+        *([*star_lines(entry), f"  {entry['words']}"] for entry in fit.get("stars", [])),
         _target_lines(calibration, targets),
         *_wavelength_blocks(calibration, known),
-        mirror_lines(calibration),
-        _goodness_lines(calibration),
-        list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
-        (list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []),
-        _bound_lines(calibration, known),
-        ["Posterior", *_wrap(f"  {line}" for line in posterior)] if posterior else [],
     ]
+    after = [
+        _titled("Goodness of fit", _goodness_lines(calibration)),
+        [str(calibration.identifiability)],
+        [f"Gauge: {gauge}"] if gauge else [],
+        _titled("At a bound", _bound_lines(known)),
+        _titled("Posterior", posterior),
+    ]
+    before, after = ([_wrap(calibration, part) for part in parts] for parts in (before, after))
+    verdict_lines = [*found.words, *_wrap(calibration, [f"  - {one}" for one in told if hidden])]
+    # a table of many mirrors may be wider
+    parts = [verdict_lines, *before, mirror_lines(calibration), *after]
     return "\n\n".join("\n".join(part) for part in parts if part)
 
 
-def _stars(stars):
-    """Say what was found of the standard stars, and how far it rests on the catalogue."""
-    words = [f"  {' '.join(star.meta['words'].split())}" for star in stars]
-    return ["Standard stars", *_wrap(words)] if words else []
+def _titled(title, lines):
+    return [title, *lines] if lines else []
 
 
-def _wrap(lines):
-    """Break long lines at 80 columns, keeping the indentation of list items."""
-    for line in "\n".join(lines).split("\n"):
-        indent = " " * (len(line) - len(line.lstrip(" -")))
-        yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
+def _wrap(calibration, lines):
+    """Break long lines at 80 columns, keeping the indentation of list items.
 
-
-def _with_wavelengths(text, calibration):
-    """Name elements of parameters by their wavelength instead of their number."""
+    Elements of parameters are named by their wavelength instead of their number.
+    """
     nm = calibration.wavelength.to_value(u.nm)
-    return _ELEMENT.sub(
-        lambda m: f"{m[1]} ({nm[int(m[2])]:.1f} nm)" if int(m[2]) < nm.size else m[0], text
-    )
+
+    def named(found):
+        i = int(found[2])
+        return f"{found[1]} ({nm[i]:.1f} nm)" if i < nm.size else found[0]
+
+    wrapped = []
+    for line in _ELEMENT.sub(named, "\n".join(lines)).split("\n") if lines else ():
+        indent = " " * (len(line) - len(line.lstrip(" -")))
+        wrapped += textwrap.wrap(line, WIDTH, subsequent_indent=indent) or [""]
+    return wrapped
 
 
 def _heading(calibration):
@@ -114,27 +120,32 @@ def _heading(calibration):
     state = "converged" if calibration.converged else "NOT CONVERGED"
     title = f"Calibration of {calibration.instrument or 'an instrument'} from {names}"
     return [
-        *_wrap([title]),
+        title,
         f"{settings['strategy']} fit of {counted(len(calibration.covariance), 'parameter')} to "
         f"{fit['n_data']} {settings['observable'].replace('_', ' ')}s,",
         f"{settings['fitter']}, {fit['seconds']:.2f} s, {state}",
     ]
 
 
-def _global_lines(known):
-    lines = parameter_lines(known, several=False)
-    return ["Parameters for all wavelengths", *lines] if lines else []
-
-
 def _law_lines(calibration):
     """Name the laws that parameters follow, and the frames with which they were calibrated."""
     optics = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
-    lines = [
+    return [
         f"  - {name}.{key}: {law}"
         for name, leaf in optics.items()
         for key, law in leaf._follows.items()
     ]
-    return list(_wrap(["Laws that are added to parameters", *lines])) if lines else []
+
+
+def _own_lines(calibration):
+    """Say which parameters with values of their own really differ."""
+    lines = []
+    for name, copies in (calibration.settings.get("own") or {}).items():
+        evidence = _evidence(calibration, copies)
+        words = "differs" if evidence > _STRONG else "may as well be the same in all of them"
+        words = words if np.isfinite(evidence) else "is not determined"
+        lines.append(f"  - {name}: {words} (ln Bayes factor {evidence:.1f})")
+    return lines
 
 
 def _evidence(calibration, names):
@@ -166,7 +177,7 @@ def _accuracy_lines(record, reasons):
     return [
         f"Accuracy on {record.name}, in percent of polarization",
         *_rows({name: _percent(table, name) for name in _ACCURACIES}),
-        *_wrap([f"{counts}; {why})" if why else f"{counts})"]),
+        f"{counts}; {why})" if why else f"{counts})",
     ]
 
 
@@ -174,17 +185,6 @@ def _masked(calibration):
     """Return why cells of each dataset are masked; a file of before does not say."""
     reasons, count = calibration.fit.get("masked") or [], len(calibration.datasets)
     return reasons if len(reasons) == count else [{}] * count
-
-
-def _accuracy_words(calibration):
-    lines = [
-        "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
-        "paper's s_rel",
-        f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
-        "  s_standard: rms error on datasets that were not fitted"
-        + ("" if calibration.fit.get("standards") else " (none given)"),
-    ]
-    return list(_wrap(lines))
 
 
 def _percent(table, name):
@@ -196,15 +196,15 @@ def _rows(columns):
     """Return median, best and worst of each column, under their names."""
     head = f"  {'':<10}" + "".join(f"{name:>11}" for name in columns)
     rows = [
-        f"  {label:<10}" + "".join(f" {_of(np.abs(v), function)}" for v in columns.values())
-        for label, function in (("median", np.median), ("best", np.min), ("worst", np.max))
+        f"  {label:<10}" + "".join(f"{_told(np.abs(v), end, '.3f'):>11}" for v in columns.values())
+        for label, end in (("median", np.median), ("best", np.min), ("worst", np.max))
     ]
     return [head, *rows]
 
 
-def _of(values, function):
-    known = values[np.isfinite(values)]
-    return f"{function(known):10.3f}" if known.size else f"{'-':>10}"
+def _told(values, function, form):
+    known = values[~np.isnan(values)]
+    return f"{function(known):{form}}" if known.size else "-"
 
 
 def _standard_lines(entry):
@@ -215,13 +215,12 @@ def _standard_lines(entry):
         "s_cv": entry["s_cv_percent"],
         "/ s_cv": entry["chi"],
     }
-    lines = [
+    return [
         f"Prediction of {entry['name']} (not fitted), in percent",
         *_rows({name: np.array(values, dtype=float) for name, values in columns.items()}),
         f"  {entry['words']} ({counted(entry['n_frames'], 'frame')} x "
         f"{counted(len(entry['n']), 'wavelength')})",
     ]
-    return list(_wrap(lines))
 
 
 def _target_lines(calibration, targets):
@@ -242,8 +241,7 @@ def _target_lines(calibration, targets):
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: the angle with the worst accuracy")
-    lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
-    return list(_wrap(lines))
+    return lines + open_lines(calibration, infinite)
 
 
 def _target_row(table):
@@ -256,31 +254,29 @@ def _target_row(table):
         # s_Q and s_U only lead to s_p: their worst values would crowd the table
         worst = (np.max,) if key in ("s_p", "s_chi") else ()
         for function in (np.median, *worst):
-            row += f"{_short(table[key].value, function):>10}"
+            row += f"{_told(table[key].value, function, '.2g'):>10}"
     return row
-
-
-def _short(values, function):
-    known = values[~np.isnan(values)]
-    return f"{function(known):.2g}" if known.size else "-"
 
 
 def _wavelength_blocks(calibration, known):
     """Return tables with one row per wavelength, and in each as many parameters as fit."""
     several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
-    marks = "? badly determined, c conditional on a bound"
-    for i in range(0, len(several), _N_COLUMNS):
-        title = [] if i else [f"Parameters for each wavelength ({marks})"]
-        yield title + _block(calibration, dict(several[i : i + _N_COLUMNS]))
-
-
-def _block(calibration, shown):
-    rows, s_mean = _table_head(shown), _by_wavelength(calibration.datasets)
-    for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
-        mean = s_mean.get(round(wavelength, 2), np.nan)
-        row = f"{wavelength:8.1f}" + (f"{mean:8.3f}" if np.isfinite(mean) else f"{'-':>8}")
-        rows.append((row + "".join(_cell(entry, i) for entry in shown.values())).rstrip())
-    return rows
+    s_mean, blocks = _by_wavelength(calibration.datasets), []
+    for start in range(0, len(several), _N_COLUMNS):
+        names, shown = zip(*several[start : start + _N_COLUMNS], strict=True)
+        optics, keys = zip(*(name.split(".") for name in names), strict=True)
+        units = [str(entry["unit"] or "") for entry in shown]
+        marks = "Parameters for each wavelength (? badly determined, c conditional on a bound)"
+        rows = [] if start else [marks]
+        for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units)):
+            row = f"{first:>8}{second:>8}" + "".join(f"{text[:20]:>17}    " for text in texts)
+            rows.append(row.rstrip())
+        for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
+            mean = s_mean.get(round(wavelength, 2), np.nan)
+            row = f"{wavelength:8.1f}" + (f"{mean:8.3f}" if np.isfinite(mean) else f"{'-':>8}")
+            rows.append((row + "".join(_cell(entry, i) for entry in shown)).rstrip())
+        blocks.append(rows)
+    return blocks
 
 
 def _cell(entry, i):
@@ -295,15 +291,6 @@ def _cell(entry, i):
     return f"{value} {_SAID.get(status, '')}".ljust(21)
 
 
-def _table_head(shown):
-    optics, keys = zip(*(name.split(".") for name in shown), strict=True)
-    units = [str(entry["unit"] or "") for entry in shown.values()]
-    return [
-        f"{first:>8}{second:>8}" + "".join(f"{text[:20]:>17}    " for text in texts).rstrip()
-        for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units))
-    ]
-
-
 def _by_wavelength(datasets):
     """Return s_mean at each wavelength, of the first dataset that has it."""
     found = {}
@@ -316,15 +303,10 @@ def _by_wavelength(datasets):
 
 
 def _goodness_lines(calibration):
-    found = calibration.fit.get("lack_of_fit") or []
-    lines = [f"  - {test['words']}" for test in found]
-    lines += _outlier_lines(calibration.fit.get("outliers") or [])
-    return list(_wrap(["Goodness of fit", *lines])) if lines else []
-
-
-def _outlier_lines(outliers):
-    """Name the pairs of frames at odds with the fit, which are not left out."""
-    lines = [
+    """Return the tests, and the pairs of frames at odds with the fit, which are not left out."""
+    outliers = calibration.fit.get("outliers") or []
+    lines = [f"  - {test['words']}" for test in calibration.fit.get("lack_of_fit") or []]
+    lines += [
         f"  - frames {one['frames']} of {one['dataset']} are at odds with the fit, by "
         f"{one['residual_percent']:+.2g} % ({one['sigma']:.0f} robust sigma, brightness "
         f"{one['brightness']:.2f}); they are not left out"
@@ -334,40 +316,29 @@ def _outlier_lines(outliers):
     return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
 
 
-def _bound_lines(calibration, known):
+def _bound_lines(known):
     """Name what is at a bound, how far it may go inward, and whose errors depend on that."""
-    lines = []
+    lines, hanging = [], {}
     for name, entry in known.items():
-        where = np.flatnonzero(np.ravel(entry["at_bound"]))
-        inward, values = (np.ravel(entry[key])[where] for key in ("std_inward", "value"))
-        ends = [inward_words(entry, *pair) for pair in zip(values, inward, strict=True)]
-        places = _places(calibration, entry, where)
-        told = zip(places, ends, strict=True)
-        lines += [f"  - {name}{place}{end and ': '}{end}" for place, end in told]
-    hanging = {}
-    for name, entry in known.items():
-        for i in np.flatnonzero(np.ravel(entry["status"]) == "conditional"):
-            by = str(np.ravel(entry["conditional_on"])[i])
+        flat = {
+            key: np.ravel(entry[key])
+            for key in ("at_bound", "value", "std_inward", "status", "conditional_on")
+        }
+        for i in np.flatnonzero(flat["at_bound"]):
+            end = inward_words(entry, flat["value"][i], flat["std_inward"][i])
+            place = f"{name}[{i}]" if entry["value"].ndim else name
+            lines.append(f"  - {place}{end and ': '}{end}")
+        for i in np.flatnonzero(flat["status"] == "conditional"):
             times = (np.ravel(entry["std_released"]) / np.ravel(entry["std"]))[i]
-            hanging.setdefault((by, name), []).append(times)
+            hanging.setdefault((str(flat["conditional_on"][i]), name), []).append(times)
     for (by, name), times in hanging.items():
         several = f" at {len(times)} wavelengths" if len(times) > 1 else ""
+        low, high = min(times), max(times)
         lines.append(
             f"  - the error of {name}{several} is conditional on {by} at its bound; without it "
-            f"{_times(times)} times as large"
+            f"{low:.2g}{'' if low == high else f' to {high:.2g}'} times as large"
         )
-    lines = [_with_wavelengths(line, calibration) for line in lines]
-    return list(_wrap(["At a bound", *lines])) if lines else []
-
-
-def _places(calibration, entry, where):
-    nm = calibration.wavelength.to_value(u.nm)
-    return [f" ({nm[i]:.1f} nm)" if entry["value"].ndim else "" for i in where]
-
-
-def _times(times):
-    low, high = min(times), max(times)
-    return f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
+    return lines
 
 
 # ---- for machines ------------------------------------------------------------------
@@ -397,7 +368,10 @@ def to_dict(calibration, targets=TARGETS):
         ],
         "left_out": what_is_left_out(calibration),
         "stars": fit.get("stars", []),
-        "mirrors": mirrors(calibration),
+        "mirrors": [
+            {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns(table)
+            for table in _mirror_tables(calibration)
+        ],
         "fitted_stars": [
             {key: table.meta[key] for key in ("name", "from_data")} | columns(table)
             for table in fitted_stars(calibration)
@@ -428,12 +402,8 @@ def to_dict(calibration, targets=TARGETS):
 
 def _dataset(record):
     table = record.accuracy
-    return {
-        "name": record.name,
-        "source": record.source,
-        "content_hash": record.content_hash,
-        "n_frames": record.n_frames,
-        "n_masked": record.n_masked,
+    keys = ("name", "source", "content_hash", "n_frames", "n_masked")
+    return {key: getattr(record, key) for key in keys} | {
         "wavelength_nm": table["wavelength"].to_value(u.nm),
         "n": table["n"],
         "k": table["k"],
@@ -444,7 +414,6 @@ def _dataset(record):
 # ---- mirrors, stars that no fit saw, and what is left open on sky ----
 
 
-_LINE_WIDTH = 80
 _N_MIRROR_ROWS = 5
 # a diattenuation of so many times that of any metal is pointed at
 _ABOVE = 3
@@ -455,26 +424,31 @@ _N_OPEN = 3
 _STAR_HEAD = ("DoLP (%)", "catalogue", "AoLP (deg)", "catalogue")
 
 
+def _mirror_tables(calibration):
+    return [mirror_values(calibration, name) for name in mirror_names(calibration)]
+
+
 def mirror_lines(calibration):
     """Return diattenuations of mirrors beside those of bare metals, at a few wavelengths."""
-    tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
+    tables = _mirror_tables(calibration)
     if not tables:
         return []
-    shown = {table.meta["name"]: table for table in tables}
     # a grid of several tables need not ascend
     order = np.argsort(calibration.wavelength)
     step = 1 if order.size <= _ALL_ROWS else -(-order.size // _N_MIRROR_ROWS)
     shortened = f"; one in {step} of {order.size} wavelengths" if step > 1 else ""
-    head = "       nm" + "".join(f"{name:>17}" for name in shown)
+    head = "       nm" + "".join(f"{table.meta['name']:>17}" for table in tables)
     lines = [f"Diattenuation in percent; the metals bare, at 45 deg{shortened}"]
     lines.append(head + "".join(f"{metal:>10}" for metal in METALS))
     for i in order[::step]:
         line = f"{calibration.wavelength[i].to_value(u.nm):9.1f}"
-        line += "".join(f"{_with_error(table, 'diattenuation', i):>17}" for table in tables)
+        for table in tables:
+            value, std = (table[f"diattenuation{end}"][i].value for end in ("", "_err"))
+            line += f"{_with_error(value, std, 3):>17}"
         metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
         lines.append(line + "".join(f"{value.to_value(u.percent):10.2f}" for value in metals))
     # the table may be wider, a sentence need not
-    return lines + [s for t in tables for s in textwrap.wrap(_above_metals(t), _LINE_WIDTH)]
+    return lines + [s for t in tables for s in textwrap.wrap(_above_metals(t), WIDTH)]
 
 
 def _above_metals(table):
@@ -499,9 +473,10 @@ def _above_metals(table):
     )
 
 
-def _with_error(table, key, i):
-    value, std = (table[name][i].value for name in (key, f"{key}_err"))
-    return f"{value:.3f} +- {std:.3f}" if np.isfinite(std) else f"{value:.3f}"
+def _with_error(value, std, digits):
+    if not np.isfinite(value):
+        return "-"
+    return f"{value:.{digits}f}" + (f" +- {std:.{digits}f}" if np.isfinite(std) else "")
 
 
 def star_lines(entry):
@@ -515,20 +490,9 @@ def star_lines(entry):
         for key, unit, digits in (("dolp", "percent", 3), ("aolp", "deg", 1)):
             for name in (key, f"{key}_known"):
                 value, std = entry[f"{name}_{unit}"][i], entry[f"{name}_err_{unit}"][i]
-                text = "-" if not np.isfinite(value) else f"{value:.{digits}f}"
-                text += f" +- {std:.{digits}f}" if np.isfinite(std) and text != "-" else ""
-                line += f"{text:>17}"
+                line += f"{_with_error(value, std, digits):>17}"
         lines.append(line)
     return lines
-
-
-def mirrors(calibration):
-    """Return the values of all mirrors for machines."""
-    tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
-    return [
-        {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns(table)
-        for table in tables
-    ]
 
 
 # ---- what an accuracy for a target is made of -----------------------------------------------
@@ -540,41 +504,26 @@ def open_on_sky(calibration):
     Of each direction ``kind``, ``words``, and least and largest change ``aolp_deg`` and
     ``dolp_percent``.
     """
-    finding = calibration.identifiability
-    return [
-        {"kind": kind, "words": _words(direction)} | direction["sky"]
-        for kind, directions in (
-            ("open", finding.directions),
-            ("badly determined", finding.near_null),
-        )
-        for direction in sorted(directions, key=_turn, reverse=True)
-        if direction.get("sky") and shows_on_sky(direction["sky"])
-    ]
+    finding, found = calibration.identifiability, []
+    kinds = (("open", finding.directions), ("badly determined", finding.near_null))
+    for kind, directions in kinds:
+        shown = [one for one in directions if one.get("sky") and shows_on_sky(one["sky"])]
+        shown.sort(key=lambda one: max(map(abs, one["sky"]["aolp_deg"])), reverse=True)
+        for one in shown:
+            words = f"{_AFTER_LEAD.split(one['words'])[0]}: {sky_words(one['sky'])}"
+            found.append({"kind": kind, "words": words} | one["sky"])
+    return found
 
 
 def open_lines(calibration, infinite=True):
     """Say what makes an accuracy for a target infinite or large, one line a kind."""
-    found, lines = open_on_sky(calibration), []
-    for kind, says in (
-        (
-            "open",
-            "infinite, because the data do not determine"
-            if infinite
-            else "from priors, because the data do not determine it",
-        ),
-        ("badly determined", "large, because of badly determined directions"),
-    ):
-        words = [one["words"] for one in found if one["kind"] == kind]
+    of_open = "infinite, because the data do not determine"
+    if not infinite:
+        of_open = "from priors, because the data do not determine it"
+    of_bad, lines = "large, because of badly determined directions", []
+    for kind, says in (("open", of_open), ("badly determined", of_bad)):
+        words = [one["words"] for one in open_on_sky(calibration) if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
         if words:
             lines.append(f"  {says}: {'; '.join([*words[:_N_OPEN], *more])}")
     return lines
-
-
-def _turn(direction):
-    return max(map(abs, (direction.get("sky") or {}).get("aolp_deg", [0.0])))
-
-
-def _words(direction):
-    lead = _AFTER_LEAD.split(direction["words"])[0]
-    return f"{lead}: {sky_words(direction['sky'])}"

@@ -84,8 +84,8 @@ def verdict(calibration, targets=TARGETS):
     # whether it is usable does not hang on what was asked for
     bright = target_accuracies(calibration, TARGETS[:1])
     found = {}
-    for lead, sky in _open_leads(calibration, free).items():
-        for what in _seen(sky) if sky else ():
+    for lead, change in _open_leads(calibration, free).items():
+        for what in _seen(change):
             found.setdefault(what, []).append(lead)
     # what leads at a single wavelength opens that one only
     many = _MOST * len(calibration.wavelength)
@@ -101,13 +101,19 @@ def verdict(calibration, targets=TARGETS):
         *_mirrors(calibration, known),
         _misfit(calibration),
     ]
-    hanging = _hanging(free)
-    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), hanging]
+    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), _hanging(free)]
     stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
     reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
     # what is not known runs to its bounds, too
     wrong = any(wrong) or bool(stuck and not any(unknown))
-    cautions = [] if reasons else _cautions(calibration, free)
+    cautions = []
+    if not reasons:
+        excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
+        at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
+        cautions += [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
+        cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
+        if any("disagree with the priors" in test["words"] for test in tests):
+            cautions.append("data and priors disagree")
     advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
@@ -185,29 +191,26 @@ def _excess(calibration):
 def _mirrors(calibration, known):
     """Say of each mirror that polarizes as no mirror does, where the source is not to."""
     sources = [r for r in calibration.datasets if kind_of_source(r.source) != "polarized"]
-    told = " or ".join(f"{r.name} really {str(r.source)!r}" for r in sources)
-    return [
-        f"{name} polarizes by more than {_NO_MIRROR.value:g} %, as no mirror does: is {told}?"
-        for name in (mirror_names(calibration) if sources else ())
-        if _too_much(calibration, known, name)
-    ]
-
-
-def _too_much(calibration, known, name):
-    """Return whether a fitted mirror polarizes too much with certainty, at most wavelengths."""
-    if known.get(f"{name}.diattenuation", {"fixed": False})["fixed"]:
-        return False
-    table = mirror_values(calibration, name)
-    # without an error where it is at a bound, and where only a product with another is known
-    error = np.nan_to_num(table["diattenuation_err"].value, posinf=np.inf)
-    least = np.abs(table["diattenuation"].value) - 3 * error
-    return np.mean(least * table["diattenuation"].unit > _NO_MIRROR) > _MOST
+    told, found = " or ".join(f"{r.name} really {str(r.source)!r}" for r in sources), []
+    for name in mirror_names(calibration) if sources else ():
+        if known.get(f"{name}.diattenuation", {"fixed": False})["fixed"]:
+            continue
+        table = mirror_values(calibration, name)
+        # without an error where it is at a bound, and where only a product with another is known
+        error = np.nan_to_num(table["diattenuation_err"].value, posinf=np.inf)
+        least = np.abs(table["diattenuation"].value) - 3 * error
+        # with certainty, at most wavelengths
+        if np.mean(least * table["diattenuation"].unit > _NO_MIRROR) > _MOST:
+            found.append(
+                f"{name} polarizes by more than {_NO_MIRROR.value:g} %, as no mirror does: is "
+                f"{told}?"
+            )
+    return found
 
 
 def _misfit(calibration):
     """Say that the model does not describe the data at all."""
-    left = [_median(r.accuracy["s_res"].to_value(u.percent)) for r in calibration.datasets]
-    worst = np.nanmax([0.0, *left])
+    worst = _worst(calibration, "s_res")
     if not worst > _MISFIT.value or not _excess(calibration):
         return ""
     return f"the model misses the data by {worst:.2g} %, {_excess(calibration):.2g} times the noise"
@@ -220,7 +223,12 @@ def _absurd(free):
         std = float(entry["std"]) * u.Unit(entry["unit"])
         if std > _ABSURD_ANGLE:
             told.append(f"{name} is known to {std.to_value(u.deg):.3g} deg only")
-    wide = [n for n, e in free.items() if np.mean(e["std"] > _width(e)) > _MOST]
+    wide = [
+        name
+        for name, entry in free.items()
+        if None not in entry["bounds"]
+        and np.mean(entry["std"] > entry["bounds"][1] - entry["bounds"][0]) > _MOST
+    ]
     return [*told, f"errors larger than the bounds: {', '.join(wide)}"] if wide else told
 
 
@@ -232,28 +240,22 @@ def _hanging(free):
     return f"orientations depend on the bound of {', '.join(names)}" if names else ""
 
 
-def _width(entry):
-    low, high = entry["bounds"]
-    return np.inf if low is None or high is None else high - low
-
-
-def _open_leads(calibration, free, shown=False):
-    """Return what leads the open directions, and their change on sky if known, or if it shows."""
+def _open_leads(calibration, free):
+    """Return what leads the open directions, and their change on sky, None where not known."""
     found = {}
     for direction in calibration.identifiability.directions:
-        sky, lead = direction.get("sky"), direction["words"].partition(" ")[0]
+        lead = direction["words"].partition(" ")[0]
         stem, _, index = lead.rstrip("]").partition("[")
         # a prior or a bound may have closed what the data leave open
-        is_open = stem in free and np.ravel(free[stem]["status"])[int(index or 0)] == "open"
-        if is_open and not (shown and sky and not _seen(sky)):
-            found[lead] = sky or {}
+        if stem in free and np.ravel(free[stem]["status"])[int(index or 0)] == "open":
+            found[lead] = direction.get("sky")
     return found
 
 
 def _seen(sky):
-    """Return what of AoLP and DoLP changes by what shows."""
+    """Return what of AoLP and DoLP changes by what shows, as far as that is known."""
     kinds = (("aolp_deg", "AoLP"), ("dolp_percent", "DoLP"))
-    return [what for key, what in kinds if max(map(abs, sky[key])) >= _SHOWS]
+    return [what for key, what in kinds if sky and max(map(abs, sky[key])) >= _SHOWS]
 
 
 def _open_words(sky):
@@ -285,17 +287,6 @@ def _too_far(tables, sky):
 def _median(values):
     known = values[~np.isnan(values)]
     return float(np.median(known)) if known.size else np.nan
-
-
-def _cautions(calibration, free):
-    """Say what to mind in a calibration that is usable."""
-    tests, excess = calibration.fit.get("lack_of_fit") or [], _excess(calibration)
-    stuck = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
-    told = [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
-    told += [f"at its bound: {', '.join(stuck)}"] if stuck else []
-    if any("disagree with the priors" in test["words"] for test in tests):
-        told.append("data and priors disagree")
-    return told
 
 
 # ---- accuracy, what is determined, what to do -----------------------------------------------
@@ -340,7 +331,8 @@ def _determined(calibration, free):
     # what is open comes first
     bad = {s: _with_status(free, s) for s in (*STATUSES[3:6], STATUSES[2])}
     counts = [f"{n} {status}" for status, (n, _) in bad.items() if n]
-    if bad["open"][0] and not _open_leads(calibration, free, shown=True):
+    leads = _open_leads(calibration, free).values()
+    if bad["open"][0] and all(sky and not _seen(sky) for sky in leads):
         counts[0] += " (not seen on sky)"
     names = ", ".join(names for n, names in bad.values() if n)
     yield f"Not         {', '.join(counts)}: {names}" if counts else "Not         none"
@@ -414,58 +406,50 @@ def compact_lines(calibration, found, height=HEIGHT):
     single = parameter_lines(known, several=False)
     found_of = (shortened(f"  {star.meta['words']}") for star in stars)
     rows = [*single, *found_of, *parameter_lines(known)[len(single) :]]
-    rest = [_heading(calibration), _fit(calibration), *_goodness(calibration)]
+    names = [record.name for record in calibration.datasets]
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    title = f"Calibration of {calibration.instrument or 'an instrument'} from {names[0]}{more}"
+    rest = [title, *_fit(calibration)]
     room = height - len(found.words) - len(rest) - 2
     if len(rows) > room:
         rows = [*rows[: room - 1], f"  and {len(rows) - room + 1} more lines"]
     return [*found.words, "", *rows, "", *(shortened(line) for line in rest)]
 
 
-def _heading(calibration):
-    names = [record.name for record in calibration.datasets]
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return f"Calibration of {calibration.instrument or 'an instrument'} from {names[0]}{more}"
-
-
 def _fit(calibration):
+    """Say how the fit ended, and how good it is."""
     fit, n = calibration.fit, len(calibration.covariance)
     outliers = len(fit.get("outliers") or [])
-    return (
+    yield (
         f"Fit         {counted(n, 'parameter')}, {fit['n_data']} data, rank "
         f"{calibration.identifiability.rank}, {calibration.settings['strategy']}, "
         + ("converged" if calibration.converged else "NOT CONVERGED")
         + (f"; {counted(outliers, 'pair')} of frames at odds" if outliers else "")
         + ("" if calibration.posterior is None else ", sampled")
     )
-
-
-def _goodness(calibration):
     s_res, s_cv = (_worst(calibration, key) for key in ("s_res", "s_cv"))
     left_out = f", s_cv {s_cv:.2g} %" if np.isfinite(s_cv) else ""
     datasets = "worst dataset, " if len(calibration.datasets) > 1 else ""
     yield f"Residuals   s_res {s_res:.2g} %{left_out} ({datasets}median wavelength)"
-    tests = calibration.fit.get("lack_of_fit") or []
-    if tests:
-        told = [
-            f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
-            f"({p_words(test['p_value'])})"
-            for test in tests
-        ]
+    told = [
+        f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
+        f"({p_words(test['p_value'])})"
+        for test in fit.get("lack_of_fit") or []
+    ]
+    if told:
         yield f"Scatter     {', '.join(told)}"
     # what no fit saw is why it was given
-    for entry in calibration.fit.get("standards", []):
+    for entry in fit.get("standards", []):
         yield f"Predicted   {entry['name']}: {entry['words']}"
-    for entry in calibration.fit.get("stars", []):
+    for entry in fit.get("stars", []):
         yield f"Catalogue   {entry['words']}"
 
 
 def _worst(calibration, key):
-    """Return the largest of the datasets' medians over the wavelengths."""
-    medians = []
-    for table in (record.accuracy for record in calibration.datasets):
-        known = table[key].value[np.isfinite(table[key].value)] if key in table.colnames else []
-        medians += [np.median(known)] if len(known) else []
-    return max(medians, default=np.nan)
+    """Return the largest of the datasets' medians over the wavelengths; NaN where none is known."""
+    tables = (record.accuracy for record in calibration.datasets)
+    medians = [_median(table[key].value) for table in tables if key in table.colnames]
+    return np.fmax.reduce(medians, initial=np.nan)
 
 
 # ---- parameters -----------------------------------------------------------------------------
@@ -479,26 +463,19 @@ def without_stars(known, stars):
 
 def parameter_lines(known, several=True):
     """Return a line for each free parameter, those given per wavelength last, if at all."""
-    free = {name: entry for name, entry in known.items() if not entry["fixed"]}
-    lines = [
-        line
-        for name, entry in free.items()
-        if not entry["value"].ndim
-        for line in _wrapped(name, number(entry))
-    ]
-    if several:
-        rows = {name: entry for name, entry in free.items() if entry["value"].ndim}
-        lines += [shortened(f"  {name:<{_COLUMN}}{_range(entry)}") for name, entry in rows.items()]
-    return lines
-
-
-def _wrapped(name, text):
-    first = f"  {name:<{_COLUMN}}"
-    indent = " " * (_COLUMN + 5)
-    return textwrap.wrap(
-        first + text, WIDTH, subsequent_indent=indent, drop_whitespace=True,
-        break_on_hyphens=False,
-    )  # fmt: skip
+    lines, rows = [], []
+    for name, entry in known.items():
+        head = f"  {name:<{_COLUMN}}"
+        if entry["fixed"]:
+            continue
+        if entry["value"].ndim:
+            rows.append(shortened(head + _range(entry)))
+        else:
+            indent = " " * (_COLUMN + 5)
+            lines += textwrap.wrap(
+                head + number(entry), WIDTH, subsequent_indent=indent, break_on_hyphens=False
+            )
+    return lines + rows if several else lines
 
 
 def number(entry):
@@ -517,7 +494,10 @@ def number(entry):
     error = f"{std:.5f}" if std < 10 else f"{std:.4g}"
     text = f"{text} +- {error} {unit}".rstrip()
     if status == "conditional":
-        return f"{text} ({conditional(entry)})"
+        released = float(entry["std_released"])
+        without = f"{released:.2g}" if np.isfinite(released) else "open"
+        by = entry["conditional_on"]
+        return f"{text} (conditional on {by} at its bound; without it {without})"
     return text if status == "determined" else f"{text} ({status})"
 
 
@@ -530,13 +510,6 @@ def inward_words(entry, value, inward):
     # two digits of the way inward
     digits = max(2, 1 - int(np.floor(np.log10(inward)))) if inward > 0 else 5
     return f"below {value + inward:.{digits}f}" if at_low else f"above {value - inward:.{digits}f}"
-
-
-def conditional(entry):
-    """Say on what an error hangs, and what it is without."""
-    released = float(entry["std_released"])
-    without = f"{released:.2g}" if np.isfinite(released) else "open"
-    return f"conditional on {entry['conditional_on']} at its bound; without it {without}"
 
 
 def _range(entry):

@@ -24,7 +24,7 @@ from astropolcal.calibration.identifiability.linearized import (
     step_of,
 )
 from astropolcal.calibration.noise.scatter import Scatter
-from astropolcal.calibration.noise.weighting import Problem, problem_of, weighting_of
+from astropolcal.calibration.noise.weighting import Problem, problem_of
 from astropolcal.exceptions import ParameterError
 
 __all__ = ["Covariance"]
@@ -81,14 +81,6 @@ class Covariance:
             raise ParameterError(
                 f"covariance of {n} names and {len(self.units)} units has shape {self.matrix.shape}"
             )
-        self._check_symmetry()
-        if factor is not None:
-            self.factor = self._rows("factor", factor)
-        if null is not None:
-            self.null = self._rows("null", null)
-
-    def _check_symmetry(self):
-        """Refuse what differs from its transpose by more than a share of both errors."""
         variances = np.diag(self.matrix)
         # the parameters have units of their own, and with them the rounding errors
         stds = np.sqrt(np.where(np.isfinite(variances), np.abs(variances), 0.0))
@@ -104,13 +96,11 @@ class Covariance:
                 f"{self.names[column]} is {self.matrix[row, column]:g} and "
                 f"{self.matrix[column, row]:g}"
             )
-
-    def _rows(self, key, rows):
-        """Return directions as an array of rows."""
-        rows = np.array(rows, dtype=float).reshape(-1, len(self.names))
-        if not np.isfinite(rows).all():
-            raise ParameterError(f"{key} of a covariance has a value that is not finite")
-        return rows
+        for key, rows in (("factor", factor), ("null", null)):
+            if rows is not None:
+                setattr(self, key, np.array(rows, dtype=float).reshape(-1, n))
+                if not np.isfinite(getattr(self, key)).all():
+                    raise ParameterError(f"{key} of a covariance has a value that is not finite")
 
     def __len__(self):
         return len(self.names)
@@ -122,13 +112,7 @@ class Covariance:
     def __eq__(self, other):
         if not isinstance(other, Covariance):
             return NotImplemented
-        same = self.names == other.names and self.units == other.units
-        arrays = ((getattr(self, key), getattr(other, key)) for key in ("matrix", "factor", "null"))
-        return same and all(
-            (a is None and b is None)
-            or (a is not None and b is not None and np.array_equal(a, b, equal_nan=True))
-            for a, b in arrays
-        )
+        return same_content(vars(self), vars(other))
 
     __hash__ = None
 
@@ -235,20 +219,25 @@ class Covariance:
             moves = np.abs(np.concatenate([factor, null])).max(axis=0, initial=0.0) > 0
             blind = undetermined & ~moves
         else:
-            factor, blind = self._factor_of_matrix(steps, ~undetermined), undetermined
+            known, blind = ~undetermined, undetermined
+            matrix = self.matrix[np.ix_(known, known)] / np.outer(steps[known], steps[known])
+            # symmetric: eigenvectors are the directions, roots of eigenvalues their errors
+            variance, vectors = np.linalg.eigh(matrix)
+            factor = np.zeros((len(variance), len(self)))
+            factor[:, known] = (vectors * np.sqrt(variance.clip(0))).T
         # rows of `factor` are principal directions times their standard errors; here they part
         sigmas = np.linalg.norm(factor, axis=1)
         known = factor / np.where(sigmas > 0, sigmas, 1.0)[:, None]
         return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
 
-    def _factor_of_matrix(self, steps, known):
-        """Return the determined directions of the parameters that have an error."""
-        matrix = self.matrix[np.ix_(known, known)] / np.outer(steps[known], steps[known])
-        # a symmetric matrix: eigenvectors are the directions, roots of eigenvalues their errors
-        variance, vectors = np.linalg.eigh(matrix)
-        factor = np.zeros((len(variance), len(self)))
-        factor[:, known] = (vectors * np.sqrt(variance.clip(0))).T
-        return factor
+
+def same_content(a, b):
+    """Return whether dictionaries of arrays are equal, NaN to NaN, which `==` of them is not."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(same_content(a[key], b[key]) for key in a)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=True)
+    return type(a) is type(b) and a == b
 
 
 @dataclass
@@ -317,7 +306,13 @@ def full_covariance(calibration):
     if known.factor is not None:
         return known
     if calibration.measurement is None:
-        return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
+        steps = np.array([declared_step(unit) for unit in known.units])
+        null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
+        undetermined = ~np.isfinite(np.diag(known.matrix))
+        undetermined &= [name not in set(calibration.at_bound) for name in known.names]
+        # less those that a prior has closed
+        is_open = (np.abs(null[:, undetermined]) > STILL).any(axis=1)
+        return Covariance(known.names, known.units, known.matrix, null=null[is_open] * steps)
     problem = problem_of(calibration)
     how = white_covariance if calibration.settings.get("errors") == "white" else covariance_around
     return how(problem.measurement, problem.around(), problem.weighting)
@@ -334,7 +329,7 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
     if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
     prior = whitened.along(whitened.prior_rows) * weighting.level
-    slack = slack_of_bounds(measurement, whitened)
+    slack = _inward(measurement, whitened)[-1] if whitened.held.any() else None
     return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
 
 
@@ -373,22 +368,6 @@ def sandwich(measurement, whitened, middle, slack=None):
     return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
-def residual_variance(calibration):
-    """Return the variance of a datum of weight one: 1 where every datum has its own noise."""
-    return weighting_of(calibration).level ** 2
-
-
-def _open_of_file(calibration):
-    """Return the open directions that a file names, less those that a prior has closed."""
-    known = calibration.covariance
-    steps = np.array([declared_step(unit) for unit in known.units])
-    null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
-    undetermined = ~np.isfinite(np.diag(known.matrix))
-    undetermined &= [name not in set(calibration.at_bound) for name in known.names]
-    is_open = (np.abs(null[:, undetermined]) > STILL).any(axis=1)
-    return null[is_open] * steps
-
-
 # ---- errors at a bound, and next to one ----
 
 
@@ -420,10 +399,10 @@ def errors_at_bounds(measurement, whitened):
     """
     if not whitened.held.any():
         return {"inward": {}, "released": {}}
-    held, columns, response, steps, widths = _inward(measurement, whitened)
+    held, columns, response, steps, moved = _inward(measurement, whitened)
     names, per_unit = measurement.free.names, whitened.scale / measurement.free.factors()
     released = _released(names, whitened, held, columns, response)
-    slack = np.linalg.norm(_moved(whitened, held, response, steps, widths), axis=0) * per_unit
+    slack = np.linalg.norm(moved, axis=0) * per_unit
     root = np.linalg.pinv(np.linalg.qr(columns, mode="r")) * measurement.weighting.level
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
@@ -435,66 +414,48 @@ def errors_at_bounds(measurement, whitened):
     return {"inward": inward, "released": released}
 
 
-def slack_of_bounds(measurement, whitened):
-    """Return how parameters move while one at its bound goes inward by its one-sided error.
-
-    Shape (n_held, n_free), in steps of a degree, micrometre or percent.
-    """
-    if not whitened.held.any():
-        return np.zeros((0, whitened.scale.size))
-    held, _, response, steps, widths = _inward(measurement, whitened)
-    return _moved(whitened, held, response, steps, widths)
-
-
 def _inward(measurement, whitened):
-    """Return what is held, its derivatives, how others follow, one-sided errors and widths."""
+    """Return what is held, its derivatives, how others follow, one-sided errors, and the slack.
+
+    The slack is how all parameters move while one at its bound goes inward by its one-sided error,
+    (n_held, n_free), in steps of a degree, micrometre or percent.
+    """
     held = np.flatnonzero(whitened.held)
-    columns, residual, response = _without_others(measurement, whitened, held)
-    low, high = measurement.free.bounds()
-    vector = measurement.vector()
-    # from the lower bound up, from the upper one down
-    inward = np.where((vector - low <= high - vector)[held], 1.0, -1.0)
-    widths = (high - low)[held] / whitened.scale[held]
-    steps = _one_sided(columns * inward, residual, measurement.weighting.level, widths)
-    return held, columns, response, steps, widths
-
-
-def _moved(whitened, held, response, steps, widths):
-    # what the data do not limit is anywhere up to the opposite bound
-    steps = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)
-    rows = np.zeros((held.size, whitened.scale.size))
-    rows[:, whitened.live] = response.T
-    rows[np.arange(held.size), held] = 1.0
-    # without an opposite bound either, it stays where it is
-    return rows * np.where(np.isfinite(steps), steps, 0.0)[:, None]
-
-
-def _without_others(measurement, whitened, held):
-    """Return derivatives and residuals less what the live parameters absorb, and how these go."""
     rows = np.concatenate([whitened.rows, whitened.prior_rows])
-    residual = Problem(measurement, measurement.weighting).residuals(measurement.vector())
-    # orthonormal: each determined direction in units of its standard error
+    vector, weighting = measurement.vector(), measurement.weighting
+    residual = Problem(measurement, weighting).residuals(vector)
+    # less what the live parameters absorb; orthonormal: each determined direction in units of its
+    # standard error
     basis = whitened.along(rows)
     along = basis.T @ rows[:, held]
     columns = rows[:, held] - basis @ along
     size = np.linalg.norm(columns, axis=0)
     columns[:, size <= RANK * whitened.together.singular.max(initial=0.0)] = 0.0
     # a step of what is held moves the live ones by this, shape (n_live, n_held)
-    return columns, residual - basis @ (basis.T @ residual), -whitened.errors.half.T @ along
-
-
-def _one_sided(columns, residual, level, widths):
-    """Return how far each may go inward until chi-square over the noise has risen by one."""
+    response = -whitened.errors.half.T @ along
+    low, high = measurement.free.bounds()
+    # from the lower bound up, from the upper one down
+    inward = np.where((vector - low <= high - vector)[held], 1.0, -1.0)
+    widths = (high - low)[held] / whitened.scale[held]
     # the triangular factor is as good as all rows
-    square = np.linalg.qr(np.column_stack([columns, residual]), mode="r")
-    columns, residual = square[:, :-1], square[:, -1]
-    return [_rises(columns, residual, level, i, width) for i, width in enumerate(widths)]
+    rest = residual - basis @ (basis.T @ residual)
+    square = np.linalg.qr(np.column_stack([columns * inward, rest]), mode="r")
+    steps = [_rises(square, weighting.level, i, width) for i, width in enumerate(widths)]
+    # what the data do not limit is anywhere up to the opposite bound
+    far = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)
+    moved = np.zeros((held.size, whitened.scale.size))
+    moved[:, whitened.live] = response.T
+    moved[np.arange(held.size), held] = 1.0
+    # without an opposite bound either, it stays where it is
+    return held, columns, response, steps, moved * np.where(np.isfinite(far), far, 0.0)[:, None]
 
 
-def _rises(columns, residual, level, i, width):
+def _rises(square, level, i, width):
+    """Return how far one may go inward until chi-square over the noise has risen by one."""
     # a calibration is read where there is no scipy
     from scipy.optimize import brentq, nnls
 
+    columns, residual = square[:, :-1], square[:, -1]
     own, others = columns[:, i], np.delete(columns, i, axis=1)
     if not np.isfinite(level) or not own.any():
         return np.nan if own.any() else np.inf

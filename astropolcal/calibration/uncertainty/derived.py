@@ -7,7 +7,7 @@ variance is g C g. A quantity that moves along a direction which the data do not
 infinite error, however small the change: no pseudo-inverse hides it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
@@ -293,31 +293,18 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     >>> bool(half_wave.std < 0.1 * u.deg)
     True
     """
-    chain = calibration.chains[dataset]
-    leaf = find_optic(chain, optic)
+    leaf = find_optic(calibration.chains[dataset], optic)
+    components = ("retardance", "horizontal", "diagonal", "circular")
+    components = [key for key in components if key in leaf.param_names]
+    if components:
+        return _of_optic(calibration, dataset, optic, components, wavelength)
+    if not callable(getattr(leaf, "retardance", None)):
+        raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
     lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
-    components = [
-        key for key in ("retardance", "horizontal", "diagonal", "circular")
-        if key in leaf.param_names
-    ]  # fmt: skip
-    if not components:
-        if not callable(getattr(leaf, "retardance", None)):
-            raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
-        found = propagate(
-            calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
-        )
-        found.wavelength = lam
-        return found
-    parts, weights = _at_wavelengths(calibration, leaf, components, lam)
-    if len(components) == 1:
-        value, slopes = parts[0], np.ones((1, *np.shape(lam)))
-    else:
-        value = np.sqrt(np.sum(parts**2, axis=0))
-        # d|Delta| / d Delta_k = Delta_k / |Delta|
-        slopes = parts / np.where(value > 0, value, 1.0)
-    found = _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
-    found.wavelength = lam
-    return found
+    found = propagate(
+        calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
+    )
+    return replace(found, wavelength=lam)
 
 
 def derived_efficiency(calibration, wavelength=None, dataset=0):
@@ -362,18 +349,14 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     found = [o for o in leaves(calibration.chains[dataset]) if "efficiency" in o.param_names]
     if not found:
         raise ChainError("no optic of the chain has an efficiency")
+    return _of_optic(calibration, dataset, found[0].name, ["efficiency"], wavelength)
+
+
+def _of_optic(calibration, dataset, optic, keys, wavelength):
+    """Return one parameter of an optic, or the length of several, between the wavelengths, too."""
+    leaf = find_optic(calibration.chains[dataset], optic)
     lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
-    (value,), weights = _at_wavelengths(calibration, found[0], ["efficiency"], lam)
-    slopes = np.ones((1, *np.shape(lam)))
-    derived = _of_parameters(calibration, found[0], ["efficiency"], value, slopes, weights)
-    derived.wavelength = lam
-    return derived
-
-
-def _at_wavelengths(calibration, leaf, keys, lam):
-    """Return parameters (degree or 1) at wavelengths, and the share of each grid point."""
-    grid = calibration.wavelength.to_value(u.nm)
-    wanted = np.atleast_1d(lam.to_value(u.nm))
+    grid, wanted = calibration.wavelength.to_value(u.nm), np.atleast_1d(lam.to_value(u.nm))
     # one number for all wavelengths holds anywhere
     several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
     slack = SAME_WAVELENGTH * grid.max()
@@ -383,24 +366,19 @@ def _at_wavelengths(calibration, leaf, keys, lam):
             f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
             f"{grid.min():.2f} to {grid.max():.2f} nm"
         )
-    weights = between(wanted, grid)
-    parts = []
-    for key in keys:
-        parameter = getattr(leaf, key)
-        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
-        value = np.ravel(parameter.value) * factor
-        parts.append(weights @ value if value.size > 1 else np.full(wanted.size, value[0]))
-    return np.array(parts).reshape(len(keys), *np.shape(lam)), weights
+    weights, unit = between(wanted, grid), getattr(leaf, keys[0]).unit
 
+    def length(*chains):
+        parts = []
+        for parameter in (getattr(find_optic(chains[dataset], optic), key) for key in keys):
+            value = np.ravel(
+                parameter.value if unit is None else parameter.quantity.to_value(u.deg)
+            )
+            parts.append(weights @ value if value.size > 1 else np.full(wanted.size, value[0]))
+        found = parts[0] if len(keys) == 1 else np.linalg.norm(parts, axis=0)
+        return found.reshape(lam.shape) * (1 if unit is None else u.deg)
 
-def _of_parameters(calibration, leaf, keys, value, slopes, weights):
-    """Return a quantity that depends on parameters of one optic at the same wavelength."""
-    units = (getattr(leaf, key).unit for key in keys)
-    named = {
-        f"{leaf.name}.{key}": np.ravel(slope) * (1.0 if unit is None else unit.to(u.deg))
-        for key, slope, unit in zip(keys, slopes, units, strict=True)
-    }
-    return _by_name(calibration, value[()], named, weights)
+    return replace(propagate(calibration, length), wavelength=lam)
 
 
 def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
@@ -447,15 +425,14 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     lam = _grid(calibration, wavelength)
     chain = with_beam(calibration.chains[dataset], beam)
     value = system_mueller(chain, lam, positions)
-    return _by_name(calibration, value, system_mueller_derivatives(chain, lam, positions), axis=-3)
+    return _by_name(calibration, value, system_mueller_derivatives(chain, lam, positions), -3)
 
 
-def _by_name(calibration, value, slopes, mix=None, axis=0):
+def _by_name(calibration, value, slopes, axis):
     """Return a quantity with its error from derivatives by name, see `spread_out`."""
     free = free_of(calibration)
-    mix = np.eye(len(calibration.wavelength)) if mix is None else mix
-    # a single quantity is one of one wavelength
-    slopes = spread_out(free, per_canonical(free, slopes), np.shape(value) or (1,), mix, axis)
+    mix = np.eye(len(calibration.wavelength))
+    slopes = spread_out(free, per_canonical(free, slopes), np.shape(value), mix, axis)
     return derive(calibration, free, value, slopes.reshape(-1, free.size))
 
 
@@ -606,7 +583,7 @@ def derived_sky(
             change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
             slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
-    return _by_name(calibration, value, slopes, axis=-2)
+    return _by_name(calibration, value, slopes, -2)
 
 
 def _double_difference_rows(chain, lam, positions, modulator):

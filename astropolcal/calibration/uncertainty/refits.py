@@ -33,7 +33,6 @@ from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty.covariance import (
     Covariance,
     full_covariance,
-    residual_variance,
     sandwich,
     white_covariance,
 )
@@ -45,7 +44,8 @@ from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
-_FEWEST_BLOCKS = 3
+# blocks of a bootstrap, and groups of a robust covariance, of which there are many at best
+_FEWEST = 3
 
 
 # ---- profile likelihood: chi-square along one parameter, all others refitted ----
@@ -130,16 +130,11 @@ class Profile:
                 f"{self.name} is unbounded: between {ends} chi-square rises by at most "
                 f"{self.delta_chi2.max():.2g}, so the data do not determine it"
             )
-        if np.isinf(low) or np.isinf(high):
-            return self._one_sided(low, high)
-        return f"{self.name} = {self.best:.6g}, between {low:.6g} and {high:.6g} at one sigma"
-
-    def _one_sided(self, low, high):
-        if np.isinf(low):
-            least, end, last, bound = "at most", high, self.values[0], self.bounds[0]
-        else:
-            least, end, last, bound = "at least", low, self.values[-1], self.bounds[1]
-        at_bound = np.isclose(getattr(last, "value", last), bound)
+        if np.isfinite(low) and np.isfinite(high):
+            return f"{self.name} = {self.best:.6g}, between {low:.6g} and {high:.6g} at one sigma"
+        least, end, i = ("at most", high, 0) if np.isinf(low) else ("at least", low, -1)
+        last = self.values[i]
+        at_bound = np.isclose(getattr(last, "value", last), self.bounds[i])
         stop = "its bound" if at_bound else "the last value"
         return (
             f"{self.name} is {least} {end:.6g} at one sigma; chi-square does not limit it "
@@ -223,22 +218,18 @@ def profile(calibration, name, values=None, n=21):
     if values is None:
         inward = (calibration.fit.get("bounds") or {"inward": {}})["inward"]
         std = inward.get(name, covariance.stds[index])
-        grid = _grid(best, std, declared_step(unit), n)
+        half = _WIDTH * std if np.isfinite(std) else _OPEN_WIDTH * declared_step(unit)
+        # an odd number of values, so that the best is one
+        grid = best + half * np.linspace(-1, 1, n + 1 - n % 2)
         grid = np.unique(np.clip(grid, low, high))
     else:
         grid = np.unique(np.append(to_unit(values, unit, name), best))
         if grid[0] < low or grid[-1] > high:
             raise ParameterError(f"{name}: values outside its bounds {low:g} to {high:g}")
     chi2, vectors = _follow(refit, index, grid * factor, int(np.argmin(np.abs(grid - best))))
-    rise = (chi2 - chi2.min()) / residual_variance(calibration)
+    rise = (chi2 - chi2.min()) / refit.weighting.level**2
     quantity = 1 if unit is None else u.Unit(unit)
     return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
-
-
-def _grid(best, std, step, n):
-    """Return values around the best; an odd number of them, so that it is one."""
-    half = _WIDTH * std if np.isfinite(std) else _OPEN_WIDTH * step
-    return best + half * np.linspace(-1, 1, n + 1 - n % 2)
 
 
 def _follow(refit, index, values, here):
@@ -310,28 +301,7 @@ class Resampled:
     @property
     def covariance(self):
         """The sample covariance, a `Covariance`."""
-        centred = self.samples - self.samples.mean(axis=0)
-        return Covariance(self.names, self.units, centred.T @ centred / (len(self.samples) - 1))
-
-    def std(self, name):
-        """
-        Return the standard deviation of one parameter.
-
-        Parameters
-        ----------
-        name : str
-            One of ``names``.
-
-        Returns
-        -------
-        `~astropy.units.Quantity` or float
-
-        Raises
-        ------
-        ParameterError
-            If there is no such parameter.
-        """
-        return self.covariance.std(name)
+        return Covariance(self.names, self.units, np.atleast_2d(np.cov(self.samples.T)))
 
     def interval(self, level=0.6827):
         """
@@ -406,59 +376,52 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     if n < 2:
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
     refit = problem_of(calibration)
-    groups = _blocks(refit.measurement, block)
+    measurement, labels = refit.measurement, labels_of(refit.measurement, block)
+    # for each dataset the block of each datum
+    blocks = [
+        _numbered(labels[segment], f"{dataset.observations.name} has {{}} {block} blocks")
+        for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True)
+    ]
+    counts = [int(numbers.max()) + 1 for numbers in blocks]
     rng = np.random.default_rng(check_seed(seed))
     # what all data determine, a resample must determine too
     wanted = _singular_values(refit, 1.0)
     samples, rejected = [], 0
     with shown(progress), counting(n, "resamples") as add:
         while len(samples) < n:
-            counts = _draw(rng, groups)
-            vector = _resample(refit, counts, wanted)
-            if vector is None:
-                rejected += 1
-                if rejected > _PATIENCE * n + 10:
-                    raise FitError(
-                        f"{rejected} resamples could not be fitted: the data have too few blocks "
-                        "for the model"
-                    )
-                continue
-            samples.append(vector)
-            add()
-    return _result(calibration, refit, np.array(samples), block, groups, rejected)
+            # of each dataset as many blocks as there are, with replacement
+            drawn = (np.bincount(rng.integers(k, size=k), minlength=k) for k in counts)
+            often = [own[numbers] for own, numbers in zip(drawn, blocks, strict=True)]
+            often = np.concatenate(often).astype(float)
+            seen = _singular_values(refit, np.sqrt(often))[: wanted.size]
+            if np.all(seen >= _LOST * wanted):
+                vector, _, found = refit.fit(refit.solution, often)
+                if found.success:
+                    samples.append(vector)
+                    add()
+                    continue
+            rejected += 1
+            if rejected > _PATIENCE * n + 10:
+                raise FitError(
+                    f"{rejected} resamples could not be fitted: the data have too few blocks "
+                    "for the model"
+                )
+    known = full_covariance(calibration)
+    samples = np.array(samples) / measurement.free.factors()
+    is_open = (np.abs(known._axes().open) > STILL).any(axis=0)
+    # where the data leave a direction open, a fit ends anywhere along it
+    samples[:, is_open] = np.nan
+    return Resampled(known.names, known.units, samples, block, sum(counts), rejected)
 
 
-def _blocks(measurement, block):
-    """Return for each dataset its slice of the data and the block of each datum."""
-    labels, found = labels_of(measurement, block), []
-    for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
-        _, numbers = np.unique(labels[segment], return_inverse=True)
-        if numbers.max() + 1 < _FEWEST_BLOCKS:
-            raise FitError(
-                f"{dataset.observations.name} has {numbers.max() + 1} {block} blocks; a bootstrap "
-                f"needs {_FEWEST_BLOCKS}, and many more to be accurate"
-            )
-        found.append((segment, numbers))
-    return found
-
-
-def _draw(rng, groups):
-    """Return how often each datum occurs in a resample."""
-    parts = []
-    for _, numbers in groups:
-        n_blocks = numbers.max() + 1
-        # as many blocks as there are, with replacement
-        drawn = np.bincount(rng.integers(n_blocks, size=n_blocks), minlength=n_blocks)
-        parts.append(drawn[numbers])
-    return np.concatenate(parts).astype(float)
-
-
-def _resample(refit, counts, wanted):
-    """Return the fit to a resample; None if it determines less than all data, or fails."""
-    if np.any(_singular_values(refit, np.sqrt(counts))[: wanted.size] < _LOST * wanted):
-        return None
-    vector, _, found = refit.fit(refit.solution, counts)
-    return vector if found.success else None
+def _numbered(labels, words):
+    """Return the number of the group of each datum, of which there are enough."""
+    _, numbers = np.unique(labels, return_inverse=True)
+    if numbers.max() + 1 < _FEWEST:
+        raise FitError(
+            f"{words.format(numbers.max() + 1)}; {_FEWEST} are needed, and many more to be accurate"
+        )
+    return numbers
 
 
 def _singular_values(refit, scale):
@@ -469,22 +432,10 @@ def _singular_values(refit, scale):
     return found.singular[: found.rank] if np.ndim(scale) == 0 else found.singular
 
 
-def _result(calibration, refit, vectors, block, groups, rejected):
-    known = full_covariance(calibration)
-    samples = vectors / refit.measurement.free.factors()
-    is_open = (np.abs(known._axes().open) > STILL).any(axis=0)
-    # where the data leave a direction open, a fit ends anywhere along it
-    samples[:, is_open] = np.nan
-    n_blocks = sum(int(numbers.max()) + 1 for _, numbers in groups)
-    return Resampled(known.names, known.units, samples, block, n_blocks, rejected)
-
-
 # ---- standard errors of parameters: of the full covariance, robust, and as published ones are ----
 
 
 METHODS = ("covariance", "white", "robust", "van-holstein")
-CORRECTIONS = ("leverage", "number")
-_FEWEST_GROUPS = 3
 # a share of a residual below this is what the fit has taken away, and no scatter
 _TAKEN = 1e-6
 
@@ -577,7 +528,7 @@ def standard_errors(calibration, method=None, groups=None):
 # ---- robust -----------------------------------------------------------------------------
 
 
-def robust_covariance(calibration, groups="derotator", correction="leverage"):
+def robust_covariance(calibration, groups="derotator"):
     r"""
     Return a covariance that allows residuals to be correlated within groups.
 
@@ -589,9 +540,8 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     (White 1980 [1]_ for groups of one datum, Liang & Zeger 1986 [2]_ for any). Nothing is assumed
     of the residuals of a group but that they are independent of other groups', which takes many
     groups. As the fit follows its data, residuals are too small, and few groups more so.
-    ``"leverage"`` undoes it with :math:`A_g = (1 - J_g B J_g^T)^{-1/2}`, which is exact for
-    independent residuals (Bell & McCaffrey 2002 [3]_); ``"number"`` multiplies the whole by
-    :math:`\frac{G}{G-1}\frac{n-1}{n-k}` for G groups, n data and k parameters.
+    :math:`A_g = (1 - J_g B J_g^T)^{-1/2}` undoes it, which is exact for independent residuals
+    (Bell & McCaffrey 2002 [3]_).
 
     Parameters
     ----------
@@ -600,8 +550,6 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     groups : {"derotator", "pair"} or array_like
         What is correlated: all data at a derotator angle, those of a pair of
         frames, or the label of each datum, shape (n_data,).
-    correction : {"leverage", "number"}
-        Correction for a small number of groups.
 
     Returns
     -------
@@ -643,52 +591,32 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     >>> bool(0.5 < robust.std("hwp.w_sio2") / cal.covariance.std("hwp.w_sio2") < 2)
     True
     """
-    check_choice("correction", correction, CORRECTIONS, FitError)
     problem = problem_of(calibration)
     measurement, whitened = problem.measurement, problem.around()
-    labels = _labels(measurement, groups)
-    residuals = problem.residuals(problem.solution)[: measurement.n_data]
-    # derivatives to the determined directions, each in units of its standard error
-    slopes = whitened.along(whitened.rows)
-    # (n_groups, rank): how far each group alone pulls the solution, in standard errors
-    pulls = np.array(
-        [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
-    )
-    # of one array with itself: a product of two copies is symmetric to rounding only
-    middle = pulls.T @ pulls
-    if correction == "number":
-        n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
-        middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
-    # priors are taken at their word: their variance is not read from residuals
-    prior = problem.weighting.level * whitened.along(whitened.prior_rows)
-    middle += prior.T @ prior
-    return sandwich(measurement, whitened, middle)
-
-
-def _labels(measurement, groups):
     labels = labels_of(measurement, groups) if isinstance(groups, str) else np.asarray(groups)
     if labels.shape != (measurement.n_data,):
         raise FitError(
             f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one per datum"
         )
-    _, numbers = np.unique(labels, return_inverse=True)
-    if numbers.max() + 1 < _FEWEST_GROUPS:
-        raise FitError(
-            f"{numbers.max() + 1} groups; a robust covariance needs {_FEWEST_GROUPS}, and many "
-            "more to be accurate"
-        )
-    return numbers
-
-
-def _pull(slopes, residuals, correction):
-    """Return how far a group pulls along each determined direction."""
-    if correction == "leverage":
+    numbers = _numbered(labels, "{} groups for a robust covariance")
+    residuals = problem.residuals(problem.solution)[: measurement.n_data]
+    # derivatives to the determined directions, each in units of its standard error
+    slopes = whitened.along(whitened.rows)
+    pulls = []
+    for group in range(numbers.max() + 1):
+        own, left_over = slopes[numbers == group], residuals[numbers == group]
         # of the hat matrix in the group only the directions of its slopes count
-        left, singular, _ = np.linalg.svd(slopes, full_matrices=False)
+        left, singular, _ = np.linalg.svd(own, full_matrices=False)
         spare = 1 - singular**2
         grown = np.where(spare > _TAKEN, 1 / np.sqrt(np.maximum(spare, _TAKEN)), 0.0)
-        residuals = residuals + left @ ((grown - 1) * (left.T @ residuals))
-    return slopes.T @ residuals
+        left_over = left_over + left @ ((grown - 1) * (left.T @ left_over))
+        # (rank,): how far the group alone pulls the solution, in standard errors
+        pulls.append(own.T @ left_over)
+    # priors are taken at their word: their variance is not read from residuals
+    prior = problem.weighting.level * whitened.along(whitened.prior_rows)
+    # of one array with itself: a product of two copies is symmetric to rounding only
+    pulls = np.array(pulls)
+    return sandwich(measurement, whitened, pulls.T @ pulls + prior.T @ prior)
 
 
 # ---- as published --------------------------------------------------------------------------

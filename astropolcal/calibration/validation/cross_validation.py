@@ -10,18 +10,16 @@ where it is itself estimated.
 Prediction of standards: datasets that the fit of a calibration did not use.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
-from astropolcal.calibration.noise.scatter import leave_out_groups
+from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError
@@ -30,7 +28,7 @@ from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations.reading import SAME_WAVELENGTH, bins_on_grid
 from astropolcal.optics import PolarizedSource
 from astropolcal.progress import steps
-from astropolcal.words import p_words
+from astropolcal.words import listed, p_words
 
 __all__ = ["add_standard", "lack_of_fit"]
 
@@ -52,36 +50,43 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
     s_rel (Sec. 2.3), with k the free parameters that act there; ``s_cv`` the rms of held-out
     residuals.
     """
-    part = measurement.datasets[dataset]
-    residuals = residuals[measurement.segments[dataset]]
-    held_out = None if held_out is None else held_out[measurement.segments[dataset]]
+    part, own = measurement.datasets[dataset], measurement.segments[dataset]
+    residuals = residuals[own]
+    held_out = np.full(residuals.size, np.nan) if held_out is None else held_out[own]
     rows = [part.bin_of_datum == b for b in part.bins]
-    n = np.array([row.sum() for row in rows])
-    k = part.n_parameters_per_wavelength
+    n, k = np.array([row.sum() for row in rows]), part.n_parameters_per_wavelength
     squares = np.array([np.sum(residuals[row] ** 2) for row in rows])
     with np.errstate(divide="ignore", invalid="ignore"):
         # n - k as for independent data: every parameter that acts here takes one degree of freedom,
         # also one common to all wavelengths, as in the paper
         s_res = np.where(n > k, np.sqrt(squares / np.where(n > k, n - k, 1)), np.nan)
         s_mean = s_res / np.sqrt(n)
-    s_cv = [
-        np.nan if held_out is None else rms(held_out[row][np.isfinite(held_out[row])])
-        for row in rows
-    ]
-    return QTable(
-        {
-            "wavelength": part.observations.wavelength,
-            "n": n,
-            "k": np.full(len(n), k),
-            "s_res": (s_res * 100) * u.percent,
-            "s_mean": (s_mean * 100) * u.percent,
-            "s_cv": (np.array(s_cv) * 100) * u.percent,
-            "s_standard": np.full(len(n), np.nan) * u.percent,
-        }
-    )
+    s_cv = [rms(held_out[row][np.isfinite(held_out[row])]) for row in rows]
+    table = QTable({"wavelength": part.observations.wavelength, "n": n, "k": np.full(len(n), k)})
+    columns = {
+        "s_res": s_res,
+        "s_mean": s_mean,
+        "s_cv": s_cv,
+        "s_standard": np.full(len(n), np.nan),
+    }
+    for key, values in columns.items():
+        table[key] = 100 * np.array(values) * u.percent
+    return table
 
 
-def cross_validated_residuals(measurement, vector, weights=None, groups=None):
+def held_out_residuals(calibration, groups=None):
+    """Return the residuals of all data, each predicted without its group, with the fit's weights.
+
+    ``groups`` may be a word, see `groups_by`.
+    """
+    live = calibration.live_measurement()
+    equal = calibration.settings.get("weights") is None
+    groups = groups_by(live, groups) if isinstance(groups, str) else groups
+    weights = None if equal else weighting_of(calibration).weight
+    return cross_validated_residuals(live, weights, groups)
+
+
+def cross_validated_residuals(measurement, weights=None, groups=None):
     """Return the residual of every datum predicted by a fit that left its group out.
 
     Up to 16 groups each have a fit; of more, which weigh little, the fits are linear steps. NaN
@@ -94,51 +99,59 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     found = np.unique(labels)
     if len(found) < fewest:
         return held_out
-    jacobian = measurement.jacobian(vector)
-    if len(found) > _MANY:
-        return _held_out_linearly(measurement, vector, jacobian, weights, labels, groups)
+    problem = Problem(measurement, assumed(measurement, weights))
+    if not np.isfinite(problem.noise):
+        # as many data as parameters tell no noise, against which a prior could weigh
+        problem.noise = 0.0
+    linear = _Linear(problem) if len(found) > _MANY else None
     for label in steps(found, "groups left out"):
         out = labels == label
-        moved, blind = _undetermined(measurement, vector, jacobian, out, weights)
+        if linear is not None:
+            predicted, blind = linear.without(out)
+        else:
+            _, blind = _undetermined(problem, out)
         if groups is not None and blind.any():
-            raise FitError(_not_predicted(measurement, label, out, moved))
-        fitted = _fit_without(measurement, vector, out, weights)
+            share = np.abs(_undetermined(problem, out)[0] / physical_scale(measurement.free))
+            slots = measurement.free.slots
+            moved = [s.name for s in slots if share[:, s.slice].max() > _WORTH_A_WORD]
+            raise FitError(
+                f"cross-validation: without group {label} ({out.sum()} data) the others do not "
+                f"determine {listed(moved, most=_MOST_NAMES)}; group by something else"
+            )
+        if linear is None:
+            fitted, _, _ = problem.fit(problem.solution, (~out).astype(float))
+            predicted = measurement.residuals(fitted)[out]
         # along what the others leave open the fit still stands where all data have put it
-        held_out[out] = np.where(blind, np.nan, measurement.residuals(fitted)[out])
+        held_out[out] = np.where(blind, np.nan, predicted)
     return held_out
 
 
-def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
-    """Return what a fit without each of many groups predicts, by one step of linear algebra.
+class _Linear:
+    """What a fit without each of many groups predicts, by one step of linear algebra.
 
     The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
     for a linear model, and a small group moves no parameter far.
     """
-    problem = Problem(measurement, assumed(measurement, weights))
-    whitened, weight = problem.around(vector), problem.weights
-    root = whitened.along(whitened.rows)
-    residuals = measurement.residuals(vector) * weight
-    order = np.argsort(labels, kind="stable")
-    ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1
-    held_out = np.empty(measurement.n_data)
-    for rows in np.split(order, ends):
+
+    def __init__(self, problem):
+        whitened, self._weights = problem.around(), problem.weights
+        self._root = whitened.along(whitened.rows)
+        self._residuals = problem.measurement.residuals(problem.solution) * self._weights
+
+    def without(self, out):
+        """Return the residuals of a group, and which of them the others do not determine."""
         # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
         # eigenvalues are those of R^T R, (rank, rank)
-        own = root[rows]
+        own, residuals = self._root[out], self._residuals[out]
         values, axes = np.linalg.eigh(own.T @ own)
         seen = own @ axes
         # along these the others determine nothing
         alone = values > 1 - _ALONE
         blind = (np.abs(seen[:, alone]) > _STILL).any(axis=1)
-        if groups is not None and blind.any():
-            out = labels == labels[rows[0]]
-            moved, _ = _undetermined(measurement, vector, jacobian, out, weights)
-            raise FitError(_not_predicted(measurement, labels[rows[0]], out, moved))
         gain = np.where(alone, 0.0, 1 / np.where(alone, 1.0, 1 - values))
         # (1 - R R^T)^-1 = 1 + R (1 - R^T R)^-1 R^T
-        change = seen @ (gain * (seen.T @ residuals[rows]))
-        held_out[rows] = np.where(blind, np.nan, (residuals[rows] + change) / weight[rows])
-    return held_out
+        change = seen @ (gain * (seen.T @ residuals))
+        return (residuals + change) / self._weights[out], blind
 
 
 def _checked(measurement, groups):
@@ -156,11 +169,12 @@ def _checked(measurement, groups):
     return groups
 
 
-def _undetermined(measurement, vector, jacobian, out, weights):
+def _undetermined(problem, out):
     """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
-    scale = physical_scale(measurement.free)
-    problem = Problem(measurement, assumed(measurement, weights))
-    kept = problem.jacobian(vector)[np.append(~out, np.ones(measurement.n_priors, dtype=bool))]
+    measurement, scale = problem.measurement, physical_scale(problem.measurement.free)
+    jacobian = measurement.jacobian(problem.solution)
+    kept = problem.jacobian(problem.solution)
+    kept = kept[np.append(~out, np.ones(measurement.n_priors, dtype=bool))]
     null = Whitened(kept.T, scale).data.null * scale
     # which combinations of what the others leave open do the data left out see, and how strongly
     left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
@@ -170,40 +184,12 @@ def _undetermined(measurement, vector, jacobian, out, weights):
     return left.T[moves] @ null, (np.abs(change) > limit).any(axis=0)
 
 
-def _not_predicted(measurement, label, out, moved):
-    share = np.abs(moved / physical_scale(measurement.free)).max(axis=0)
-    slots = [s for s in measurement.free.slots if share[s.slice].max() > _WORTH_A_WORD]
-    return (
-        f"cross-validation: without group {label} ({out.sum()} data) the others do not determine "
-        f"{_listed([slot.name for slot in slots])}; group by something else"
-    )
-
-
-def _listed(names):
-    more = len(names) - _MOST_NAMES
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
-
-
-def _fit_without(measurement, vector, out, weights):
-    model = measurement.canonical()
-    model.stand_at(vector)
-    noise = Problem(model, assumed(model, weights)).noise
-    # as many data as parameters tell no noise, against which a prior could weigh
-    noise = noise if np.isfinite(noise) else 0.0
-    index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
-    with warnings.catch_warnings():
-        # a fit that stops early still gives an honest, if poorer, prediction
-        warnings.simplefilter("ignore")
-        TRFLSQFitter()(model, index, observed, weights=weights, maxiter=50, inplace=True)
-    return model.vector()
-
-
 # ---- goodness of fit: whether the residuals exceed the noise ----
 
 
-# fewer degrees of freedom than this give no test
 # weights that differ by less than this share are equal
 _EQUAL = 1e-12
+# fewer degrees of freedom than this give no test
 _LEAST_FREEDOM = 0.5
 # what happens by chance less often than this is no chance
 _UNLIKELY = 0.01
@@ -310,7 +296,8 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
             f"{measurement.n_data}; estimate it from this measurement"
         )
     if hasattr(vector, "measurement"):
-        vector, weights, fitted = _of_calibration(measurement, vector)
+        fitted = vector.measurement is measurement
+        vector, weights = None, weighting_of(vector).weight if fitted else None
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     hat = _Hat.of(measurement, vector, noise.sigma_of_data, weights, whitened) if fitted else None
     table, whole = _test_by_wavelength(measurement, vector, noise, hat)
@@ -318,11 +305,6 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     chi2, expected, p_value = _together(table, whole, noise.dof, priors)
     words = _verdict(chi2, expected, p_value, noise, priors)
     return LackOfFit(table, chi2, expected, p_value, words, priors)
-
-
-def _of_calibration(measurement, calibration):
-    fitted = calibration.measurement is measurement
-    return measurement.vector(), weighting_of(calibration).weight if fitted else None, fitted
 
 
 def _test_of_priors(measurement, vector, hat):
@@ -500,7 +482,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     """
     refuse_fitted(calibration, observations)
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
-    predicted = _calibrated_chain(calibration, chain, rows, observations.name)
+    predicted = predicted_chain(calibration, chain, observations)
     known = parameter_table([predicted])
     fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
     measurement = Measurement(
@@ -511,7 +493,11 @@ def standard_accuracy(calibration, chain, observations, positions=None):
         ties={k: t for k, t in calibration.ties.items() if k in known and t.source in known},
     )
     table = _errors(measurement)
-    table["s_cv"] = _own_s_cv(calibration, observations.source, rows)
+    same = [record for record in calibration.datasets if record.source == observations.source]
+    # s_cv over the data of the same source, or over all
+    tables = (r.accuracy for r in same or calibration.datasets if r.accuracy is not None)
+    found = [(t["wavelength"].to_value(u.nm), t["s_cv"].value, t["n"]) for t in tables]
+    table["s_cv"] = _pooled(calibration.wavelength.to_value(u.nm), found)[rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         table["chi"] = (table["s_standard"] / table["s_cv"]).to_value(u.one)
     finding, free = calibration.identifiability, measurement.free
@@ -533,63 +519,50 @@ def standard_accuracy(calibration, chain, observations, positions=None):
         "open_percent": float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0)),
         "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
-    table.meta["words"] = _words(table, bool(_of_source(calibration, observations.source)))
+    table.meta["words"] = _words(table, bool(same))
     return table
 
 
-def predicted_chain(calibration, chain, observations):
-    """Return the chain with the calibration's values at the wavelengths of the observations."""
+def predicted_chain(calibration, chain, observations, sources=False):
+    """Return the chain with the calibration's values where it has the optic, and its flags.
+
+    At the wavelengths of the observations; polarized sources stay free if ``sources``.
+    """
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
-    return _calibrated_chain(calibration, chain, rows, observations.name, sources=True)
-
-
-def _calibrated_chain(calibration, chain, rows, name, sources=False):
-    """Return the chain with the calibration's values, bounds and flags where it has the optic."""
     # reversed, so that of optics in several chains the first dataset's counts
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
     for leaf in leaves(chain):
         is_source = sources and isinstance(leaf, PolarizedSource)
-        own = None if is_source else fitted.get(leaf.name)
-        if is_source:
-            pass
-        elif own is None:
-            parameters = ((key, getattr(leaf, key)) for key in leaf.param_names)
-            # free, and nothing is known of it
-            is_open = (k for k, p in parameters if not p.fixed and p.prior is None)
-            unknown += [f"{leaf.name}.{key}" for key in is_open]
-        elif type(own) is not type(leaf):
+        is_new = not is_source and leaf.name not in fitted
+        origin = leaf if is_source or is_new else fitted[leaf.name]
+        if type(origin) is not type(leaf):
             raise ChainError(
-                f"{name}: {leaf.name} is of class {type(leaf).__name__}, but that of the "
-                f"calibration is of class {type(own).__name__}"
+                f"{observations.name}: {leaf.name} is of class {type(leaf).__name__}, but that of "
+                f"the calibration is of class {type(origin).__name__}"
             )
-        origin = leaf if own is None else own
-        train.append(_at_rows(leaf, origin, rows, calibration.wavelength, free=is_source))
+        values, known = {}, {key: getattr(origin, key) for key in leaf.param_names}
+        for key, parameter in known.items():
+            on_grid = np.size(parameter.value) == len(calibration.wavelength) > 1
+            value = parameter.value[rows] if on_grid else parameter.value
+            values[key] = value if parameter.unit is None else value * parameter.unit
+            if is_new and not parameter.fixed and parameter.prior is None:
+                # free, and nothing is known of it
+                unknown.append(f"{leaf.name}.{key}")
+        new = leaf.with_parameters(**values)
+        for key, parameter in known.items():
+            # with the calibration's flags its open directions can be followed; what only a
+            # catalogue knows stays as it is
+            getattr(new, key).fixed = parameter.fixed or is_new
+            getattr(new, key).bounds = parameter.bounds
+            getattr(new, key).prior = None
+        train.append(new)
     if unknown:
         raise FitError(
-            f"{name}: nothing determines {', '.join(unknown)}: the calibration has no such "
-            "optics; hold them at known values"
+            f"{observations.name}: nothing determines {', '.join(unknown)}: the calibration has no "
+            "such optics; hold them at known values"
         )
     return join(train)
-
-
-def _at_rows(leaf, source, rows, grid, free=False):
-    """Return the optic with the source's values at some wavelengths of the grid."""
-    values = {}
-    for key in leaf.param_names:
-        parameter = getattr(source, key)
-        value = np.array(parameter.value)
-        on_grid = value.size > 1 and value.size == len(grid)
-        value = value[rows] if on_grid else value
-        values[key] = value if parameter.unit is None else value * parameter.unit
-    new = leaf.with_parameters(**values)
-    for key in leaf.param_names:
-        # with the calibration's flags its open directions can be followed; what only a
-        # catalogue knows stays as it is
-        getattr(new, key).fixed = getattr(source, key).fixed or (source is leaf and not free)
-        getattr(new, key).bounds = getattr(source, key).bounds
-        getattr(new, key).prior = None
-    return new
 
 
 def _errors(measurement):
@@ -608,24 +581,17 @@ def _errors(measurement):
     return table
 
 
-def _of_source(calibration, source):
-    return [record for record in calibration.datasets if record.source == source]
-
-
-def _own_s_cv(calibration, source, rows):
-    """Return s_cv over the data of the same source, or over all, at each wavelength."""
-    same = _of_source(calibration, source) or calibration.datasets
-    grid = calibration.wavelength.to_value(u.nm)
-    squares, n = np.zeros(grid.size), np.zeros(grid.size)
-    for table in (r.accuracy for r in same if r.accuracy is not None):
-        at = np.abs(table["wavelength"].to_value(u.nm)[:, None] - grid).argmin(axis=1)
-        s_cv, count = table["s_cv"].to_value(u.percent), np.asarray(table["n"])
-        known = np.isfinite(s_cv)
-        # mean square over datasets, weighted by their number of data
-        np.add.at(squares, at[known], (count * s_cv**2)[known])
-        np.add.at(n, at[known], count[known])
+def _pooled(wavelength, tables):
+    """Return the rms in percent at some wavelengths (nm), of those in tables, by number of data."""
+    squares, n = np.zeros(wavelength.size), np.zeros(wavelength.size)
+    for own, percent, count in tables:
+        percent, count = np.array(percent, dtype=float), np.array(count)
+        known = np.isfinite(percent)
+        pairs = np.abs(wavelength[:, None] - own) < SAME_WAVELENGTH * np.array(own)
+        squares += pairs[:, known] @ (count * percent**2)[known]
+        n += pairs[:, known] @ count[known]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.sqrt(squares / n)[rows] * u.percent
+        return np.sqrt(squares / n) * u.percent
 
 
 def _words(table, same_source):
@@ -711,21 +677,8 @@ def add_standard(calibration, chain, observations, positions=None):
     ]
     calibration.fit["standards"] = [*others, entry]
     for record in (r for r in calibration.datasets if r.accuracy is not None):
-        _fill(record, calibration.fit["standards"])
+        same = (s for s in calibration.fit["standards"] if s["source"] == record.source)
+        found = [(s["wavelength_nm"], s["s_standard_percent"], s["n"]) for s in same]
+        wavelength = record.accuracy["wavelength"].to_value(u.nm)
+        record.accuracy["s_standard"] = _pooled(wavelength, found)
     return table
-
-
-def _fill(record, standards):
-    """Write the rms over all standards of the dataset's source into its accuracies."""
-    lam = record.accuracy["wavelength"].to_value(u.nm)
-    squares, n = np.zeros(lam.size), np.zeros(lam.size)
-    for entry in (s for s in standards if s["source"] == record.source):
-        own = np.array(entry["wavelength_nm"])
-        pairs = np.abs(lam[:, None] - own) < SAME_WAVELENGTH * own
-        count = np.array(entry["n"])
-        squares += pairs @ np.where(
-            count > 0, count * np.array(entry["s_standard_percent"]) ** 2, 0
-        )
-        n += pairs @ count
-    with np.errstate(divide="ignore", invalid="ignore"):
-        record.accuracy["s_standard"] = np.sqrt(squares / n) * u.percent

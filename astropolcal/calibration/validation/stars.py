@@ -82,7 +82,7 @@ def star_stokes(calibration, chain, observations, positions=None):
     if not isinstance(first, PolarizedSource):
         raise ChainError("the chain of a star begins with a PolarizedSource")
     chain = join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
-    predicted = predicted_chain(calibration, chain, observations)
+    predicted = predicted_chain(calibration, chain, observations, sources=True)
     measurement = Measurement(
         predicted,
         observations,

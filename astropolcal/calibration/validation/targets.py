@@ -14,12 +14,11 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
 from astropolcal.calibration.noise.estimates import rms
-from astropolcal.calibration.noise.scatter import groups_by
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
-    cross_validated_residuals,
+    held_out_residuals,
     refuse_fitted,
 )
 from astropolcal.chain import leaves
@@ -538,12 +537,15 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     >>> four_accuracies(cal, simulate(chain, charis.wavelength, frames, seed=3)).colnames
     ['wavelength', 's_res', 's_mean', 's_cv', 's_standard']
     """
-    table = calibration.datasets[dataset].accuracy
-    if groups is not None:
-        table = _cross_validated(calibration, dataset, groups)
-    result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
     record = calibration.datasets[dataset]
-    table = record.accuracy
+    table = result = record.accuracy
+    if groups is not None:
+        held_out = held_out_residuals(calibration, groups)
+        if np.isnan(held_out).all():
+            raise FitError("the groups are too few for cross-validation")
+        live = calibration.measurement
+        result = accuracy_table(live, dataset, live.residuals(), held_out)
+    result = result["wavelength", "s_res", "s_mean", "s_cv"].copy()
     unknown = np.full(len(table), np.nan) * u.percent
     result["s_standard"] = table["s_standard"] if "s_standard" in table.colnames else unknown
     known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
@@ -562,17 +564,6 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
-
-
-def _cross_validated(calibration, dataset, groups):
-    # residuals refuses a calibration without data in words of its own
-    residuals, live = calibration.residuals, calibration.measurement
-    if isinstance(groups, str):
-        groups = groups_by(live, groups)
-    held_out = cross_validated_residuals(live, live.vector(), calibration._weights(), groups)
-    if np.isnan(held_out).all():
-        raise FitError(f"{np.unique(groups).size} groups are too few for cross-validation")
-    return accuracy_table(live, dataset, residuals, held_out)
 
 
 def _independent(calibration, standard, dataset):
