@@ -172,20 +172,17 @@ def polarimetric_efficiency(
 
 
 def _cycle(path, lam, positions):
-    """Return the first two rows of the matrices at the four angles of the plate."""
-    if "flc_state" not in stages(path):
-        return np.stack([_at(path, lam, positions, hwp) for hwp in _CYCLE])
-    n = len(next(iter(positions.values())))
-    a, b = (positions | {"flc_state": np.full(n, state)} for state in (0.0, 1.0))
-    pairs = zip(_CYCLE, _EXCHANGED, strict=True)
-    return np.stack([(_at(path, lam, a, one) + _at(path, lam, b, two)) / 2 for one, two in pairs])
-
-
-def _at(path, lam, positions, hwp):
-    """Return the first two rows of the matrices with the plate turned further."""
-    if "hwp" in positions:
-        positions = positions | {"hwp": positions["hwp"] + hwp}
-    return np.asarray(system_mueller(path, lam, positions))[..., :2, :]
+    """Return rows I and Q at the four angles of the plate, mean over the states of a modulator."""
+    cycles = [(_CYCLE, positions)]
+    if "flc_state" in stages(path):
+        count = len(positions["hwp"])
+        states = (positions | {"flc_state": np.full(count, state)} for state in (0.0, 1.0))
+        cycles = zip((_CYCLE, _EXCHANGED), states, strict=True)
+    found = []
+    for angles, at in cycles:
+        turned = (at | {"hwp": at["hwp"] + further} for further in angles)
+        found.append([system_mueller(path, lam, one)[..., :2, :] for one in turned])
+    return np.mean(found, axis=0)
 
 
 def _law_of(instrument):
@@ -211,27 +208,20 @@ def _positions(path, derotator, altitude, parallactic, law):
         found[turning or "derotator"] = angle_to_rad(derotator, "derotator")
     elif turning is not None:
         raise ParameterError(f"the chain has an optic on the stage {turning}: derotator= is needed")
-    found |= _pointing(wanted, altitude, parallactic, law)
+    if _SKY & wanted:
+        needs_altitude = "altitude" in wanted or (law[1] and "hwp" in wanted)
+        if parallactic is None or (altitude is None and needs_altitude):
+            lacking = "altitude= and parallactic=" if needs_altitude else "parallactic="
+            raise ParameterError(f"a chain from the sky needs {lacking}")
+        a, p = horizontal(90 * u.deg if altitude is None else altitude, parallactic)
+        found |= {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
     unknown = wanted - set(found)
     if unknown:
         raise ChainError(f"no position of the stages {', '.join(sorted(unknown))}")
     for name, angle in found.items():
         if not np.all(np.isfinite(angle)):
             raise ParameterError(f"{name} = {angle} must be finite")
-    keep = {"derotator", *wanted} & set(found)
-    return {stage: found[stage] for stage in keep} or {"hwp": 0.0}
-
-
-def _pointing(wanted, altitude, parallactic, law):
-    """Return the positions of what follows the sky."""
-    if not _SKY & wanted:
-        return {}
-    needs_altitude = "altitude" in wanted or (law[1] and "hwp" in wanted)
-    if parallactic is None or (altitude is None and needs_altitude):
-        lacking = "altitude= and parallactic=" if needs_altitude else "parallactic="
-        raise ParameterError(f"a chain from the sky needs {lacking}")
-    a, p = horizontal(90 * u.deg if altitude is None else altitude, parallactic)
-    return {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
+    return {stage: found[stage] for stage in {"derotator", *wanted} & set(found)}
 
 
 def _measured(rows, aolp):

@@ -95,7 +95,7 @@ EXTERNAL = (
 )
 
 if ONLINE:
-    for unused in ("astropy.org", "pythonloc"):
+    for unused in ("astropy.org", "h5py", "pythonloc"):
         intersphinx_mapping.pop(unused, None)
     intersphinx_mapping["asdf"] = ("https://www.asdf-format.org/projects/asdf/en/stable/", None)
     intersphinx_mapping["photutils"] = ("https://photutils.readthedocs.io/en/stable/", None)

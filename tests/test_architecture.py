@@ -42,6 +42,7 @@ HEAVY = (
     "distributed",
     "emcee",
     "jinja2",
+    "h5py",
     "matplotlib",
     "photutils",
     "specutils",

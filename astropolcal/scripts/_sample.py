@@ -31,7 +31,7 @@ EXAMPLES = """\
 examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
-  astropolcal sample cal.asdf run.ecsv --checkpoint run.chain --resume -o out.asdf
+  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf
 
 The files are the tables that the calibration was made from, all of them. Which
 parameters vary, their bounds and their priors are those of the calibration.
@@ -51,7 +51,7 @@ files FILE + Input  the tables that it was made from (ECSV)
 --steps N int =5000  default: %(default)s
 --burn N|auto burn_in  steps to leave out at the start (default: auto, 5 autocorrelation times)
 --seed N int  makes the run repeatable
---checkpoint FILE Continued  write the steps here while the run lasts
+--checkpoint FILE.h5 Continued  write the steps here while the run lasts
 --resume  go on from the checkpoint, if there is one
 @ plots full json online quiet
 """
@@ -93,7 +93,7 @@ def run(arguments):
 def _check_options(arguments):
     """Raise before the long work is done."""
     if arguments.resume and not arguments.checkpoint:
-        raise AstropolcalError("--resume needs --checkpoint FILE")
+        raise AstropolcalError("--resume needs --checkpoint FILE.h5")
     if arguments.seed is not None and arguments.seed < 0:
         raise AstropolcalError(f"--seed {arguments.seed}: allowed are whole numbers from 0 up")
     # a run of days must not be overwritten by a typo
@@ -113,6 +113,8 @@ def _check_run(calibration, arguments):
     need("emcee", "sampling")
     # the summary comes last, and must not fail after hours
     need("arviz_stats.base", "the summary of a posterior")
+    if arguments.checkpoint:
+        need("h5py", "a checkpoint")
 
 
 def _sample(calibration, arguments):
@@ -155,7 +157,7 @@ def _words(calibration, arguments, written):
     complaints = posterior.convergence.complaints(posterior.names)
     if complaints:
         words[0] = shortened(f"NOT CONVERGED: {complaints[0]}")
-        words[-1] = "Next        more --steps; with --checkpoint FILE, --resume goes on from it"
+        words[-1] = "Next        more --steps; with --checkpoint FILE.h5, --resume goes on from it"
     ends = [*words, *written_calibration(arguments, written)]
     return "\n".join(with_ending(_table(posterior), ends, arguments.full))
 

@@ -20,6 +20,7 @@ from astropolcal.exceptions import AstropolcalWarning
 from astropolcal.measurement import Normal
 
 pytest.importorskip("emcee")
+pytest.importorskip("h5py")
 
 GLOBAL = ["hwp.w_sio2", "hwp.w_mgf2"]
 GLOBAL += [f"{name}.theta" for name in ("hwp", "derotator", "calibration_polarizer")]

@@ -218,6 +218,7 @@ def test_default_numbers_of_walkers_and_of_steps_kept_grow(calibration, monkeypa
 @pytest.mark.slow
 def test_resumed_run_of_many_parameters_is_the_uninterrupted_one(calibration, tmp_path):
     """The steps around the fit draw the same random numbers."""
+    pytest.importorskip("h5py")
     options = {"seed": 4, "progress": False, "checkpoint": tmp_path / "chain.h5"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropolcalWarning)

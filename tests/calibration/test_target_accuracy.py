@@ -17,7 +17,7 @@ from astropolcal.calibration.validation.cross_validation import (
     add_standard,
     cross_validated_residuals,
 )
-from astropolcal.calibration.validation.targets import absolute_accuracy, propagate_accuracy
+from astropolcal.calibration.validation.targets import propagate_accuracy
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations.observables import get_observable
@@ -77,10 +77,6 @@ def test_accuracy_of_the_degree_lies_between_those_of_q_and_u(p, angle, rel, abs
     turned = propagate_accuracy(p, (angle + 45) * u.deg, rel * u.percent, absolute * u.percent)
     # a turn by 45 deg exchanges q and u
     np.testing.assert_allclose(turned["s_p"], found["s_p"], rtol=1e-6, atol=1e-15 * u.percent)
-
-
-def test_absolute_accuracy_adds_in_squares():
-    np.testing.assert_allclose(percent(absolute_accuracy(3 * u.percent, 0.04 * u.one)), 5)
 
 
 def test_impossible_targets_are_refused():

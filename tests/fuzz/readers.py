@@ -857,7 +857,7 @@ class Described(Reader):
 class Checkpoint(Reader):
     """Checkpoints of a sampler."""
 
-    suffix = ".chain"
+    suffix = ".h5"
     shape, every = (8, 4, 2), 2
     description = {"parameters": [["hwp.theta", "deg"]], "seed": 1, "moves": ["DEMove"]}
     arrays = {"noise": np.ones(5), "bounds": np.zeros((2, 2))}
@@ -881,8 +881,8 @@ class Checkpoint(Reader):
     def mutate(self, rng, content):
         if rng.random() < 0.5:
             return mutate.mutate_bytes(rng, content)
-        kind, stated, steps = content.split(b"\n", 2)
-        return b"\n".join([kind, mutate.mutate_json(rng, stated), steps])
+        kind, start, stated, steps = content.split(b"\n", 3)
+        return b"\n".join([kind, start, mutate.mutate_json(rng, stated), steps])
 
     def read(self, path):
         return self._run(path, 8)

@@ -41,7 +41,7 @@ FAILED = {
 #: Slow ones take a part of that.
 SHARE = {"calibration": 2, "forged": 2, "loaded": 4, "observations": 2, "spectra": 2}
 SHARE |= dict.fromkeys(("cube", "star", "cameras", "header", "science", "info", "product"), 3)
-NEEDS = {"spectra": "specutils"}
+NEEDS = {"checkpoint": "h5py", "spectra": "specutils"}
 
 
 @pytest.fixture(params=READERS)

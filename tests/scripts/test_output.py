@@ -177,7 +177,7 @@ def test_summary_says_five_things_in_24_lines():
 
 
 def test_samples_fit_a_terminal():
-    for package in ("emcee", "arviz_stats"):
+    for package in ("emcee", "h5py", "arviz_stats"):
         pytest.importorskip(package)
     assert_fits(call(SAMPLES)[0])
 

@@ -15,7 +15,7 @@ from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.scripts.main import build_parser, main
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
-for package in ("emcee", "arviz_stats", "corner"):
+for package in ("emcee", "h5py", "arviz_stats", "corner"):
     pytest.importorskip(package)
 
 NAMES = ["hwp.w_sio2", "wollaston.efficiency[1]"]
@@ -268,7 +268,7 @@ def interrupt_after(patch, count):
 
 @pytest.mark.slow
 def test_interrupted_run_goes_on(calibration, table, tmp_path, capsys):
-    checkpoint = tmp_path / "run.chain"
+    checkpoint = tmp_path / "run.h5"
     whole = ["sample", calibration, table, *RUN, "-q"]
     argv = [*whole, "--checkpoint", str(checkpoint)]
     with pytest.MonkeyPatch.context() as patch:
@@ -285,7 +285,7 @@ def test_interrupted_run_goes_on(calibration, table, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_resume_without_a_checkpoint_yet_begins_one(calibration, table, tmp_path):
-    checkpoint = tmp_path / "run.chain"
+    checkpoint = tmp_path / "run.h5"
     argv = ["sample", calibration, table, *RUN, "-q", "--checkpoint", str(checkpoint), "--resume"]
     assert main(argv) == 0
     assert checkpoint.exists()
@@ -297,16 +297,16 @@ def test_resume_without_a_checkpoint_yet_begins_one(calibration, table, tmp_path
 
 @pytest.mark.slow
 def test_checkpoint_is_not_overwritten(calibration, table, tmp_path, capsys):
-    checkpoint = tmp_path / "run.chain"
+    checkpoint = tmp_path / "run.h5"
     checkpoint.write_bytes(b"precious")
     argv = (calibration, table, *RUN, "--checkpoint", checkpoint)
-    assert "run.chain: exists already; --resume goes on" in fails(capsys, *argv)
-    assert "run.chain: is not a checkpoint" in fails(capsys, *argv, "--resume")
+    assert "run.h5: exists already; --resume goes on" in fails(capsys, *argv)
+    assert "run.h5: is not a checkpoint" in fails(capsys, *argv, "--resume")
     assert checkpoint.read_bytes() == b"precious"
 
 
 def test_checkpoint_of_another_run(calibration, table, tmp_path, capsys):
-    checkpoint = tmp_path / "run.chain"
+    checkpoint = tmp_path / "run.h5"
     argv = ["sample", calibration, table, *RUN, "-q", "--checkpoint", str(checkpoint)]
     assert main(argv) == 0
     other = ["4" if text == "3" else text for text in argv[1:]]
@@ -351,7 +351,7 @@ def test_bad_options_get_one_line_and_status_two(calibration, table, capsys, tmp
         (["--resume"], "--resume needs --checkpoint"),
         (["-o", "nowhere/out.asdf"], "no folder"),
         (["--json", "nowhere/out.json"], "no folder"),
-        (["--checkpoint", "nowhere/run.chain"], "no folder"),
+        (["--checkpoint", "nowhere/run.h5"], "no folder"),
         (["--plots", __file__], "is a file, not a folder"),
     ]:
         monkeypatch.chdir(tmp_path)

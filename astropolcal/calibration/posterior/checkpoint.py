@@ -1,13 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Checkpoints of a sampler: one file that a kill at any moment leaves usable.
+"""Checkpoints of a sampler: one HDF5 file that a kill at any moment leaves usable.
 
-A line says what the file is, another one (JSON) of which run it is; then come the steps, each of
-the same size, with its number, the state of the random numbers after it and a CRC. A run writes
-them in place, where the system has set aside their blocks. What counts is the beginning of the file
-up to the first step that is not whole; the rest is computed again, with the same random numbers.
+HDF5 makes the file, with room for all steps, and never touches it again: where a write of its own
+fails it takes the process with it. The block before its structures, which it leaves to the user,
+says where the steps are and (JSON) of which run, so that no structure is read that may be spoiled.
+All steps have the same size, with their number, the state of the random numbers and a CRC; a run
+writes them in place. What counts is the beginning of the file up to the first step that is not
+whole; the rest is computed again, with the same random numbers.
 """
 
 import errno
+import io
 import json
 import os
 import zlib
@@ -16,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astropolcal.calibration.posterior.samples import need
 from astropolcal.exceptions import FitError
 from astropolcal.files import atomic_path, check_kind, one_line, understood, write_bytes
 
@@ -23,10 +27,11 @@ __all__ = []
 
 _FORMAT = b"astropolcal posterior checkpoint 3\n"
 _KEYS = 624  # words of the state of MT19937
+_LEAST_BLOCK = 512  # of HDF5, before its structures; larger ones are twice, four times ... as large
 
 
 def _step(n_walkers, n_parameters):
-    """Return how a step is kept: little-endian whatever the machine, so that a run may move."""
+    """Return how a step is kept: little-endian on any machine, so that a run may move."""
     fields = [
         ("coords", "<f8", (n_walkers, n_parameters)),
         ("log_prob", "<f8", n_walkers),
@@ -80,17 +85,16 @@ class Chain:
         if path is None:
             yield self
             return
-        path = Path(path)
+        path, room = Path(path), 0
         check_kind(path, FitError)
         with ExitStack() as stack:
-            found = os.path.exists(path)
-            if found:
+            if os.path.exists(path):
                 self._file = stack.enter_context(_held(path))
-                stated = _head(self._file, path)
+                self._start, room, *stated = _head(self._file, path)
                 if resume:
-                    _compare(path, stated, description, arrays)
-                    self._continue(path)
-            if not (found and resume):
+                    _compare(path, *stated, description, arrays)
+                    self._continue()
+            if not resume or room < len(self._steps):
                 self._create(path, description, arrays)
                 self._file = stack.enter_context(_held(path))
             try:
@@ -99,28 +103,43 @@ class Chain:
                 self.flush()
                 self._file = None
 
-    def _continue(self, path):
-        """Take the steps of a file, and set aside blocks for what is not in it yet."""
-        self._start = self._file.tell()
+    def _continue(self):
+        """Take the steps of a file."""
+        self._file.seek(self._start)
         found = np.fromfile(self._file, self._steps.dtype, len(self._steps))
         for number, step in enumerate(found, 1):
             if step["number"] != number or step["crc"] != _crc(step):
                 break
             self.count = self.saved = number
         self._steps[: self.count] = found[: self.count]
-        try:
-            _take_room(self._file, self._start + self._steps.nbytes)
-        except OSError as error:
-            raise self._refused(error) from error
 
     def _create(self, path, description, arrays):
         """Write a file with room for all steps; it takes its name when it is complete."""
-        stated = {"description": description}
-        stated |= {"arrays": {key: np.asarray(array).tolist() for key, array in arrays.items()}}
-        with atomic_path(path, error=FitError) as temporary, open(temporary, "wb") as stream:
-            stream.write(_FORMAT + json.dumps(stated).encode() + b"\n")
-            self._start = stream.tell()
-            _take_room(stream, self._start + self._steps.nbytes)
+        h5py = need("h5py", "a checkpoint")
+        arrays = {key: np.asarray(array).tolist() for key, array in arrays.items()}
+        stated = {"description": description, "arrays": arrays, "room": len(self._steps)}
+        stated, block = json.dumps(stated).encode(), _LEAST_BLOCK
+        while block < len(stated) + 100:
+            block *= 2
+        with atomic_path(path, error=FitError) as temporary, _Disk(temporary, "w+b") as stream:
+            with h5py.File(stream, "w", libver="earliest", userblock_size=block) as file:
+                plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+                # its place is taken at once, without writing zeros
+                plan.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+                plan.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+                kind = h5py.h5t.py_create(self._steps.dtype)
+                space = h5py.h5s.create_simple(self._steps.shape)
+                self._start = h5py.h5d.create(file.id, b"steps", kind, space, plan).get_offset()
+            if stream.error is not None:
+                raise stream.error
+            size = stream.seek(0, os.SEEK_END)
+            for place, content in (
+                (0, _FORMAT + f"{self._start:020}\n".encode() + stated + b"\n"),
+                (self._start, self._steps[: self.count].view(np.uint8)),
+            ):
+                stream.seek(place)
+                write_bytes(stream.fileno(), content)
+            _take_room(stream, size)
 
     def append(self, coords, log_prob, random_state, accepted):
         """Keep a step; bring the file up to date when it is time."""
@@ -143,21 +162,30 @@ class Chain:
             write_bytes(self._file.fileno(), new.view(np.uint8))
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise self._refused(error) from error
+            raise FitError(
+                f"{self._file.name}: cannot be written: {one_line(error)}; its first "
+                f"{self.saved} steps are safe, the run goes on from there"
+            ) from error
         self.saved = self.count
 
-    def _refused(self, error):
-        return FitError(
-            f"{self._file.name}: cannot be written: {one_line(error)}; its first "
-            f"{self.saved} steps are safe, the run goes on from there"
-        )
+
+class _Disk(io.FileIO):
+    """A file that keeps the error of a write that failed from whoever writes it."""
+
+    error = None
+
+    def write(self, content):
+        try:
+            write_bytes(self.fileno(), content)
+        except OSError as error:
+            self.error = error
+        return len(content)
 
 
 def _take_room(stream, size):
     """Let the system set aside the blocks that are not written yet, where it can."""
     if not hasattr(os, "posix_fallocate"):
         return
-    stream.flush()
     try:
         os.posix_fallocate(stream.fileno(), 0, size)
     except OSError as error:
@@ -186,23 +214,24 @@ def _held(path):
 
 
 def _head(stream, path):
-    """Return of which run a checkpoint is; its steps begin where this ends."""
+    """Return where the steps of a checkpoint begin, for how many it has room, and of which run."""
     if stream.read(len(_FORMAT)) != _FORMAT:
         raise FitError(f"{path}: is not a checkpoint of this version")
     with understood(path, FitError, "the checkpoint is damaged"):
-        stated = json.loads(stream.readline())
+        start, stated = int(stream.readline(100)), json.loads(stream.readline())
+        if not 0 < start < os.path.getsize(path):
+            raise ValueError(f"its steps begin at byte {start}")
         arrays = {key: np.array(values, float) for key, values in stated["arrays"].items()}
-        return dict(stated["description"]), arrays
+        return start, int(stated["room"]), dict(stated["description"]), arrays
 
 
-def _compare(path, stated, description, arrays):
+def _compare(path, stated, stored, description, arrays):
     """Refuse a checkpoint of another run, and say in what it differs."""
-    other = [key for key in description if stated[0].get(key) != description[key]]
+    other = [key for key in description if stated.get(key) != description[key]]
     for key, array in arrays.items():
-        stored = stated[1].get(key)
         # a calibration made anew on another machine may differ in the last digits
-        same = stored is not None and stored.shape == np.shape(array)
-        if not (same and np.allclose(stored, array, rtol=1e-6, atol=1e-9)):
+        same = key in stored and stored[key].shape == np.shape(array)
+        if not (same and np.allclose(stored[key], array, rtol=1e-6, atol=1e-9)):
             other.append(key)
     if other:
         raise FitError(

@@ -379,7 +379,7 @@ def sample(
     seed : int, optional
         Makes the run repeatable.
     checkpoint : path-like, optional
-        File that the run is written to.
+        HDF5 file that the run is written to.
     checkpoint_every : int
         Number of kept steps between two writes, which is the most that a killed run loses.
     resume : bool
@@ -402,7 +402,7 @@ def sample(
     Raises
     ------
     AstropolcalError
-        If emcee is not installed.
+        If emcee, or h5py for a checkpoint, is not installed.
     FitError
         If the numbers of walkers or steps make no sense, a move is known to
         sample wrongly, the walkers find no place to start, or the checkpoint

@@ -2,15 +2,16 @@
 """Samples of a posterior: quantiles, covariance, and whether the chain is long enough."""
 
 from dataclasses import asdict, dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.result.calibration import ParameterTable
-from astropolcal.calibration.uncertainty.covariance import Covariance
+from astropolcal.calibration.uncertainty.covariance import Covariance, same_content
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.files import plain
 
 __all__ = ["Posterior"]
 
@@ -120,6 +121,21 @@ class Convergence:
         times = autocorrelation_times(used) * thin if times is None else times
         flat = used.reshape(-1, used.shape[2])
         lower, median, upper = np.quantile(flat, _QUANTILES, axis=0)
+        try:
+            stats = need("arviz_stats.base", "convergence").array_stats
+        except AstropolcalError:
+            measures = {}
+        else:
+            measures = {
+                "r_hat": stats.rhat,
+                "ess_bulk": partial(stats.ess, method="bulk"),
+                "ess_tail": partial(stats.ess, method="tail", prob=_TAIL),
+            }
+        columns = [np.ascontiguousarray(used[:, :, i].T) for i in range(used.shape[2])]
+        statistics = {
+            key: [np.nan if _is_flat(draws) else float(of(draws)) for draws in columns]
+            for key, of in measures.items()
+        }
         return cls(
             n_steps=len(chain) * thin,
             burn_in=burn_in * thin,
@@ -129,7 +145,7 @@ class Convergence:
             lower=lower,
             upper=upper,
             std=flat.std(axis=0, ddof=1),
-            **_statistics(used),
+            **statistics,
         )
 
     @property
@@ -149,7 +165,11 @@ class Convergence:
             return [f"{', '.join(stuck)} did not move"]
         found = []
         if self.n_times < ENOUGH:
-            found.append(f"{ENOUGH} times are needed; run {self._wanted()} steps or more")
+            needed = ENOUGH * self.times.max()
+            # to two digits
+            step = 10 ** max(int(np.floor(np.log10(needed))) - 1, 0)
+            wanted = int(np.ceil(needed / step) * step)
+            found.append(f"{ENOUGH} times are needed; run {wanted} steps or more")
         if self.r_hat is None:
             return found
         worst, value = _extreme(self.r_hat, names, largest=True)
@@ -167,12 +187,6 @@ class Convergence:
                 )
         return found
 
-    def _wanted(self):
-        """Return how many steps would do, to two digits."""
-        needed = ENOUGH * self.times.max()
-        step = 10 ** max(int(np.floor(np.log10(needed))) - 1, 0)
-        return int(np.ceil(needed / step) * step)
-
     def agreement(self):
         """Return the largest R-hat and the smallest effective sample size in words, if known."""
         if self.r_hat is None or not np.isfinite(self.times).all():
@@ -189,24 +203,6 @@ def _extreme(values, names, largest):
     bad = np.where(np.isnan(values), np.inf, values if largest else -values)
     i = int(np.argmax(bad))
     return names[i], values[i]
-
-
-def _statistics(used):
-    """Return R-hat and effective sample sizes; nothing without arviz-stats."""
-    try:
-        stats = need("arviz_stats.base", "convergence").array_stats
-    except AstropolcalError:
-        return {}
-    measures = {
-        "r_hat": stats.rhat,
-        "ess_bulk": lambda draws: stats.ess(draws, method="bulk"),
-        "ess_tail": lambda draws: stats.ess(draws, method="tail", prob=_TAIL),
-    }
-    columns = [np.ascontiguousarray(used[:, :, i].T) for i in range(used.shape[2])]
-    return {
-        key: np.array([np.nan if _is_flat(draws) else float(of(draws)) for draws in columns])
-        for key, of in measures.items()
-    }
 
 
 # ---- samples of a posterior: quantiles, covariance, and whether to believe them ----
@@ -336,8 +332,7 @@ class Posterior:
     def __eq__(self, other):
         if not isinstance(other, Posterior):
             return NotImplemented
-        # arrays with NaN in the same places are equal, which `==` of dictionaries is not
-        return _equal(self.to_dict(), other.to_dict())
+        return same_content(self.to_dict(), other.to_dict())
 
     __hash__ = None
 
@@ -353,10 +348,8 @@ class Posterior:
         """Kept steps left out at the start."""
         if self.is_thinned:
             return 0
-        return self._usual_burn_in() if self._burn_in is None else int(self._burn_in)
-
-    def _usual_burn_in(self):
-        """Return 5 autocorrelation times, at most half of all."""
+        if self._burn_in is not None:
+            return int(self._burn_in)
         half = len(self.chain) // 2
         # from the second half: the way from the start would look like a long memory
         times = autocorrelation_times(self.chain[half:])
@@ -390,13 +383,12 @@ class Posterior:
     @property
     def n_steps(self):
         """Length of the run in steps of the sampler, burn-in included."""
-        return self._convergence.n_steps if self.is_thinned else len(self.chain) * self.thin
+        return self.convergence.n_steps
 
     @property
     def n_times(self):
         """Length of the run in the longest autocorrelation times, 0 where nothing moves."""
-        times = self.autocorrelation_times
-        return float(self.n_steps / times.max()) if np.isfinite(times).all() else 0.0
+        return self.convergence.n_times
 
     @property
     def converged(self):
@@ -563,22 +555,24 @@ class Posterior:
         columns = {"fitted": self.fitted, "autocorrelation_time": found.times}
         keys = ("median", "lower", "upper", "std", "r_hat", "ess_bulk", "ess_tail")
         columns |= {key: getattr(found, key) for key in keys}
-        return {
+        ends = None if self.acceptance is None else [self.acceptance.min(), self.acceptance.max()]
+        content = {
             "converged": self.converged,
             "words": self.words(),
             "n_steps": self.n_steps,
             "n_walkers": self.chain.shape[1],
             "burn_in": found.burn_in,
             "n_samples": found.n_draws,
-            "acceptance": _ends(self.acceptance),
+            "acceptance": ends,
             "seed": self.seed,
             "settings": dict(self.settings),
             "parameters": {
                 name: {"unit": str(self.units[i] or "")}
-                | {key: _number(column, i) for key, column in columns.items()}
+                | {k: None if column is None else column[i] for k, column in columns.items()}
                 for i, name in enumerate(self.names)
             },
         }
+        return plain(content)
 
     # ---- files ----------------------------------------------------------------------
 
@@ -619,8 +613,8 @@ class Posterior:
         return Posterior(**(self._parts() | parts))
 
     def _parts(self):
-        parts = {key: getattr(self, key) for key in _KEYS if key not in ("burn_in", "convergence")}
-        return parts | {"burn_in": self._burn_in, "convergence": self._convergence}
+        given = {"burn_in": self._burn_in, "convergence": self._convergence}
+        return {key: given[key] if key in given else getattr(self, key) for key in _KEYS}
 
     def to_dict(self):
         """
@@ -661,20 +655,3 @@ class Posterior:
             raise ParameterError(f"posterior with missing or unknown {', '.join(odd)}")
         found = parts["convergence"]
         return cls(**(parts | {"convergence": None if found is None else Convergence(**found)}))
-
-
-def _equal(a, b):
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return np.array_equal(a, b, equal_nan=True)
-    return type(a) is type(b) and a == b
-
-
-def _number(column, i):
-    known = column is not None and np.isfinite(column[i])
-    return float(column[i]) if known else None
-
-
-def _ends(values):
-    return None if values is None else [float(values.min()), float(values.max())]

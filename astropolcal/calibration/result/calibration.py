@@ -323,24 +323,22 @@ class Calibration:
             ``conditional_on``, the names of what is at it, and ``std_released``, the error without
             it. Arrays for parameters given per wavelength.
         """
-        result = {}
+        result, known = {}, self._known()
         for chain in self.chains:
             for leaf in leaves(chain):
                 for key in leaf.param_names:
                     name = f"{leaf.name}.{key}"
                     # chains share optics by name, and the values of the fit
                     if name not in result:
-                        result[name] = self._describe(name, getattr(leaf, key))
+                        result[name] = self._describe(name, getattr(leaf, key), known)
         return result
 
-    def _describe(self, name, parameter):
-        size = int(np.size(parameter.value))
+    def _describe(self, name, parameter, known):
+        shape, size = np.shape(parameter.value), np.size(parameter.value)
         # the covariance has rows of free parameters only
         free = not parameter.fixed and name not in self.ties
         elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
-        shape = np.shape(parameter.value)
-        known = self._known() if free else {}
-        rows = [known.get(element, _UNKNOWN) for element in elements]
+        rows = [known.get(element, _UNKNOWN) if free else _UNKNOWN for element in elements]
         columns = (np.array(column).reshape(shape) for column in zip(*rows, strict=True))
         entry = {
             "value": np.array(parameter.value),
@@ -523,10 +521,13 @@ def measurement_of_all(calibration, observations, positions=None):
     given = [_prepared(calibration, table) for table in given]
     order = _order(calibration.datasets, given)
     tables = [given[i] for i in order]
-    if positions is None:
-        positions = _positions(calibration, tables)
-    else:
+    instrument = instrument_of(calibration)
+    if positions is not None:
         positions = [positions[i] for i in order]
+    elif instrument is not None:
+        # as the instrument reads them; else from the columns
+        pairs = zip(tables, calibration.chains, strict=True)
+        positions = [instrument.positions(*pair) for pair in pairs]
     # the same chains, ties and grid as in the fit: what the file holds is enough to predict
     measurement = Measurement(
         calibration.chains,
@@ -586,14 +587,6 @@ def _order(records, given):
         raise CalibrationFileError(f"the calibration was also made from {listed}: give that table")
     # the order of the fit, on which slices of data and residuals depend
     return [known.index(record.content_hash) for record in records]
-
-
-def _positions(calibration, tables):
-    """Return the positions that the instrument reads; None, the columns, without one."""
-    instrument = instrument_of(calibration)
-    if instrument is None:
-        return None
-    return [instrument.positions(*pair) for pair in zip(tables, calibration.chains, strict=True)]
 
 
 # ---- validity ------------------------------------------------------------------------------
@@ -750,14 +743,9 @@ def instrument_of(calibration):
 
 def _dates(calibration):
     """Return the dates of a calibration's data, the oldest first."""
-    return sorted(day for record in calibration.datasets if (day := _first_day(record)))
-
-
-def _first_day(record):
-    """Return the date of a dataset's meta, with a day; None where there is none."""
-    date = stated_date(record.meta, record.name, CalibrationFileError)
+    dates = (stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets)
     # a month alone begins on its first day
-    return f"{date}-01" if date is not None and len(date) == len("2025-10") else date
+    return sorted(f"{d}-01" if len(d) == len("2025-10") else d for d in dates if d is not None)
 
 
 def _optics_of(calibration):

@@ -6,10 +6,11 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import instruments
+from astropolcal.calibration.result.calibration import instrument_of
 from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.efficiency import has_derotator, has_plate, polarimetric_efficiency, sky_path
-from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import diattenuation_vector, retardance_vector
 from astropolcal.optics import COORDINATES
@@ -75,7 +76,14 @@ def compare(members):
     >>> irdis["filter"].tolist(), irdis["derotator_retardance"].round(1)
     (['Y', 'J', 'H', 'Ks'], <Quantity [126.1, 156.1,  99.3,  84.1] deg>)
     """
-    pairs = list(members.items()) if isinstance(members, dict) else _labelled(members)
+    if isinstance(members, dict):
+        pairs = list(members.items())
+    else:
+        pairs = []
+        for number, member in enumerate(members):
+            label = member if isinstance(member, str) else getattr(member, "name", None)
+            label = getattr(member, "instrument", None) or label or f"chain {number + 1}"
+            pairs.append((str(label), member))
     if not pairs:
         raise ParameterError("nothing to compare: give calibrations, instruments or chains")
     labels = [label for label, _ in pairs]
@@ -91,15 +99,6 @@ def compare(members):
     return table
 
 
-def _labelled(members):
-    found = []
-    for number, member in enumerate(members):
-        label = member if isinstance(member, str) else getattr(member, "name", None)
-        label = getattr(member, "instrument", None) or label or f"chain {number + 1}"
-        found.append((str(label), member))
-    return found
-
-
 def _resolved(label, member):
     """Return chain, wavelengths, instrument (or None) and calibration (or None) of a member."""
     if isinstance(member, str):
@@ -107,21 +106,13 @@ def _resolved(label, member):
     if isinstance(member, Instrument):
         return member.published(), member.wavelength, member, None
     if hasattr(member, "chains") and hasattr(member, "wavelength"):
-        known = member.instrument and _known(member.instrument)
         # datasets share what is compared; the first chain has it
-        return member.chains[0], member.wavelength, known, member
+        return member.chains[0], member.wavelength, instrument_of(member), member
     if isinstance(member, tuple) and len(member) == 2:
         return member[0], np.atleast_1d(u.Quantity(member[1])), None, None
     raise ParameterError(
         f"{label}: {member!r} is not a calibration, instrument, name of one, or (chain, wavelength)"
     )
-
-
-def _known(name):
-    try:
-        return instruments.get(name)
-    except InstrumentError:
-        return None
 
 
 def _rows(label, chain, wavelength, instrument, calibration):
@@ -156,17 +147,22 @@ class _Optics:
 
     @staticmethod
     def path(chain):
-        return _behind_telescope(sky_path(chain))
+        """Return the path from the half-wave plate on, or the first optic on a stage."""
+        found = leaves(sky_path(chain))
+        # the telescope is of the site, not of the instrument
+        own = [i for i, optic in enumerate(found) if _is_own(optic)]
+        plate = [i for i in own if found[i].stage == "hwp"]
+        return join(found[(plate or own or [0])[0] :])
 
     @staticmethod
     def parts(path):
         """Return plate and derotator (None where there is none) and the path."""
-        found = leaves(path)
-        plate = next((o for o in found if o.stage == "hwp"), None)
-        turning = (
-            o for o in found if o.stage not in (None, "hwp", *_SKY) and o.stage not in COORDINATES
+        own = [optic for optic in leaves(path) if _is_own(optic)]
+        plate, derotator = (
+            next((optic for optic in own if (optic.stage == "hwp") is is_plate), None)
+            for is_plate in (True, False)
         )
-        return plate, next(turning, None), path
+        return plate, derotator, path
 
     def values(self, chain):
         """Return an array of shape (quantities, n_wavelengths), retardances in degree."""
@@ -195,17 +191,9 @@ class _Optics:
         return np.atleast_2d(found)
 
 
-def _behind_telescope(path):
-    """Return the path from the half-wave plate on, or the first optic on a stage."""
-    found = leaves(path)
-    own = [
-        i
-        for i, o in enumerate(found)
-        if o.stage not in (None, *_SKY) and o.stage not in COORDINATES
-    ]
-    # the telescope is of the site, not of the instrument
-    plate = [i for i in own if found[i].stage == "hwp"]
-    return join(found[(plate or own or [0])[0] :])
+def _is_own(optic):
+    """Return whether an optic is on a stage with an angle that is not one of the telescope."""
+    return optic.stage not in (None, *_SKY) and optic.stage not in COORDINATES
 
 
 def _matrix(optic, wavelength):

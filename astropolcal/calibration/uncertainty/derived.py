@@ -177,7 +177,7 @@ def propagate(calibration, function, derivatives=None):
     free = FreeParameters(chains, len(calibration.wavelength), calibration.ties)
     value = function(*chains)
     if derivatives is not None:
-        known = slopes_of(free, derivatives(*chains), np.shape(value))
+        known = _slopes_of(free, derivatives(*chains), np.shape(value))
         return derive(calibration, free, value, known)
     unit = value.unit if isinstance(value, u.Quantity) else None
     start, canonical = free.start(), free.factors()
@@ -202,7 +202,7 @@ def propagate(calibration, function, derivatives=None):
     return _package(free, axes, value, parts)
 
 
-def slopes_of(free, derivatives, shape):
+def _slopes_of(free, derivatives, shape):
     """Lay derivatives by name out over the flat vector, shape (size, n_free)."""
     size = int(np.prod(shape, dtype=int))
     slopes = np.zeros((size, free.size))
@@ -216,8 +216,7 @@ def slopes_of(free, derivatives, shape):
                 f"derivative of {name} has shape {np.shape(derivative)}; expected is {expected}"
             )
         # a follower moves with the parameter it is tied to, in canonical units
-        own = free.values_of(name)
-        per_own = canonical_factor(own.unit) if isinstance(own, u.Quantity) else 1.0
+        per_own = canonical_factor(getattr(free.values_of(name), "unit", None))
         block = np.reshape(np.asarray(derivative, dtype=float), (size, slot.size))
         slopes[:, slot.slice] += block / per_own * factor * slot.factor
     return slopes

@@ -24,6 +24,9 @@ from astropolcal.stokes import polarization_angle
 
 __all__ = ["fitted_stars", "star_accuracy", "star_check", "star_stokes"]
 
+# efficiency from which on a cycle determines q and u
+_LEAST = 1e-3
+
 
 def star_stokes(calibration, chain, observations, positions=None):
     """
@@ -101,17 +104,13 @@ def star_stokes(calibration, chain, observations, positions=None):
     for i, b in enumerate(part.bins):
         for j, label in enumerate(labels):
             rows = (part.bin_of_datum == b) & (cycle == label)
-            found[:, i, j] = _solved(slopes[:, rows], residuals[rows])
+            own = slopes[:, rows]
+            # the smaller singular value is the efficiency in the direction measured worst
+            if rows.sum() > 1 and np.linalg.svd(own, compute_uv=False)[1] >= _LEAST:
+                found[:, i, j] = np.linalg.lstsq(own.T, residuals[rows], rcond=None)[0]
     if np.isnan(found).all():
         raise ObservationError(f"{observations.name}: no cycle determines q and u")
     return _table(observations.wavelength, found)
-
-
-def _solved(slopes, residuals):
-    # the smaller singular value is the efficiency in the direction that is measured worst
-    if slopes.shape[1] < 2 or np.linalg.svd(slopes, compute_uv=False)[1] < 1e-3:
-        return np.nan
-    return np.linalg.lstsq(slopes.T, residuals, rcond=None)[0]
 
 
 def _table(wavelength, found):
@@ -234,8 +233,9 @@ def fitted_stars(calibration):
     for chain in calibration.chains:
         star = leaves(chain)[0]
         free = [key for key in star.param_names if not getattr(star, key).fixed]
-        if isinstance(star, StarSource) and any(getattr(star, key).prior for key in free):
-            found.setdefault(star.name, _fitted_star(calibration, star, free))
+        with_prior = any(getattr(star, key).prior for key in free)
+        if isinstance(star, StarSource) and with_prior and star.name not in found:
+            found[star.name] = _fitted_star(calibration, star, free)
     return list(found.values())
 
 
@@ -403,14 +403,10 @@ def _add_known(table, q, stokes_u, covariance):
 
 
 def _pull(table, key):
-    """Return by how many of all errors together the star is off, median over the wavelengths."""
-    return np.nanmedian(np.abs(table[f"{key}_error"].value) / _stated(table, key))
-
-
-def _stated(table, key):
-    """Return the errors of the star, the calibration and the catalogue together."""
+    """Return by how many errors of star, calibration and catalogue together the star is off."""
     parts = (table[f"{key}{suffix}"].value for suffix in ("_err", "_sys_err", "_known_err"))
-    return np.sqrt(sum(np.nan_to_num(part, posinf=np.inf) ** 2 for part in parts))
+    stated = np.sqrt(sum(np.nan_to_num(part, posinf=np.inf) ** 2 for part in parts))
+    return np.nanmedian(np.abs(table[f"{key}_error"].value) / stated)
 
 
 def _error_along(direction, matrix):

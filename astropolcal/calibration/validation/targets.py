@@ -169,7 +169,14 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
 def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
-    errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
+    errors, tables, count = SkyErrors(calibration, view, ignore), [], view.good.shape[1]
+    model = calibration.fit.get("model_error")
+    words = (
+        f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
+        f"{view.telescope}; "
+        + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
+        + (f", rms over {count} settings" if count > 1 else "")
+    )
     words += "; as if the undetermined parameters were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
@@ -190,17 +197,6 @@ def _target(dolp, aolp):
         raise ParameterError(f"target {dolp}, {aolp}: one degree and one angle are needed")
     double = 2 * np.atleast_1d(angle_to_rad(_ANY if aolp is None else aolp, "aolp"))
     return float(_fraction("dolp", dolp, 1.0)), double
-
-
-def _made_of(calibration, view):
-    model = calibration.fit.get("model_error")
-    count = view.good.shape[1]
-    return (
-        f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
-        f"{view.telescope}; "
-        + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
-        + (f", rms over {count} settings" if count > 1 else "")
-    )
 
 
 def keep_sky_accuracy(calibration, view=None):
@@ -226,11 +222,6 @@ def target_entry(table):
 
 
 # ---- the equations of the paper ------------------------------------------------------------
-
-
-def absolute_accuracy(s_unpol, s_sky):
-    """Return the error that scales with the intensity, s_abs^2 = s_unpol^2 + s_sky^2 (Sec. 2.3)."""
-    return np.hypot(s_unpol, s_sky)
 
 
 def propagate_accuracy(dolp, aolp, s_rel, s_abs):
@@ -314,29 +305,29 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
         raise ParameterError(f"no accuracy is given; at least one of {', '.join(given)} is needed")
     wavelength = next(iter(present.values()))["wavelength"]
     found = {name: _values(name, table, column, wavelength) for name, table in present.items()}
+    for name, value in (("dolp", dolp), ("aolp", aolp)):
+        if np.shape(value) not in ((), wavelength.shape):
+            raise ParameterError(
+                f"{name} has shape {np.shape(value)}; allowed are () and {wavelength.shape}, "
+                "one per wavelength"
+            )
     zero = np.zeros(len(wavelength)) * u.percent
     s_rel, s_unpol, s_sky = (found.get(name, zero) for name in given)
-    s_abs = absolute_accuracy(s_unpol, s_sky)
+    # the error that scales with the intensity
+    s_abs = np.hypot(s_unpol, s_sky)
     result = QTable({"wavelength": wavelength})
     for name, key in _CALIBRATIONS.items():
         result[key] = found.get(name, zero * np.nan)
     result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
-    for key, value in _for_target(dolp, aolp, s_rel, s_abs).items():
+    for key, value in propagate_accuracy(dolp, aolp, s_rel, s_abs).items():
         result[key] = value
     missing = [name for name in given if name not in found]
-    result.meta |= {"column": column, "missing": missing, "words": _words(column, missing)}
+    words = f"all three calibrations count, by their {column}"
+    if missing:
+        lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
+        words = f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
+    result.meta |= {"column": column, "missing": missing, "words": words}
     return result
-
-
-def _for_target(dolp, aolp, s_rel, s_abs):
-    shape = s_rel.shape
-    for name, value in (("dolp", dolp), ("aolp", aolp)):
-        if np.shape(value) not in ((), shape):
-            raise ParameterError(
-                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, "
-                "one per wavelength"
-            )
-    return propagate_accuracy(dolp, aolp, s_rel, s_abs)
 
 
 def _values(name, table, column, wavelength):
@@ -351,13 +342,6 @@ def _values(name, table, column, wavelength):
             f"{len(wavelength)} from {wavelength.min():.6g} to {wavelength.max():.6g} of the others"
         )
     return u.Quantity(table[column]).to(u.percent)
-
-
-def _words(column, missing):
-    if not missing:
-        return f"all three calibrations count, by their {column}"
-    lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
-    return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
 
 
 def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
@@ -413,7 +397,7 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
             continue
         angles = _EXTREMES if aolp is None else [aolp]
         each = [target_accuracy(dolp, angle, **tables, column=column) for angle in angles]
-        for key in ("s_Q", "s_U", "s_p", "s_chi"):
+        for key in KEYS:
             each[0][key] = np.max([table[key].value for table in each], axis=0) * each[0][key].unit
         each[0].meta |= {"dolp": dolp, "aolp": aolp}
         found.append(each[0])
@@ -436,55 +420,37 @@ def _kind(source, chain):
 
 
 def _tables_of_kinds(calibration, column):
-    """Return the accuracies of each kind of dataset on the calibration's wavelengths."""
-    grid = calibration.wavelength
-    squares = {}
+    """Return the accuracies of each kind of dataset on the calibration's wavelengths.
+
+    Of a kind that was not fitted they are those of the standards that were predicted.
+    """
+    grid, fitted, predicted = calibration.wavelength, {}, {}
     for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
         kind = _kind(record.source, chain)
-        if kind is None or record.accuracy is None:
-            continue
-        own = record.accuracy["wavelength"]
-        value = _values(kind, record.accuracy, column, own).value
-        row = np.full(grid.size, np.nan)
-        # a dataset may cover a part of the grid; the rest stays unknown
-        row[np.abs(own[:, None] - grid).argmin(axis=1)] = value**2
-        squares.setdefault(kind, []).append(row)
-    for kind, row in _standards_of_kinds(calibration, column):
-        if kind not in {_kind(r.source, c) for r, c in _fitted(calibration)}:
-            squares.setdefault(kind, []).append(row)
-    return {
-        kind: QTable({"wavelength": grid, column: np.sqrt(_mean(rows)) * u.percent})
-        for kind, rows in squares.items()
-    }
-
-
-def _fitted(calibration):
-    return zip(calibration.datasets, calibration.chains, strict=True)
-
-
-def _standards_of_kinds(calibration, column):
-    """Yield kind and squared accuracy at each wavelength of the standards that were predicted."""
-    grid = calibration.wavelength.to_value(u.nm)
+        rows = fitted.setdefault(kind, [])
+        if kind is not None and record.accuracy is not None:
+            own = record.accuracy["wavelength"]
+            rows.append((own, _values(kind, record.accuracy, column, own).value ** 2))
     # a diagnosis asks with what has no fit
     for entry in getattr(calibration, "fit", {}).get("standards", []):
-        kind = _kind(entry["source"], None)
-        if kind is None:
-            continue
-        own, n = np.array(entry["wavelength_nm"]), np.array(entry["n"], dtype=float)
+        own, n = np.array(entry["wavelength_nm"]) * u.nm, np.array(entry["n"], dtype=float)
+        square = np.array(entry["s_standard_percent"], dtype=float) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             # nothing was fitted: its rms over sqrt(n) is what s_mean is for a fit
-            share = 1 / n if column == "s_mean" else 1.0
-        row = np.full(grid.size, np.nan)
-        at = np.abs(own[:, None] - grid).argmin(axis=1)
-        row[at] = np.array(entry["s_standard_percent"], dtype=float) ** 2 * share
-        yield kind, row
-
-
-def _mean(rows):
-    """Return the mean of the known values of each column, NaN where there are none."""
-    known = np.isfinite(rows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
+            square = square / n if column == "s_mean" else square
+        predicted.setdefault(_kind(entry["source"], None), []).append((own, square))
+    tables = {}
+    for kind, several in (predicted | fitted).items():
+        # a dataset may cover a part of the grid; the rest stays unknown
+        rows = np.full((len(several), grid.size), np.nan)
+        for row, (own, square) in zip(rows, several, strict=True):
+            row[np.abs(own[:, None] - grid).argmin(axis=1)] = square
+        known = np.isfinite(rows)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
+        if kind is not None and several:
+            tables[kind] = QTable({"wavelength": grid, column: np.sqrt(mean) * u.percent})
+    return tables
 
 
 # ---- four accuracies ------------------------------------------------------------------------
@@ -551,7 +517,11 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
     name = ", ".join(entry["name"] for entry in known) or None
     if standard is not None:
-        measurement = _independent(calibration, standard, dataset)
+        measurement = standard
+        if not hasattr(standard, "datasets"):
+            measurement = calibration.measurement_of(standard, dataset)
+        for part in measurement.datasets:
+            refuse_fitted(calibration, part.observations)
         name = ", ".join(part.observations.name for part in measurement.datasets)
         wavelength = result["wavelength"]
         residuals = measurement.residuals()
@@ -564,13 +534,3 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
-
-
-def _independent(calibration, standard, dataset):
-    """Return the standard as a measurement, unless the fit has seen it."""
-    measurement = standard
-    if not hasattr(standard, "datasets"):
-        measurement = calibration.measurement_of(standard, dataset)
-    for part in measurement.datasets:
-        refuse_fitted(calibration, part.observations)
-    return measurement
