@@ -352,7 +352,7 @@ def test_bad_parts(posterior):
         ({"acceptance": [0.5]}, r"acceptance has shape \(1,\), not \(8,\)"),
         ({"fitted": [0.5]}, r"fitted has shape \(1,\), not \(2,\)"),
         ({"color": "red"}, "missing or unknown color"),
-        ({"convergence": CONVERGENCE}, "convergence of 1 parameters in a chain of 2"),
+        ({"convergence": CONVERGENCE}, r"convergence has shape \(1,\), not \(2,\)"),
         ({"convergence": CONVERGENCE | {"std": [1.0, 2.0]}}, "one value per parameter is allowed"),
     ]:
         with pytest.raises(ParameterError, match=message):

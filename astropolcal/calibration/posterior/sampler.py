@@ -208,8 +208,10 @@ class Laplace:
         self.centre = log_posterior.centre
         scale = log_posterior.physical_scale()
         jacobian = log_posterior.whitened_jacobian() * scale[:, None]
+        low, high = self.centre - log_posterior.low, log_posterior.high - self.centre
+        near = _AT_BOUND * np.maximum(1.0, np.abs(self.centre))
         #: Sign in which each parameter can leave the bound that it sits at, else 0.
-        self.inward = _inward(log_posterior)
+        self.inward = np.where(low <= near, 1.0, np.where(high <= near, -1.0, 0.0))
         self.free = self.inward == 0
         # rows of the Jacobian are parameters: left vectors are directions among them, (n, n)
         left, singular, _ = np.linalg.svd(jacobian[self.free])
@@ -263,12 +265,6 @@ class Laplace:
         away = np.abs(rng.normal(size=(count, self._reach.size))) * self._reach
         coords[:, ~self.free] += self.inward[~self.free] * away
         return coords
-
-
-def _inward(log_posterior):
-    centre, low, high = log_posterior.centre, log_posterior.low, log_posterior.high
-    near = _AT_BOUND * np.maximum(1.0, np.abs(centre))
-    return np.where(centre - low <= near, 1.0, np.where(high - centre <= near, -1.0, 0.0))
 
 
 # ---- moves -------------------------------------------------------------------------------

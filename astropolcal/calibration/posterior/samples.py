@@ -307,17 +307,17 @@ class Posterior:
                 f"chain of {n} names and {len(self.units)} units has shape {self.chain.shape}; "
                 "allowed is (n_steps, n_walkers, n_parameters)"
             )
-        if self.log_prob.shape != self.chain.shape[:2]:
-            raise ParameterError(
-                f"log_prob has shape {self.log_prob.shape}, the chain {self.chain.shape}"
-            )
-        for key, size in (("acceptance", self.chain.shape[1]), ("fitted", n)):
-            if getattr(self, key) is not None and getattr(self, key).shape != (size,):
-                raise ParameterError(f"{key} has shape {getattr(self, key).shape}, not ({size},)")
-        if self._convergence is not None and self._convergence.times.size != n:
-            raise ParameterError(
-                f"convergence of {self._convergence.times.size} parameters in a chain of {n}"
-            )
+        known = self._convergence and self._convergence.times
+        for key, array, shape in (
+            ("log_prob", self.log_prob, self.chain.shape[:2]),
+            ("acceptance", self.acceptance, self.chain.shape[1:2]),
+            ("fitted", self.fitted, (n,)),
+            ("convergence", known, (n,)),
+        ):
+            if array is not None and array.shape != shape:
+                raise ParameterError(
+                    f"{key} has shape {array.shape}, not {shape} as the chain {self.chain.shape}"
+                )
         most = len(self.chain) - 2
         if self._burn_in is not None and not 0 <= self._burn_in <= most:
             raise ParameterError(

@@ -6,6 +6,7 @@ For what a calibration holds: instrument, mode, dates, optics in the beam.
 """
 
 import warnings
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
@@ -727,8 +728,12 @@ def validity_of(calibration):
     derived = {
         "mode": mode if isinstance(mode, str) else None,
         "valid_from": min(dates, default=None),
-        "optics_in": _optics_of(calibration) if "optics_in" not in stated else None,
     }
+    if "optics_in" not in stated:
+        # as the instrument knows those of each dataset
+        with suppress(AstropolcalError):
+            instrument = instruments.get(calibration.instrument)
+            derived["optics_in"] = [list(instrument.setup(record)[1]) for record in records]
     return Validity(calibration.instrument, **(derived | stated))
 
 
@@ -746,15 +751,6 @@ def _dates(calibration):
     dates = (stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets)
     # a month alone begins on its first day
     return sorted(f"{d}-01" if len(d) == len("2025-10") else d for d in dates if d is not None)
-
-
-def _optics_of(calibration):
-    """Return the optional optics of each dataset as the instrument knows them, or None."""
-    try:
-        instrument = instruments.get(calibration.instrument)
-        return [list(instrument.setup(record)[1]) for record in calibration.datasets]
-    except AstropolcalError:
-        return None
 
 
 def with_validity(calibration, **stated):

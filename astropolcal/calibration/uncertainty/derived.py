@@ -31,7 +31,6 @@ from astropolcal.chain import (
     with_beam,
 )
 from astropolcal.exceptions import (
-    AstropolcalError,
     ChainError,
     ParameterError,
     WavelengthRangeError,
@@ -105,11 +104,8 @@ class Derived:
         if np.shape(self.value) != np.shape(self.wavelength) or np.ndim(self.value) != 1:
             raise ParameterError("a spectrum has one value at each of several wavelengths")
         from astropy.nddata import StdDevUncertainty
+        from specutils import Spectrum
 
-        try:
-            from specutils import Spectrum
-        except ImportError:
-            raise AstropolcalError("spectra need specutils 2, which is not installed") from None
         return Spectrum(
             flux=u.Quantity(self.value),
             spectral_axis=self.wavelength,
@@ -501,9 +497,7 @@ def derived_data(calibration, observations=None, dataset=0):
     return derive(calibration, free, measurement.predict(vector).copy(), slopes)
 
 
-def derived_sky(
-    calibration, q, u, positions, *, wavelength=None, modulator="hwp", chain=None, dataset=0
-):
+def derived_sky(calibration, q, u, positions, *, wavelength=None, chain=None, dataset=0):
     """
     Return the Stokes parameters recovered for a source, with the calibration's error.
 
@@ -519,11 +513,9 @@ def derived_sky(
         Normalized Stokes parameters of the source, V = 0.
     positions : dict of str to `~astropy.units.Quantity`
         Position of every stage in the plus frames, scalar or shape (n_pairs,);
-        the modulator stands 45 degrees further in the minus frames.
+        the half-wave plate (``hwp``) stands 45 degrees further in the minus frames.
     wavelength : `~astropy.units.Quantity`, optional
         By default the calibration's grid.
-    modulator : str
-        Stage of the half-wave plate.
     chain : `~astropy.modeling.CompoundModel`, optional
         Chain of the sky observation, whose optics bear the names and values of
         the calibrated ones; by default the calibrated chain from its first
@@ -562,7 +554,7 @@ def derived_sky(
     lam = _grid(calibration, wavelength)
     # what stands before the first optic on a stage belongs to the source
     sky = from_first_stage(calibration.chains[dataset]) if chain is None else chain
-    numerator, denominator = _double_difference_rows(sky, lam, positions, modulator)
+    numerator, denominator = _double_difference_rows(sky, lam, positions)
     stokes = np.array([1.0, q, u, 0.0])
     total = denominator[""] @ stokes
     ratio = numerator[""] @ stokes / total
@@ -585,13 +577,13 @@ def derived_sky(
     return _by_name(calibration, value, slopes, -2)
 
 
-def _double_difference_rows(chain, lam, positions, modulator):
+def _double_difference_rows(chain, lam, positions):
     """Return rows of difference and sum of the four beams (``""``), and their derivatives.
 
     Two dicts of arrays of shape (n_pairs, n_wavelengths, 4).
     """
-    if modulator not in positions:
-        raise ChainError(f"no position of {modulator!r}; positions has {sorted(positions)}")
+    if "hwp" not in positions:
+        raise ChainError(f"no position of 'hwp'; positions has {sorted(positions)}")
     shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()), (1,))
     angles = {
         name: np.broadcast_to(u.Quantity(angle), shape, subok=True)
@@ -601,7 +593,7 @@ def _double_difference_rows(chain, lam, positions, modulator):
     for beam, sign in (("right", 1), ("left", -1)):
         arm = with_beam(chain, beam)
         for turned, half in ((0, 1), (45, -1)):
-            at = angles | {modulator: angles[modulator] + turned * u.deg}
+            at = angles | {"hwp": angles["hwp"] + turned * u.deg}
             rows = {"": system_mueller(arm, lam, at)}
             rows |= system_mueller_derivatives(arm, lam, at)
             for name, matrix in rows.items():

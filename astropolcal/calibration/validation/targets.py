@@ -161,12 +161,12 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
     True
     """
     check_choice("open_directions", open_directions, _OPEN, ParameterError)
-    wanted = [_target(dolp, aolp) for dolp, aolp in targets]
     view, ignore = view_of_calibration(calibration), open_directions == "ignore"
-    return _accuracies(calibration, targets, wanted, view, ignore)
+    return _accuracies(calibration, targets, view, ignore)
 
 
-def _accuracies(calibration, targets, wanted, view, ignore=False):
+def _accuracies(calibration, targets, view, ignore=False):
+    wanted = [_target(*target) for target in targets]
     if view is None:
         return []
     errors, tables, count = SkyErrors(calibration, view, ignore), [], view.good.shape[1]
@@ -204,7 +204,7 @@ def keep_sky_accuracy(calibration, view=None):
     if calibration.measurement is not None:
         calibration.fit["sky_settings"] = settings_of(calibration.measurement)
     view = view_of_calibration(calibration) if view is None else view
-    tables = _accuracies(calibration, TARGETS, [_target(*one) for one in TARGETS], view)
+    tables = _accuracies(calibration, TARGETS, view)
     calibration.fit["sky_accuracy"] = [
         {key.lower(): value for key, value in target_entry(table).items()} for table in tables
     ]
