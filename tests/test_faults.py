@@ -197,6 +197,10 @@ def test_write_that_fails_once_spoils_no_checkpoint(tmp_path, monkeypatch):
 def test_limit_below_the_size_of_a_checkpoint(tmp_path):
     """HDF5 could not close such a file, and would take the process with it in the end."""
     path, reader = tmp_path / "chain.h5", Checkpoint()
+    for size in (0, 100, 3000):
+        with files_up_to(size), pytest.raises(FitError, match="cannot be written"):
+            reader._run(path, 2)
+        assert list(tmp_path.iterdir()) == []
     reader._run(path, 2)
     for size in (0, 100):
         with files_up_to(size), pytest.raises(FitError, match="its first 2 steps are safe"):

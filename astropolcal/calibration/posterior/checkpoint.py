@@ -181,6 +181,13 @@ class _Disk(io.FileIO):
             self.error = error
         return len(content)
 
+    def truncate(self, size=None):
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = error
+            return size
+
 
 def _take_room(stream, size):
     """Let the system set aside the blocks that are not written yet, where it can."""
