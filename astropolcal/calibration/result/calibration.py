@@ -702,12 +702,10 @@ def optics_sets(optics_in):
     if optics_in is None:
         return None
     given = list(optics_in)
-    if isinstance(optics_in, str) or not all(isinstance(s, (str, list, tuple)) for s in given):
-        raise CalibrationFileError(f"optics_in = {optics_in!r}; names of optics are needed")
     if all(isinstance(name, str) for name in given):
         given = [given]
-    flat = [name for names in given for name in names]
-    if not all(isinstance(name, str) for name in flat) or any(isinstance(s, str) for s in given):
+    known = (isinstance(s, (list, tuple)) and all(isinstance(n, str) for n in s) for s in given)
+    if isinstance(optics_in, str) or not all(known):
         raise CalibrationFileError(f"optics_in = {optics_in!r}; names of optics are needed")
     # one form whatever the order, because validities are compared and hashed
     return tuple(sorted({tuple(sorted(set(names))) for names in given}))

@@ -119,23 +119,25 @@ def _table(wavelength, found):
     with np.errstate(invalid="ignore", divide="ignore"):
         # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
         error = np.nanstd(found, axis=2) / np.sqrt(np.maximum(count - 1, 0))
-    percent = 100 * u.percent
     table = QTable({"wavelength": wavelength})
-    for key, value in zip(("q", "u", "q_err", "u_err"), (*mean, *error), strict=True):
-        table[key] = value * percent
+    _add(table, q=mean[0], u=mean[1], q_err=error[0], u_err=error[1])
     # rms of both components: the degree has the error of one of them
     spread = np.hypot(*error) / np.sqrt(2)
     dolp = np.hypot(*mean)
-    table["dolp"] = stokes.debias_dolp(dolp, spread) * percent
-    table["dolp_err"] = spread * percent
+    _add(table, dolp=stokes.debias_dolp(dolp, spread), dolp_err=spread)
     table["aolp"] = stokes.polarization_angle(*mean) * u.deg
     with np.errstate(divide="ignore", invalid="ignore"):
         # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
         table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
     table["n_cycles"] = count
-    for key, value in zip(("q_cycles", "u_cycles"), found, strict=True):
-        table[key] = value * percent
+    _add(table, q_cycles=found[0], u_cycles=found[1])
     return table
+
+
+def _add(table, **fractions):
+    """Add columns in percent."""
+    for key, values in fractions.items():
+        table[key] = 100 * values * u.percent
 
 
 def star_accuracy(table, q=0.0, u_=0.0):
@@ -171,7 +173,7 @@ def star_accuracy(table, q=0.0, u_=0.0):
     known = np.stack(np.broadcast_arrays(q, u_, np.zeros(len(table)))[:2])
     mean = np.stack([table[key].to_value(u.one) for key in ("q", "u")])
     off = np.stack([table[f"{k}_cycles"].to_value(u.one) for k in "qu"]) - known[..., None]
-    length, percent = np.hypot(*known), 100 * u.percent
+    length = np.hypot(*known)
     with np.errstate(divide="ignore", invalid="ignore"):
         along = np.einsum("kw,kwc->wc", known / length, off)
     # an unpolarized star has no direction: the mean square of q and u
@@ -180,11 +182,10 @@ def star_accuracy(table, q=0.0, u_=0.0):
     # angles of polarization repeat after 180 deg: the shortest way, -90 to 90 deg
     turn = np.mod(angle + np.pi / 2, np.pi) - np.pi / 2
     result = QTable({"wavelength": table["wavelength"]})
-    result["dolp_error"] = (np.hypot(*mean) - length) * percent
+    _add(result, dolp_error=np.hypot(*mean) - length)
     result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
-    result["s_dolp"] = np.sqrt(np.nanmean(squares, axis=1)) * percent
-    for key, value in zip(("s_q", "s_u"), np.sqrt(np.nanmean(off**2, axis=2)), strict=True):
-        result[key] = value * percent
+    s_q, s_u = np.sqrt(np.nanmean(off**2, axis=2))
+    _add(result, s_dolp=np.sqrt(np.nanmean(squares, axis=1)), s_q=s_q, s_u=s_u)
     return result
 
 
@@ -256,10 +257,9 @@ def _fitted_star(calibration, star, free):
             matrix[:, covariance.names.index(f"{star.name}.{name}")] = slope
             prior += (slope * means[name].std()) ** 2
         error = np.sqrt(np.diag(covariance.propagate(matrix)))
-        values = star.mueller(wavelength)[..., row, 0], error
-        known = before.mueller(wavelength)[..., row, 0], np.sqrt(prior)
-        for stem, (value, std) in ((key, values), (f"{key}_prior", known)):
-            table[stem], table[f"{stem}_err"] = 100 * value * u.percent, 100 * std * u.percent
+        value, known = (one.mueller(wavelength)[..., row, 0] for one in (star, before))
+        columns = {key: value, f"{key}_err": error, f"{key}_prior": known}
+        _add(table, **columns, **{f"{key}_prior_err": np.sqrt(prior)})
         share.append(1 - np.clip(error**2 / prior, 0, 1))
     table.meta |= {"name": star.name, "from_data": float(np.median(share))}
     i = len(table) // 2
@@ -383,10 +383,8 @@ def _known(observations, star):
 
 
 def _add_known(table, q, stokes_u, covariance):
-    percent = 100 * u.percent
     length = np.hypot(q, stokes_u)
-    table["q_known"], table["u_known"] = q * percent, stokes_u * percent
-    table["dolp_known"] = length * percent
+    _add(table, q_known=q, u_known=stokes_u, dolp_known=length)
     table["aolp_known"] = np.where(length > 0, polarization_angle(q, stokes_u), np.nan) * u.deg
     along, across = np.full((2, length.size), np.nan)
     if covariance is not None:
@@ -397,7 +395,7 @@ def _add_known(table, q, stokes_u, covariance):
         matrix = np.broadcast_to(np.asarray(covariance), (length.size, 2, 2))
         along = _error_along(np.stack([c, s], -1), matrix)
         across = _error_along(np.stack([-s, c], -1), matrix)
-    table["dolp_known_err"] = along * percent
+    _add(table, dolp_known_err=along)
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
