@@ -96,16 +96,16 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     fewest = 3 if groups is None else 2
     labels = leave_out_groups(measurement) if groups is None else _checked(measurement, groups)
     held_out = np.full(measurement.n_data, np.nan)
-    found = np.unique(labels)
-    if len(found) < fewest:
+    order = np.argsort(labels, kind="stable")
+    members = np.split(order, np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1)
+    if len(members) < fewest:
         return held_out
     problem = Problem(measurement, assumed(measurement, weights))
     if not np.isfinite(problem.noise):
         # as many data as parameters tell no noise, against which a prior could weigh
         problem.noise = 0.0
-    linear = _Linear(problem) if len(found) > _MANY else None
-    for label in steps(found, "groups left out"):
-        out = labels == label
+    linear = _Linear(problem) if len(members) > _MANY else None
+    for out in steps(members, "groups left out"):
         if linear is not None:
             predicted, blind = linear.without(out)
         else:
@@ -115,11 +115,13 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
             slots = measurement.free.slots
             moved = [s.name for s in slots if share[:, s.slice].max() > _WORTH_A_WORD]
             raise FitError(
-                f"cross-validation: without group {label} ({out.sum()} data) the others do not "
-                f"determine {listed(moved, most=_MOST_NAMES)}; group by something else"
+                f"cross-validation: without group {labels[out[0]]} ({out.size} data) the others do "
+                f"not determine {listed(moved, most=_MOST_NAMES)}; group by something else"
             )
         if linear is None:
-            fitted, _, _ = problem.fit(problem.solution, (~out).astype(float))
+            counts = np.ones(measurement.n_data)
+            counts[out] = 0.0
+            fitted, _, _ = problem.fit(problem.solution, counts)
             predicted = measurement.residuals(fitted)[out]
         # along what the others leave open the fit still stands where all data have put it
         held_out[out] = np.where(blind, np.nan, predicted)
@@ -173,8 +175,7 @@ def _undetermined(problem, out):
     """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
     measurement, scale = problem.measurement, physical_scale(problem.measurement.free)
     jacobian = measurement.jacobian(problem.solution)
-    kept = problem.jacobian(problem.solution)
-    kept = kept[np.append(~out, np.ones(measurement.n_priors, dtype=bool))]
+    kept = np.delete(problem.jacobian(problem.solution), out, axis=0)
     null = Whitened(kept.T, scale).data.null * scale
     # which combinations of what the others leave open do the data left out see, and how strongly
     left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
