@@ -3,7 +3,7 @@
 
 HDF5 makes the file, with room for all steps, and never touches it again: where a write of its own
 fails it takes the process with it. The block before its structures, which it leaves to the user,
-says where the steps are and (JSON) of which run, so that no structure is read that may be spoiled.
+says where the steps are and (JSON) of which run, so that no structure is read that may be damaged.
 All steps have the same size, with their number, the state of the random numbers and a CRC; a run
 writes them in place. What counts is the beginning of the file up to the first step that is not
 whole; the rest is computed again, with the same random numbers.
