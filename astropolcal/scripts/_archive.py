@@ -19,7 +19,7 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
-from astropolcal.scripts._common import give, with_ending, written_lines
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
 # what sequences are worked on by, and what does not change a product
@@ -28,8 +28,8 @@ _DRIVING = (
     *("run", "command", "cubes", "output", "json", "quiet", "full", "online", "archive", "target"),
     *("retry", "timeout", "workers", "cluster", "gap", "cycles"),
 )
-_ONLY = ("gap", "cycles", "target", "retry", "timeout")
-_DEFAULTS = {"gap": 30.0}
+_ONLY = {"gap": 30.0, "cycles": None, "target": None, "retry": False, "timeout": None}
+_PRELOADED = ("scripts._correct", "scripts._reduce", "correction", "reduction", "pipeline.library")
 # of an entry of the manifest, what does not tell how the product was made
 _OF_ENTRY = ("name", "key", "n_files", "first", "source", "state")
 # reasons in the summary for machines: all are in the manifest
@@ -39,8 +39,8 @@ _MOST_LISTED, _MOST_DOUBTS = 1000, 20
 def is_archive(arguments, single):
     """Return whether a whole archive is asked for; refuse options that have no meaning then."""
     if arguments.archive is None:
-        for name in _ONLY:
-            if getattr(arguments, name) not in (None, False, _DEFAULTS.get(name)):
+        for name, usual in _ONLY.items():
+            if getattr(arguments, name) != usual:
                 raise ParameterError(f"--{name}: is for --archive DIR")
         if arguments.output is None:
             raise ParameterError("-o FILE is needed, or --archive DIR for a whole archive")
@@ -67,7 +67,13 @@ def run_archive(command, arguments):
 
     folder = Path(arguments.archive)
     folder.mkdir(parents=True, exist_ok=True)
-    work = _Work(command, _settled(arguments), os.path.abspath(folder), _source(arguments))
+    # as workers need them, whose folder may be another
+    settled = copy.copy(arguments)
+    for name in ("calibration", "raw"):
+        value = getattr(arguments, name, None)
+        if value is not None:
+            setattr(settled, name, type(value)(os.path.abspath(value)))
+    work = _Work(command, settled, os.path.abspath(folder), _source(arguments))
     where = {"workers": arguments.workers, "cluster": arguments.cluster}
     with closing(Index(folder / "index.sqlite")) as index:
         manifest = Manifest(folder / "manifest.jsonl")
@@ -83,7 +89,9 @@ def run_archive(command, arguments):
         before = Counter(state for *_, state in sequences())
         total, rest = before.total(), before.total() - sum(before[state] for state in skipped)
         if not total:
-            raise AstropolcalError(f"{arguments.cubes[0]}: no sequence in it{_first(index)}")
+            # why the first file belongs to none
+            why = next((f"; {path}: {why}" for path, why in index.problems()), "")
+            raise AstropolcalError(f"{arguments.cubes[0]}: no sequence in it{why}")
 
         def todo():
             for s, key, state in sequences():
@@ -91,32 +99,22 @@ def run_archive(command, arguments):
                     before = manifest.entries[s.name] if state == "older" else {}
                     yield s.name, key, s.instrument, s.files, before
 
-        preload = [f"astropolcal.scripts._{name}" for name in _SUFFIX]
-        preload += [
-            "astropolcal.correction",
-            "astropolcal.reduction",
-            "astropolcal.pipeline.library",
-        ]
+        preload = [f"astropolcal.{name}" for name in _PRELOADED]
         limit = None if arguments.timeout is None else 60 * arguments.timeout
         ended = ended_tasks(work, todo(), timeout=limit, preload=preload, **where)
         with closing(ended), counting(total, "sequences", total - rest) as add:
             for each in ended:
-                manifest.add(_entry(each, work.source))
+                name, key, _, files, _ = each.task
+                entry = {"name": name, "key": key, "n_files": len(files), "first": files[0]}
+                entry |= {"source": work.source, "state": "done"} | (each.result or {})
+                if each.reason is not None:
+                    entry |= {"state": "failed", "reason": each.reason}
+                manifest.add(entry)
                 add()
         found = [manifest.entries[s.name] for s, *_ in sequences()]
         content = counts | _content(found, rest, index, folder, arguments)
-    give(arguments, _lines(content, folder, arguments), content)
+    common.give(arguments, _lines(content, folder, arguments), content)
     return 1 if content["n_failed"] else 0
-
-
-def _settled(arguments):
-    """Return the arguments as workers need them, whose folder may be another."""
-    arguments = copy.copy(arguments)
-    for name in ("calibration", "raw"):
-        value = getattr(arguments, name, None)
-        if value is not None:
-            setattr(arguments, name, type(value)(os.path.abspath(value)))
-    return arguments
 
 
 def _source(arguments):
@@ -146,11 +144,6 @@ def _indexed(index, arguments, where):
     return {"n_files": n_files, "n_headers_read": n_read, "index_seconds": round(seconds, 3)}
 
 
-def _first(index):
-    """Return why the first file belongs to no sequence, for a message."""
-    return next((f"; {path}: {why}" for path, why in index.problems()), "")
-
-
 @dataclass
 class _Work:
     """Corrects or reduces a sequence, in any process that sees the files."""
@@ -173,11 +166,9 @@ class _Work:
         name, _, instrument, files, before = task
         started, arguments = time.monotonic(), copy.copy(self.arguments)
         product = os.path.join(self.folder, f"{name}{_SUFFIX[self.command]}")
-        arguments.cubes, arguments.output, arguments.archive = files, product, None
-        arguments.json, arguments.quiet = os.path.join(self.folder, f"{name}.json"), True
-        arguments.gap, arguments.cycles, arguments.target = _DEFAULTS["gap"], None, None
-        arguments.retry, arguments.timeout, arguments.cluster = False, None, None
-        arguments.workers = 1 if self.command == "reduce" else None
+        arguments.cubes, arguments.output, arguments.quiet = files, product, True
+        arguments.json = os.path.join(self.folder, f"{name}.json")
+        arguments.cluster, arguments.workers = None, 1 if self.command == "reduce" else None
         if os.path.isdir(getattr(arguments, "calibration", "")):
             arguments.instrument = arguments.instrument or instrument
         said = io.StringIO()
@@ -190,7 +181,7 @@ class _Work:
                     *_, made = command.choose_calibration(arguments, files)
                     if made["calibration_hash"] == before.get("calibration_hash"):
                         return {k: v for k, v in before.items() if k not in _OF_ENTRY}
-                command.run(arguments)
+                command.work(arguments)
         doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
         with open(arguments.json, encoding="utf-8") as stream:
             summary = json.load(stream)
@@ -215,14 +206,6 @@ def _megabytes():
         return round(int(text.split("VmHWM:")[1].split()[0]) / 1024, 1)
     except (OSError, IndexError, ValueError):
         return None
-
-
-def _entry(ended, source):
-    name, key, _, files, _ = ended.task
-    entry = {"name": name, "key": key, "n_files": len(files), "first": files[0], "source": source}
-    if ended.reason is not None:
-        return entry | {"state": "failed", "reason": ended.reason}
-    return entry | {"state": "done"} | ended.result
 
 
 def _content(found, n_worked, index, folder, arguments):
@@ -274,4 +257,4 @@ def _lines(content, folder, arguments):
     ends = [shortened(f"{key + ':':<13}{words}") for key, words in lines.items() if words]
     names = [str(Path(folder) / "manifest.jsonl"), arguments.json]
     shown = body if arguments.full else [shortened(line) for line in body]
-    return with_ending(shown, [verdict, *ends, *written_lines(names)], arguments.full)
+    return common.with_ending(shown, [verdict, *ends, *common.written_lines(names)], arguments.full)

@@ -2,6 +2,7 @@
 """``astropolcal calibrate``: fit an instrument's chain to observation tables."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import astropy.units as u
@@ -9,21 +10,10 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.progress import in_one_thread
-from astropolcal.scripts._common import (
-    check_suffix,
-    edit_chains,
-    follow_laws,
-    instrument_of,
-    is_quiet,
-    printer,
-    read_datasets,
-    show,
-    stated_model,
-    write_calibration,
-    written_calibration,
-)
-from astropolcal.units import plain_number
+from astropolcal.scripts import _common as common
 
+# so that a first call without any data shows what comes out
+_EXAMPLE = Path(__file__).parents[1] / "data" / "charis_example.ecsv"
 HELP = "fit an instrument's chain of optics to observation tables"
 DESCRIPTION = """\
 Fit an instrument's chain of optics to observation tables. Without files,
@@ -93,17 +83,27 @@ def run(arguments):
     from astropolcal.calibration.validation.targets import TARGETS
     from astropolcal.observations.observables import get_observable
 
-    check_suffix("-o", arguments.output, ".asdf")
+    common.check_suffix("-o", arguments.output, ".asdf")
     _check_start(arguments)
     # raises before any table is read
     if arguments.observable is not None:
         get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
-    # so that a first call without any data shows what comes out
-    files = arguments.files or [_example(printer(arguments))]
-    datasets, standards = read_datasets(files), read_datasets(arguments.standard)
-    _check_standards(arguments.standard, standards, files, datasets)
-    instrument, options = instrument_of(arguments, datasets), stated_model(arguments)
+    files = arguments.files
+    if not files:
+        files = [_EXAMPLE]
+        words = "No files given: this is the packaged example, a simulated run\n"
+        common.say(arguments, words)
+    datasets = common.read_datasets(files)
+    standards = common.read_datasets(arguments.standard)
+    for path, standard in zip(arguments.standard, standards, strict=True):
+        for file, dataset in zip(files, datasets, strict=True):
+            # a prediction of what was fitted proves nothing
+            if standard.content_hash == dataset.content_hash:
+                raise AstropolcalError(
+                    f"--standard {path} is not an independent standard: it is fitted as {file}"
+                )
+    instrument, options = common.instrument_of(arguments, datasets), common.stated_model(arguments)
     # standards follow the datasets in the lists, and are not fitted
     n, tables = len(datasets), [*datasets, *standards]
     # the instrument knows which of its frames cannot be trusted
@@ -113,11 +113,11 @@ def run(arguments):
     chains = instrument.chains_for(tables[:n], **exact, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in tables[n:]]
-    chains = follow_laws(chains, arguments.follow, datasets)
+    chains = common.follow_laws(chains, arguments.follow, datasets)
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     if arguments.start:
         edits["free"] = []
-    chains = edit_chains(chains, **edits)
+    chains = common.edit_chains(chains, **edits)
     positions = [instrument.positions(*pair) for pair in zip(tables, chains, strict=True)]
     calibration = _fitted(arguments, chains[:n], tables[:n], positions[:n], instrument)
     if arguments.groups:
@@ -130,7 +130,8 @@ def run(arguments):
         if _is_known(item[1]):
             add_star_check(calibration, *item)
     # written first: whoever reads the summary may go away
-    written = write_calibration(calibration, arguments, lambda: to_dict(calibration, targets))
+    content = partial(to_dict, calibration, targets)
+    written = common.write_calibration(calibration, arguments, content)
     _tell(arguments, calibration, targets, written)
 
 
@@ -140,20 +141,19 @@ def _tell(arguments, calibration, targets, written):
     from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines, verdict
 
     found = verdict(calibration, targets)
-    if is_quiet(arguments):
+    if common.is_quiet(arguments):
         if not found.usable:
             words = f"NOT USABLE AS IT IS: {'; '.join(found.reasons)}"
-            show(f"astropolcal: warning: {words}", file=sys.stderr)
+            common.show(f"astropolcal: warning: {words}", file=sys.stderr)
         return
-    last = written_calibration(arguments, written)
     if arguments.full:
         # its end is what stays on the screen
         lines = [summary(calibration, targets, full=True), "", *found.words]
     else:
-        last.append(HINT)
+        written = [*written, HINT]
         before = 0 if arguments.files else 2
-        lines = compact_lines(calibration, found, HEIGHT - before - len(last))
-    show("\n".join([*lines, *last]))
+        lines = compact_lines(calibration, found, HEIGHT - before - len(written))
+    common.show("\n".join([*lines, *written]))
 
 
 def _is_known(observations):
@@ -201,27 +201,13 @@ def _check_start(arguments):
     if not arguments.start:
         return
     # they would contradict what the old calibration holds
-    given = [
-        f"--{key}"
-        for key in ("fix", "prior", "without", "own", "follow")
-        if getattr(arguments, key)
-    ]
+    keys = ("fix", "prior", "without", "own", "follow")
+    given = [f"--{key}" for key in keys if getattr(arguments, key)]
     given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
     if given:
         raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")
     if not arguments.free:
         raise AstropolcalError("--start holds everything: say with --free NAME what may change")
-
-
-def _check_standards(paths, standards, files, datasets):
-    """Refuse a standard that is fitted, before it is."""
-    for path, standard in zip(paths, standards, strict=True):
-        for file, dataset in zip(files, datasets, strict=True):
-            # a prediction of what was fitted proves nothing
-            if standard.content_hash == dataset.content_hash:
-                raise AstropolcalError(
-                    f"--standard {path} is not an independent standard: it is fitted as {file}"
-                )
 
 
 def _held(arguments, chains):
@@ -248,23 +234,13 @@ def _target(text):
 def _quantity(text, part, unit, low, high):
     """Return a number with or without unit, in this one."""
     try:
-        value = plain_number(part, u.Quantity)
         # a plain number is in the unit of the option
-        value = value.value * unit if value.unit == u.one else value.to(unit)
-    except (TypeError, ValueError, u.UnitsError):
-        value = np.nan * unit
-    if not low <= value.value <= high:
+        value = common.number_in(part, unit)
+    except (TypeError, ValueError):
+        value = np.nan
+    if not low <= value <= high:
         raise ParameterError(
             f"--target {text}: {part!r} is not allowed; it is {low} to {high} {unit}, "
             "such as 1 or 30,45 or 5%,-20deg"
         )
-    return value
-
-
-def _example(say):
-    """Return the path of the packaged example, and say that it is used."""
-    import astropolcal
-
-    path = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
-    say("No files given: this is the packaged example, a simulated run\n")
-    return path
+    return value * unit

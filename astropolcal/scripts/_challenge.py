@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal challenge``: the diagnosis against sealed simulated data."""
 
-import argparse
 import multiprocessing
 import signal
 import sys
@@ -9,8 +8,7 @@ from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.progress import in_one_thread
-from astropolcal.scripts._common import is_quiet, show, wrapped, write_json
-from astropolcal.units import plain_number
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
 HELP = "test the diagnosis, or another tool, on sealed simulated data"
@@ -49,22 +47,16 @@ folders FOLDER *  of the cases, and of the answers
 """
 
 
-def _range(text):
-    """Return the two numbers of ``LOW:HIGH``."""
-    try:
-        low, high = map(plain_number, text.split(":"))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form LOW:HIGH") from None
-    return low, high
-
-
-TYPES = {"range": _range, "kinds": lambda text: text.split(",")}
+TYPES = {
+    "range": common.numbers_type("of the form LOW:HIGH", 2, ":"),
+    "kinds": lambda text: text.split(","),
+}
 
 
 @in_one_thread
 def run(arguments):
     """Make, run or score challenges, print how they went and write what was asked for."""
-    from astropolcal.gap.challenge import make_cases, run_challenge, score_cases
+    from astropolcal.gap.challenge import KINDS, Setup, make_cases, run_challenge, score_cases
 
     action, folders = arguments.action, arguments.folders
     wanted = {"run": 0, "make": 1, "score": 2}[action]
@@ -76,46 +68,35 @@ def run(arguments):
     if action == "score":
         result = score_cases(*folders)
     else:
+        options = {
+            "n": arguments.count,
+            "seed": arguments.seed,
+            "snr": arguments.snr,
+            "kinds": arguments.kinds or tuple(KINDS),
+            "setup": Setup(
+                instrument=arguments.instrument,
+                n_wavelengths=arguments.wavelengths,
+                n_derotator=arguments.derotator_angles,
+            ),
+        }
         # processes are started once for all challenges
         with _workers(arguments.workers) as client:
-            options = _options(arguments) | {"client": client}
             if action == "run":
-                result = run_challenge(**options, checkpoint=arguments.checkpoint)
+                checkpoint = arguments.checkpoint
+                result = run_challenge(**options, client=client, checkpoint=checkpoint)
             else:
-                key = make_cases(folders[0], **options)
+                key = make_cases(folders[0], **options, client=client)
     if result is None:
-        if not is_quiet(arguments):
-            show(f"{counted(len(key), 'case')} and key.json written to {folders[0]}")
+        words = f"{counted(len(key), 'case')} and key.json written to {folders[0]}"
+        common.say(arguments, words)
         return
-    if arguments.json:
-        write_json(result.to_dict(), arguments.json)
-    for path, draw in (
-        (arguments.figure, result.plot),
-        (arguments.reliability, result.plot_reliability),
-    ):
+    figures = {arguments.figure: result.plot, arguments.reliability: result.plot_reliability}
+    for path, draw in figures.items():
         if path:
             from astropolcal.plotting._style import save
 
             save(draw(), path)
-    if not is_quiet(arguments):
-        show(_report(result))
-
-
-def _options(arguments):
-    """Return what is common to making and running challenges."""
-    from astropolcal.gap.challenge import KINDS, Setup
-
-    return {
-        "n": arguments.count,
-        "seed": arguments.seed,
-        "snr": arguments.snr,
-        "kinds": arguments.kinds or tuple(KINDS),
-        "setup": Setup(
-            instrument=arguments.instrument,
-            n_wavelengths=arguments.wavelengths,
-            n_derotator=arguments.derotator_angles,
-        ),
-    }
+    common.give(arguments, [_report(result)], result.to_dict())
 
 
 @contextmanager
@@ -138,7 +119,7 @@ def _workers(count):
         yield pool
     except BaseException as problem:
         if isinstance(problem, KeyboardInterrupt):
-            show("astropolcal: stopping ...", file=sys.stderr)
+            common.show("astropolcal: stopping ...", file=sys.stderr)
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - set(others):
             process.terminate()
@@ -157,5 +138,5 @@ def _report(result):
             f"  no. {record['index']}, {record['result']}: {record['kind']} {truth} "
             f"(SNR {record['snr']:.0f}) -> {answer}"
         )
-        lines.append(wrapped(line, indent=6))
+        lines.append(common.wrapped(line, indent=6))
     return "\n".join(lines).rstrip()

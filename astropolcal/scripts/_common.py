@@ -10,6 +10,8 @@ import stat
 import sys
 import textwrap
 import warnings
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import astropy.units as u
@@ -80,121 +82,92 @@ def check_paths(arguments):
     """
     inputs, outputs = _named(arguments, Input), _named(arguments, Output)
     for _, path in [*inputs, *_named(arguments, Continued)]:
-        _check_input(path)
+        _seen(path, path, "read", os.listdir if os.path.isdir(path) else os.stat)
+        check_kind(path)
     for _, path in outputs:
-        (_check_folder if isinstance(path, Folder) else _check_file)(path)
-    for option, path in _named(arguments, Frames):
-        if os.path.isfile(path):
-            inputs += [(option, left) for left in _left_files(path)]
+        _check_output(path)
+    inputs += [(o, left) for o, path in _named(arguments, Frames) for left in _left_files(path)]
     replaced = getattr(arguments, "may_replace", {})
     for number, (option, path) in enumerate(outputs):
-        read = [other for name, other in inputs if name != replaced.get(option)]
-        _check_inputs(option, path, read)
+        label = _label(option)
+        # what is written to a folder is of another kind than what is read from it
+        for name, other in [] if isinstance(path, Folder) else inputs:
+            if name == replaced.get(option):
+                continue
+            if _are_same(path, other):
+                raise AstropolcalError(
+                    f"{label} {path}: would overwrite the input {other}; name another file"
+                )
+            if os.path.isdir(other) and (_is_within(path, other) or _holds(other, path)):
+                raise AstropolcalError(
+                    f"{label} {path}: is one of the files that are read from {other}; name "
+                    "another folder"
+                )
         for name, other in outputs[:number]:
             if _collide(path, other) or _collide(other, path):
                 raise AstropolcalError(
-                    f"{_label(option)} {path}: cannot be written beside {_label(name)} {other}, "
+                    f"{label} {path}: cannot be written beside {_label(name)} {other}, "
                     "which takes the same name; name another file"
                 )
+
+
+def _named(arguments, kind):
+    """Return the options of a kind and their files; one a file, where there may be several."""
+    several = ((o, v if isinstance(v, list) else [v]) for o, v in vars(arguments).items())
+    return [(o, path) for o, v in several for path in v if isinstance(path, kind) and path != "-"]
 
 
 def _left_files(path):
     """Return the files of left beams that are read with a file of a right beam."""
     from astropolcal import instruments
 
-    layouts = (instruments.get(name).files for name in instruments.names())
-    return [
-        Input(layout.left_file(path))
-        for layout in layouts
-        if layout is not None and layout.beam_files and layout.beam_files[0] in Path(path).name
-    ]
-
-
-def _named(arguments, kind):
-    """Return the options of a kind and their files; one a file, where there may be several."""
-    values = ((option, value) for option, value in vars(arguments).items())
-    several = ((option, v if isinstance(v, list) else [v]) for option, v in values)
-    return [(o, path) for o, v in several for path in v if isinstance(path, kind) and path != "-"]
+    layouts = [instruments.get(name).files for name in instruments.names()]
+    pairs = [layout for layout in layouts if layout is not None and layout.beam_files]
+    name = Path(path).name if os.path.isfile(path) else ""
+    return [Input(layout.left_file(path)) for layout in pairs if layout.beam_files[0] in name]
 
 
 def _label(option):
     return "-o" if option == "output" else f"--{option.replace('_', '-')}"
 
 
-def _check_input(path):
+def _seen(path, place, done, look=os.stat):
+    """Return what the system says of a place, None where there is nothing."""
     try:
-        if stat.S_ISDIR(os.stat(path).st_mode):
-            os.listdir(path)
-    except FileNotFoundError:
-        # its reader says so
-        return
-    except (OSError, ValueError) as problem:
-        raise AstropolcalError(f"{path}: cannot be read: {_reason(problem)}") from None
-    check_kind(path)
-
-
-def _check_file(path):
-    state = _state(path, path)
-    if state is not None and stat.S_ISDIR(state.st_mode):
-        raise AstropolcalError(f"{path}: is a folder, not a file")
-    if state is not None and not stat.S_ISREG(state.st_mode):
-        # a pipe or a device takes what it is given, and no file is made beside it
-        _check_writable(path, path)
-        return
-    if state is not None and isinstance(path, Continued):
-        _check_writable(path, path)
-    # a link stays a link, and what it points to is replaced
-    folder = Path(os.path.realpath(path) if os.path.islink(path) else path).parent
-    if not os.path.isdir(folder):
-        raise AstropolcalError(f"{path}: there is no folder {folder}")
-    _check_writable(path, folder)
-
-
-def _check_folder(path):
-    # it is made later, inside the nearest folder that exists
-    whole = Path(path).absolute()
-    there = next(p for p in [Path(path), *whole.parents] if os.path.exists(p))
-    if not there.is_dir():
-        raise AstropolcalError(f"{there}: is a file, not a folder")
-    for part in whole.parts[len(there.absolute().parts) :]:
-        # names that are too long there
-        _state(path, there / part)
-    _check_writable(path, there)
-
-
-def _state(path, place):
-    """Return what the system says of something to write, None where there is nothing."""
-    try:
-        return os.stat(place)
+        return look(place)
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as problem:
-        raise AstropolcalError(f"{path}: cannot be written: {_reason(problem)}") from None
+        reason = getattr(problem, "strerror", None) or f"it is not the name of a file ({problem})"
+        raise AstropolcalError(f"{path}: cannot be {done}: {reason}") from None
 
 
-def _reason(problem):
-    return getattr(problem, "strerror", None) or f"it is not the name of a file ({problem})"
-
-
-def _check_writable(path, place):
-    if not os.access(place, os.W_OK | (os.X_OK if os.path.isdir(place) else 0)):
-        raise AstropolcalError(
-            f"{path}: no permission to write to {place}; name a folder that you may write to"
-        )
-
-
-def _check_inputs(option, path, inputs):
-    """Refuse an output that is an input, or among the files of a folder that is read."""
-    # what is written to a folder is of another kind than what is read from it
-    for other in [] if isinstance(path, Folder) else inputs:
-        if _are_same(path, other):
+def _check_output(path):
+    if isinstance(path, Folder):
+        # it is made later, inside the nearest folder that exists
+        place = next(p for p in [path, *Path(path).absolute().parents] if os.path.exists(p))
+        if not os.path.isdir(place):
+            raise AstropolcalError(f"{place}: is a file, not a folder")
+        for part in Path(path).parts:
+            # names that are too long there
+            _seen(path, Path(place, part), "written")
+        places = [place]
+    else:
+        state = _seen(path, path, "written")
+        if state is not None and stat.S_ISDIR(state.st_mode):
+            raise AstropolcalError(f"{path}: is a folder, not a file")
+        # a link stays a link, and what it points to is replaced
+        folder = Path(os.path.realpath(path) if os.path.islink(path) else path).parent
+        if not os.path.isdir(folder):
+            raise AstropolcalError(f"{path}: there is no folder {folder}")
+        places = [path, folder] if state is not None and isinstance(path, Continued) else [folder]
+        if state is not None and not stat.S_ISREG(state.st_mode):
+            # a pipe or a device takes what it is given, and no file is made beside it
+            places = [path]
+    for place in places:
+        if not os.access(place, os.W_OK | (os.X_OK if os.path.isdir(place) else 0)):
             raise AstropolcalError(
-                f"{_label(option)} {path}: would overwrite the input {other}; name another file"
-            )
-        if os.path.isdir(other) and (_is_within(path, other) or _holds(other, path)):
-            raise AstropolcalError(
-                f"{_label(option)} {path}: is one of the files that are read from {other}; name "
-                "another folder"
+                f"{path}: no permission to write to {place}; name a folder that you may write to"
             )
 
 
@@ -331,12 +304,23 @@ _SHARED = """
 _SHARED = {re.search(r"--(\w+)", entry)[1]: entry for entry in entries(_SHARED)}
 
 
-def angles(text):
-    """Return the angles of a comma-separated list, in degree."""
-    try:
-        return [plain_number(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
+def numbers(text, count=None, separator=","):
+    """Return the numbers of a text, which are finite and ``count``; or raise ValueError."""
+    found = [plain_number(part) for part in text.split(separator)]
+    if count not in (None, len(found)) or not np.isfinite(found).all():
+        raise ValueError(f"{text!r} is not {count or 'a list of'} finite numbers")
+    return found
+
+
+def numbers_type(words, count=None, separator=","):
+    """Return the type of an option that takes such numbers."""
+
+    def convert(text):
+        with suppress(ValueError):
+            return numbers(text, count, separator)
+        raise argparse.ArgumentTypeError(f"{text!r} is not {words}")
+
+    return convert
 
 
 def sky_position(text, option):
@@ -358,22 +342,19 @@ def sky_position(text, option):
         ) from None
 
 
-def number_or(*words):
+def number_or(*words, kind=float):
     """Return the type of an option that takes one of some words or a number."""
 
     def convert(text):
-        if text in words:
-            return text
-        try:
-            return plain_number(text)
-        except ValueError:
-            allowed = f"{', '.join(words)} or a number"
-            raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}") from None
+        with suppress(ValueError):
+            return text if text in words else plain_number(text, kind)
+        allowed = f"{', '.join(words)} or a number"
+        raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}")
 
     return convert
 
 
-_TYPES = {"float": float, "int": int, "angles": angles}
+_TYPES = {"float": float, "int": int, "angles": numbers_type("a list of angles in degree")}
 _TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Folder)}
 
 
@@ -391,9 +372,10 @@ def show(text, file=None):
     print(printable(text), file=file, flush=file is not None)
 
 
-def printer(arguments):
-    """Return what prints, or does nothing if that is asked for."""
-    return (lambda *_: None) if is_quiet(arguments) else show
+def say(arguments, *lines):
+    """Print lines unless nothing is to be printed."""
+    if not is_quiet(arguments):
+        show("\n".join(lines))
 
 
 def check_suffix(option, path, *suffixes):
@@ -423,33 +405,28 @@ def write_json(content, path):
         temporary.write_text(text, encoding="utf-8")
 
 
-def give(arguments, lines, content):
-    """Write what machines want, and print lines, as asked for."""
+def give(arguments, lines, content, *written):
+    """Write what machines want, and print lines and the files that were written, as asked for."""
     if arguments.json:
         write_json(content, arguments.json)
-    printer(arguments)("\n".join(lines))
+    last = written_lines(written)
+    say(arguments, *lines, *([""] if last else []), *last)
 
 
 def write_calibration(calibration, arguments, content):
-    """Write calibration, figures and what ``content()`` returns as asked for; return the files."""
-    written = []
+    """Write calibration, figures and what ``content()`` returns as asked for; say so in lines."""
+    figures, kept = [], ["Not kept: -o cal.asdf writes the calibration to a file"]
     if arguments.output:
         calibration.write(arguments.output, overwrite=True)
-        written.append(arguments.output)
+        kept = []
     if arguments.plots:
         from astropolcal.plotting import save_all
 
-        written += [str(path) for path in save_all(calibration, arguments.plots)]
+        figures = save_all(calibration, arguments.plots)
     if arguments.json:
         write_json(content(), arguments.json)
-        written += [arguments.json] if arguments.json != "-" else []
-    return written
-
-
-def say_written(say, written):
-    """Say which files were written, a line each."""
-    if written:
-        say("\nWritten: " + "\n         ".join(one_line(path, None) for path in written))
+    named = [arguments.output, arguments.json]
+    return written_lines(named, len(figures), arguments.plots) + kept
 
 
 # ---- inputs ---------------------------------------------------------------------------------
@@ -492,7 +469,9 @@ def read_datasets(paths):
 
     datasets = []
     for path in paths:
-        _check_table(path)
+        for mark, words in _NO_TABLES.items():
+            if begins(path, mark):
+                raise AstropolcalError(f"{path}: is {words}")
         dataset = Observations.read(path)
         for other, known in zip(paths, datasets, strict=False):
             # by content: the same frames under two names would count twice in a fit
@@ -502,17 +481,13 @@ def read_datasets(paths):
     return datasets
 
 
-def _check_table(path):
-    """Refuse a file of this package that is not a table, and say which command needs it."""
+def begins(path, mark):
+    """Return whether a file begins with these bytes; what cannot be opened its reader says."""
     try:
         with open(path, "rb") as stream:
-            start = stream.read(max(map(len, _NO_TABLES)))
+            return stream.read(len(mark)) == mark
     except OSError:
-        # whoever reads the table says what is wrong
-        return
-    for mark, words in _NO_TABLES.items():
-        if start.startswith(mark):
-            raise AstropolcalError(f"{path}: is {words}")
+        return False
 
 
 # ---- the model ------------------------------------------------------------------------------
@@ -531,14 +506,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     _check_fixed(fix, free, prior)
     # before the rest: what is out of the model has no parameters to edit
     for name in without:
-        present = [name in {leaf.name for leaf in leaves(chain)} for chain in chains]
-        # raises, with near matches
-        if not any(present):
-            find_optic(chains[0], name)
-        chains = [
-            remove_optic(chain, name) if here else chain
-            for chain, here in zip(chains, present, strict=True)
-        ]
+        chains = _changed(chains, name, partial(remove_optic, name=name))
     for name in free:
         for parameter in _parameters(chains, name):
             parameter.fixed = False
@@ -577,19 +545,21 @@ def follow_laws(chains, texts, tables):
                 f"hwp.theta:Polynomial1D(1):time:2026-03-01; allowed are {' and '.join(_LAWS)}"
             )
         name, _, degree, of, since = match.groups()
-        optic = name.rpartition(".")[0]
-        have = [any(leaf.name == optic for leaf in leaves(chain)) for chain in chains]
-        if not any(have):
-            # raises, with near matches
-            find_optic(chains[0], optic)
         law, of = model(int(degree)), of.split(",")
         if "time" in of and since is None and dated:
             since = np.floor(min(one.min() for one in dated))
-        chains = [
-            follow(chain, name, law, of, since=since) if here else chain
-            for chain, here in zip(chains, have, strict=True)
-        ]
+        add = partial(follow, name=name, model=law, of=of, since=since)
+        chains = _changed(chains, name.rpartition(".")[0], add)
     return chains
+
+
+def _changed(chains, optic, change):
+    """Return the chains, those with an optic changed."""
+    have = [any(leaf.name == optic for leaf in leaves(chain)) for chain in chains]
+    if not any(have):
+        # raises, with near matches
+        find_optic(chains[0], optic)
+    return [change(chain) if here else chain for chain, here in zip(chains, have, strict=True)]
 
 
 def _check_fixed(fix, free, prior):
@@ -641,33 +611,31 @@ def _normal(name, parameter, text):
     return Normal(*(value * unit for value in values))
 
 
-def _value(name, parameter, text):
-    """Return the number that a text with or without unit means, in the parameter's unit."""
+def number_in(text, unit):
+    """Return the number that a text with or without unit means, in a unit; or raise ValueError."""
     # a number, and perhaps a unit; no expression is evaluated
     match = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z%].*)?", text)
-    number, unit = match.groups() if match else ("", None)
+    number, own = match.groups() if match else ("", None)
+    value = plain_number(number)
+    return value if own is None else (value * u.Unit(own)).to_value(unit)
+
+
+def _value(name, parameter, text):
+    """Return the number that a text with or without unit means, in the parameter's unit."""
+    unit = parameter.unit or u.dimensionless_unscaled
     try:
-        value = plain_number(number)
-    except ValueError:
+        return number_in(text, unit)
+    except (ValueError, TypeError):
         raise ParameterError(
-            f"{name}={text}: not a number; allowed are such as 1.5 or 1.5{parameter.unit or ''}"
+            f"{name}={text}: not a number, or its unit is not convertible to "
+            f"{parameter.unit or 'a number'}; allowed are such as 1.5 or 1.5{parameter.unit or ''}"
         ) from None
-    if unit:
-        try:
-            value = (value * u.Unit(unit)).to_value(parameter.unit or u.dimensionless_unscaled)
-        except (ValueError, TypeError, u.UnitConversionError):
-            raise ParameterError(
-                f"{name}={text}: the unit must be convertible to {parameter.unit or 'a number'}"
-            ) from None
-    return value
 
 
 def _set(name, parameter, text):
     value = _value(name, parameter, text)
-    low, high = (
-        -np.inf if parameter.bounds[0] is None else parameter.bounds[0],
-        np.inf if parameter.bounds[1] is None else parameter.bounds[1],
-    )
+    low, high = parameter.bounds
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
     if not (np.isfinite(value) and low <= value <= high):
         # bounds that were computed carry rounding errors
         low, high = (float(f"{bound:.7g}") for bound in (low, high))
@@ -698,13 +666,6 @@ def written_lines(named, figures=0, folder=None):
     names = [one_line(path, None) for path in named if path and str(path) != "-"]
     names += [f"{counted(figures, 'figure')} in {one_line(folder, None)}"] if figures else []
     return [f"Written:    {name}" for name in names]
-
-
-def written_calibration(arguments, written):
-    """Return what `write_calibration` wrote in a few lines, or that nothing was kept."""
-    named = [path for path in written if path in (arguments.output, arguments.json)]
-    kept = [] if arguments.output else ["Not kept: -o cal.asdf writes the calibration to a file"]
-    return written_lines(named, len(written) - len(named), arguments.plots) + kept
 
 
 def with_ending(body, ends, full):

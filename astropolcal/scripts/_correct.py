@@ -17,20 +17,8 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import one_line
+from astropolcal.scripts import _common as common
 from astropolcal.scripts._archive import is_archive, run_archive
-from astropolcal.scripts._common import (
-    check_suffix,
-    cube_files,
-    ending,
-    following,
-    is_quiet,
-    number_or,
-    show,
-    with_ending,
-    wrapped,
-    write_json,
-    written_lines,
-)
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
@@ -116,14 +104,6 @@ _WAYS = {
 }
 
 
-def _point(text):
-    try:
-        x, y = (plain_number(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
-    return x, y
-
-
 def _star(text):
     """Return the arguments of `Corrected.without_star`."""
     try:
@@ -148,23 +128,28 @@ def _with_error(text):
 TYPES = {
     "star": _star,
     "names": lambda text: [name.strip() for name in text.split(",") if name.strip()],
-    "point": _point,
-    "sigma": number_or("infinite", "ignore"),
+    "point": common.numbers_type("X,Y", 2),
+    "sigma": common.number_or("infinite", "ignore"),
 }
 
 
 def run(arguments):
-    """Correct the cubes and write the product."""
+    """Correct the cubes, or the archive, and write the product."""
+    _check_options(arguments)
+    common.check_suffix("--spectrum", arguments.spectrum, ".ecsv")
+    if is_archive(arguments, ("spectrum", "plot")):
+        return run_archive("correct", arguments)
+    common.check_suffix("-o", arguments.output, ".fits")
+    return work(arguments)
+
+
+def work(arguments):
+    """Correct the cubes of one product."""
     from astropolcal import instruments
     from astropolcal.correction import ScienceFrames, correct
     from astropolcal.reduction.frames import configured, survey_frames
 
-    _check_options(arguments)
-    check_suffix("--spectrum", arguments.spectrum, ".ecsv")
-    if is_archive(arguments, ("spectrum", "plot")):
-        return run_archive("correct", arguments)
-    check_suffix("-o", arguments.output, ".fits")
-    files = cube_files(arguments.cubes)
+    files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
@@ -205,13 +190,17 @@ def run(arguments):
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
     result.write(arguments.output, overwrite=True)
-    _write_others(result, star, arguments)
+    if arguments.spectrum:
+        from astropolcal.reduction.tables import write_table
+
+        write_table(star.table(), arguments.spectrum, overwrite=True)
+    if arguments.plot:
+        from astropolcal.plotting._style import save
+        from astropolcal.plotting.correction import plot_corrected
+
+        save(plot_corrected(result), arguments.plot, ObservationError)
     summary = _summary(result, star, arguments, len(files))
-    if arguments.json:
-        write_json(summary, arguments.json)
-    if not is_quiet(arguments):
-        _report(summary, result.systematic, arguments)
-    return 0
+    common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
 def _sorted(files, instrument):
@@ -240,18 +229,15 @@ def _check_options(arguments):
         raise ParameterError(f"--seed {arguments.seed}: is for --samples N")
     check_seed(arguments.seed)
     # a size that is none is refused with the images, whose width it depends on
-    largest = arguments.size / 2
-    if arguments.radius is not None and arguments.radius > largest > 0:
-        raise ParameterError(
-            f"--radius {arguments.radius:g}: leaves the images of --size {arguments.size}; "
-            f"allowed are up to {largest:g} pixels"
-        )
-    _, outer = (arguments.subtract_star or {}).get("annulus", (0, 0))
-    if outer > largest > 0:
-        raise ParameterError(
-            f"--subtract-star annulus=...,{outer:g}: leaves the images of --size {arguments.size}; "
-            f"allowed are up to {largest:g} pixels"
-        )
+    largest, star = arguments.size / 2, arguments.subtract_star or {}
+    radii = {"--radius {:g}": arguments.radius}
+    radii["--subtract-star annulus=...,{:g}"] = star.get("annulus", (0, 0))[1]
+    for option, radius in radii.items():
+        if radius is not None and radius > largest > 0:
+            raise ParameterError(
+                f"{option.format(radius)}: leaves the images of --size {arguments.size}; "
+                f"allowed are up to {largest:g} pixels"
+            )
 
 
 def _radius(arguments):
@@ -271,6 +257,7 @@ def choose_calibration(arguments, files):
     """
     from astropolcal import instruments
     from astropolcal.correction.rows import sky_chain
+    from astropolcal.pipeline.headers import check_frames
     from astropolcal.reduction.frames import read_night
 
     path = Path(arguments.calibration)
@@ -284,7 +271,12 @@ def choose_calibration(arguments, files):
         entry = _of_library(path, arguments, night, beam, files)
         path = entry.path
         calibration, digest = _read(path)
-    _check_validity(calibration, path, arguments, night)
+    # --filter names the mode as the file does, whatever the headers call it
+    mode = arguments.filter or night.mode
+    moments = [(file, date, mode) for file, date in night.moments.items()]
+    max_age = None if arguments.max_age is None else arguments.max_age * u.yr
+    options = {"max_age": max_age, "ways": _WAYS, "dates": not arguments.any_date}
+    check_frames(calibration, moments, str(path), **options)
     wanted = {"optics_in": arguments.optics_in, "beam": beam, "date": night.dates or None}
     chain = sky_chain(calibration, label=str(path), **wanted)
     made = {"calibration": str(path), "calibration_hash": digest}
@@ -312,18 +304,6 @@ def _library(path, changed):
     from astropolcal.pipeline.library import Library
 
     return Library(path)
-
-
-def _check_validity(calibration, path, arguments, night):
-    """Refuse frames for which the calibration does not hold, unless the user asks for it."""
-    from astropolcal.pipeline.headers import check_frames
-
-    # --filter names the mode as the file does, whatever the headers call it
-    mode = arguments.filter or night.mode
-    frames = [(file, date, mode) for file, date in night.moments.items()]
-    max_age = None if arguments.max_age is None else arguments.max_age * u.yr
-    options = {"max_age": max_age, "ways": _WAYS, "dates": not arguments.any_date}
-    check_frames(calibration, frames, str(path), **options)
 
 
 def _of_library(path, arguments, night, beam, files):
@@ -364,25 +344,19 @@ def _position_angles(table, arguments):
     return angle + table["parallactic"]
 
 
-def _write_others(result, star, arguments):
-    if arguments.spectrum:
-        from astropolcal.reduction.tables import write_table
-
-        write_table(star.table(), arguments.spectrum, overwrite=True)
-    if arguments.plot:
-        from astropolcal.plotting._style import save
-        from astropolcal.plotting.correction import plot_corrected
-
-        save(plot_corrected(result), arguments.plot, ObservationError)
+# names and keys of degree and angle, their unit, its factor and the form of the number
+_POLARIZATION = (
+    ("DoLP", "degree", "dolp", "s_p", " %", 100, ".2f"),
+    ("AoLP", "angle", "aolp", "s_chi", " deg", 1, ".1f"),
+)
 
 
 def _summary(result, star, arguments, n_frames):
-    known = star.polarization()
-    errors = {kind: star.fractional_errors(kind) for kind in ("statistical", "systematic")}
-    spectrum = {"q": star.q, "u": star.u} | known
-    for kind, error in errors.items():
+    spectrum = {"radius": _radius(arguments), "q": star.q, "u": star.u} | star.polarization()
+    for kind in ("statistical", "systematic"):
+        error = star.fractional_errors(kind)
         spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
-    return {
+    summary = {
         "output": str(arguments.output),
         "calibration": result.provenance["calibration"],
         "calibration_hash": result.provenance["calibration_hash"],
@@ -397,69 +371,23 @@ def _summary(result, star, arguments, n_frames):
         "leakage_q": result.leakage[:, 1],
         "leakage_u": result.leakage[:, 2],
         "held": [] if result.systematic is None else result.systematic.held,
-        "aperture": {"radius": _radius(arguments)} | spectrum,
-    } | _subtracted(result.star)
-
-
-def _subtracted(table):
-    """Return the star that was subtracted, for the summary."""
-    if table is None:
-        return {}
-    from astropolcal.correction.star import star_words
-
-    values = {name: u.Quantity(table[name]).value for name in table.colnames[1:]}
-    return {"subtracted_star": {"from": table.meta["star"], "words": star_words(table)} | values}
-
-
-def _report(summary, systematic, arguments):
-    """Print how well the Stokes parameters are determined, the star, and the summary."""
-    named = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
-    ends = ending(*_verdict(summary, systematic, arguments.output), written_lines(named))
-    show("\n".join(with_ending(_lines(summary, systematic), ends, arguments.full)))
-
-
-def _verdict(summary, systematic, output):
-    """Return verdict, accuracy, what is determined, and what to do next, of the star."""
-    star, n = summary["aperture"], len(summary["wavelength_nm"])
-    good = n - len(summary["poorly_determined"])
-    is_open = {
-        words: systematic is not None and systematic.is_open and not np.isfinite(star[key]).any()
-        for words, key in (("DoLP", "s_p_systematic"), ("AoLP", "s_chi_systematic"))
+        "aperture": spectrum,
     }
-    told = [words for words, applies in is_open.items() if applies]
-    kinds = ("statistical", "systematic")
-    degree, angle = (
-        " + ".join(
-            _middle(scale * star[f"{key}_{kind}"], ".2g", unit, none=none)
-            for kind, none in zip(
-                kinds, ("unknown", "open" if is_open[words] else "unknown"), strict=True
-            )
-        )
-        for words, key, unit, scale in (("DoLP", "s_p", " %", 100), ("AoLP", "s_chi", " deg", 1))
-    )
-    # the unit once: the line is short
-    if not told:
-        degree, angle = degree.replace(" % +", " +"), angle.replace(" deg +", " +")
-    verdict, advice = "Usable", following("info", output)
-    if not good:
-        verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
-        advice = "frames at more angles of the half-wave plate and of the field"
-    elif told:
-        verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(told)}"
-        advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
-    elif good < n:
-        verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
-    accuracy = f"DoLP {degree}, AoLP {angle} (statistical + systematic)"
-    return verdict, accuracy, f"{summary['components']} at {good} of {n} wavelengths", advice
+    if (table := result.star) is not None:
+        from astropolcal.correction.star import star_words
+
+        told = {"from": table.meta["star"], "words": star_words(table)}
+        told |= {name: u.Quantity(table[name]).value for name in table.colnames[1:]}
+        summary["subtracted_star"] = told
+    return summary
 
 
-def _lines(summary, systematic):
-    """Return what was done, and the star within the aperture."""
+def _words(summary, systematic, arguments):
+    """Return what was done, the star within the aperture, and how well both are determined."""
     # not finite where nothing was determined
     condition = summary["condition"][np.isfinite(summary["condition"])]
-    frames = counted(summary["n_frames"], "frame")
     lines = [
-        f"{frames}, mode {summary['mode']}",
+        f"{counted(summary['n_frames'], 'frame')}, mode {summary['mode']}",
         f"  calibration: {one_line(summary['calibration'], None)}",
     ]
     if condition.size:
@@ -467,20 +395,57 @@ def _lines(summary, systematic):
         lines.append(f"  condition number of the solution for {summary['components']}: {limits}")
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
-        lines += wrapped(line, indent=4).split("\n")
-    aperture = summary["aperture"]
-    lines.append(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
-    unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
-    for name, unit, error, scale in (("dolp", " %", "s_p", 100), ("aolp", " deg", "s_chi", 1)):
-        words = "degree" if name == "dolp" else "angle"
-        shown = _middle(scale * aperture[name], ".2f" if scale == 100 else ".1f", unit, scale == 1)
-        lines.append(f"    {words} of linear polarization: {shown}")
-        for kind, none in (("statistical", "not known"), ("systematic", unknown)):
-            values = scale * aperture[f"{error}_{kind}"]
+        lines += common.wrapped(line, indent=4).split("\n")
+    star, is_open = summary["aperture"], systematic is not None and systematic.is_open
+    lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
+    found, accuracy, lost = _polarization(star, is_open)
+    lines += found
+    if subtracted := summary.get("subtracted_star"):
+        lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
+    n = len(summary["wavelength_nm"])
+    good = n - len(summary["poorly_determined"])
+    verdict, advice = "Usable", common.following("info", arguments.output)
+    if not good:
+        verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
+        advice = "frames at more angles of the half-wave plate and of the field"
+    elif lost:
+        verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
+        advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
+    elif good < n:
+        verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
+    ends = common.ending(
+        verdict,
+        f"{accuracy} (statistical + systematic)",
+        f"{summary['components']} at {good} of {n} wavelengths",
+        advice,
+        common.written_lines(
+            [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
+        ),
+    )
+    return common.with_ending(lines, ends, arguments.full)
+
+
+def _polarization(star, is_open):
+    """Return degree and angle of a star in lines, and their errors in one; which is open."""
+    lines, accuracy, lost = [], [], []
+    for name, word, key, error, unit, scale, form in _POLARIZATION:
+        shown = _middle(scale * star[key], form, unit, turns=name == "AoLP")
+        lines.append(f"    {word} of linear polarization: {shown}")
+        errors = []
+        for kind, unknown in (("statistical", False), ("systematic", is_open)):
+            values = scale * star[f"{error}_{kind}"]
+            none = "infinite" if unknown else "not known"
             lines.append(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
-    if star := summary.get("subtracted_star"):
-        lines.append(f"  subtracted from all light: {star['words']} ({star['from']})")
-    return lines
+            if unknown and not np.isfinite(values).any():
+                lost.append(name)
+            none = "open" if name in lost else "unknown"
+            errors.append(_middle(values, ".2g", unit, none=none))
+        accuracy.append(f"{name} {' + '.join(errors)}")
+    accuracy = ", ".join(accuracy)
+    if not lost:
+        # the unit once: the line is short
+        accuracy = accuracy.replace(" % +", " +").replace(" deg +", " +")
+    return lines, accuracy, lost
 
 
 def _middle(values, form, unit, turns=False, none="not known"):

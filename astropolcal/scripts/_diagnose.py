@@ -6,20 +6,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.progress import in_one_thread, stage
-from astropolcal.scripts._common import (
-    MODEL,
-    PAGES,
-    check_suffix,
-    edit_chains,
-    instrument_of,
-    printer,
-    read_datasets,
-    show,
-    stated_model,
-    wrapped,
-    write_json,
-    written_lines,
-)
+from astropolcal.scripts import _common as common
 
 HELP = "find what a model lacks to explain the measurements"
 DESCRIPTION = """\
@@ -68,43 +55,35 @@ files FILE * Input  observation tables (ECSV); before them may stand a calibrati
 @in_one_thread
 def run(arguments):
     """Diagnose, print what came out and write what was asked for."""
-    from astropolcal.gap import diagnose
+    from astropolcal.gap import EFFECTS, diagnose, get_effect
+    from astropolcal.gap._words import exposure, short
     from astropolcal.gap.report import summary, to_dict
 
     # needs no table
     if arguments.effects == "help":
-        from astropolcal.gap import EFFECTS
-
         width = max(map(len, EFFECTS)) + 2
         for name, effect in EFFECTS.items():
-            show(wrapped(f"{name:<{width}}{effect.title}", indent=width))
+            common.show(common.wrapped(f"{name:<{width}}{effect.title}", indent=width))
         return
-    say = printer(arguments)
-    check_suffix("--save", arguments.save, ".asdf")
-    check_suffix("--report", arguments.report or None, *PAGES)
-    options = {"effects": _effects(arguments.effects), "progress": stage}
+    common.check_suffix("--save", arguments.save, ".asdf")
+    common.check_suffix("--report", arguments.report or None, *common.PAGES)
+    effects = arguments.effects
+    if effects != "all":
+        effects = [name.strip() for name in effects.split(",") if name.strip()]
+        if not effects:
+            raise AstropolcalError(
+                f"--effects {arguments.effects!r}: give all, or names separated by commas"
+            )
+        for name in effects:
+            get_effect(name)
+    options = {"effects": effects, "changes": arguments.changes, "nested": arguments.nested}
     nominal, datasets, instrument = _nominal(arguments)
-    options |= {"changes": arguments.changes, "nested": arguments.nested}
-    diagnosis = diagnose(nominal, datasets, **options)
+    diagnosis = diagnose(nominal, datasets, **options, progress=stage)
     stage("what to observe next")
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
-    written = _write(diagnosis, content, arguments, instrument)
-    ends = _ending(content, written)
-    if arguments.full:
-        # its end is what stays on the screen
-        say("\n".join([summary(diagnosis), "", wrapped(content["sentences"][0]), *ends]))
-    else:
-        from astropolcal.gap._words import short
-
-        say("\n".join(short(content, [*ends, _HINT])))
-
-
-def _ending(content, written):
-    """Return what to do next, and the files that were written."""
-    from astropolcal.gap._words import exposure
-
+    _write(diagnosis, content, arguments, instrument)
     following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
     found = {
         "none": "calibrate with this model",
@@ -112,24 +91,14 @@ def _ending(content, written):
         "located": "--save FILE.asdf calibrates with what was found",
     }
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
-    words = wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
-    return [*words, *written_lines(written)]
-
-
-# ---- effects --------------------------------------------------------------------------------
-
-
-def _effects(text):
-    from astropolcal.gap import get_effect
-
-    if text == "all":
-        return "all"
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise AstropolcalError(f"--effects {text!r}: give all, or names separated by commas")
-    for name in names:
-        get_effect(name)
-    return names
+    ends = common.wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
+    ends += common.written_lines([arguments.json, arguments.report, arguments.save])
+    if arguments.full:
+        # its end is what stays on the screen
+        lines = [summary(diagnosis), "", common.wrapped(content["sentences"][0]), *ends]
+    else:
+        lines = short(content, [*ends, _HINT])
+    common.say(arguments, *lines)
 
 
 # ---- the nominal model ------------------------------------------------------------------------
@@ -143,33 +112,30 @@ def _nominal(arguments):
     files = rest if known else arguments.files
     if not files:
         raise AstropolcalError("no tables to diagnose; give at least one FILE")
-    datasets = read_datasets(files)
+    datasets = common.read_datasets(files)
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix")}
     if known:
         return _of_calibration(known, files, datasets, edits, arguments)
-    instrument = instrument_of(arguments, datasets)
-    chains = instrument.chains_for(datasets, **stated_model(arguments))
-    return edit_chains(chains, **edits), datasets, instrument.name
+    instrument = common.instrument_of(arguments, datasets)
+    chains = instrument.chains_for(datasets, **common.stated_model(arguments))
+    return common.edit_chains(chains, **edits), datasets, instrument.name
 
 
 def _of_calibration(path, files, datasets, edits, arguments):
     """Return the model of a calibration for the datasets, which need not be its own."""
     from astropolcal.calibration import Calibration
 
-    for option in ("instrument", *MODEL):
+    for option in ("instrument", *common.MODEL):
         if getattr(arguments, option):
             raise AstropolcalError(f"--{option}: the model is that of {path}; give one of them")
     calibration = Calibration.read(path)
-    records = [
-        _record(calibration, path, file, dataset)
-        for file, dataset in zip(files, datasets, strict=True)
-    ]
+    records = [_record(calibration, path, *pair) for pair in zip(files, datasets, strict=True)]
     # the very tables of the calibration: its fit need not be repeated
     hashes = [dataset.content_hash for dataset in datasets]
     if hashes == [r.content_hash for r in calibration.datasets] and not any(edits.values()):
         return calibration.with_observations(datasets), datasets, calibration.instrument
     chains = [calibration.chains[i].copy() for i in records]
-    return edit_chains(chains, **edits), datasets, calibration.instrument
+    return common.edit_chains(chains, **edits), datasets, calibration.instrument
 
 
 def _record(calibration, path, file, dataset):
@@ -190,11 +156,9 @@ def _record(calibration, path, file, dataset):
 
 
 def _write(diagnosis, content, arguments, instrument):
-    """Write what was asked for; return the names of the files."""
-    written = []
+    """Write what was asked for."""
     if arguments.json:
-        write_json(content, arguments.json)
-        written += [arguments.json] if arguments.json != "-" else []
+        common.write_json(content, arguments.json)
     if arguments.report:
         from astropolcal.gap.report import write_html
 
@@ -202,14 +166,11 @@ def _write(diagnosis, content, arguments, instrument):
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
-        written.append(arguments.report)
     if arguments.save:
         from astropolcal.gap._numbers import with_causes
 
         calibration = with_causes(diagnosis.improved, instrument=instrument)
         calibration.write(arguments.save, overwrite=True)
-        written.append(arguments.save)
-    return written
 
 
 def _figures(diagnosis):

@@ -12,12 +12,13 @@ from astropolcal.chain import stages
 from astropolcal.efficiency import demodulation, has_plate
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.optics import COORDINATES
-from astropolcal.scripts._common import give, printer, say_written, sky_position
+from astropolcal.scripts import _common as common
 from astropolcal.units import iso_date
 from astropolcal.words import counted
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
+_TITLE = "Polarimetric efficiency of {}"
 # from which efficiency on V is solved for, too
 _MODULATED = 0.1
 HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
@@ -67,16 +68,14 @@ def run(arguments):
     if not has_plate(chain):
         _any_modulation(arguments, instrument, chain, grid, settings)
         return
-    content = _table(arguments, instrument, chain, grid)
-    texts, best = [_table_text(content)] if tabulated else [], None
+    content, lines = _table(arguments, instrument, chain, grid)
+    best = None
     if planned:
-        best, found = _best(arguments, instrument, chain, grid)
-        content["best_derotator"] = found
-        texts.append(_best_text(found, instrument.name))
+        best, content["best_derotator"], words = _best(arguments, instrument, chain, grid)
+        lines = [*lines, "", *words] if tabulated else words
     if arguments.output:
         _draw(arguments, instrument, chain, grid, best)
-    give(arguments, ["\n\n".join(texts)], content)
-    say_written(printer(arguments), [path for path in (arguments.output, arguments.json) if path])
+    common.give(arguments, lines, content, arguments.output, arguments.json)
 
 
 def _chain(arguments):
@@ -137,25 +136,21 @@ def _any_modulation(arguments, instrument, chain, grid, settings):
         from astropolcal.plotting._style import save
         from astropolcal.plotting.efficiency import plot_efficiencies
 
-        save(plot_efficiencies(found, grid, title=_title(instrument)), arguments.output)
-    give(arguments, [_modulation_text(content)], content)
-    say_written(printer(arguments), [path for path in (arguments.output, arguments.json) if path])
+        figure = plot_efficiencies(found, grid, title=_TITLE.format(instrument.name))
+        save(figure, arguments.output)
+    words = f"Efficiencies of {counted(len(frames), 'frame')} of {instrument.name} "
+    words += "(del Toro Iniesta & Collados 2000)"
+    lines = _table_lines(words, " ", found.components, content)
+    common.give(arguments, lines, content, arguments.output, arguments.json)
 
 
-def _modulation_text(content):
-    lines = [
-        f"Efficiencies of {counted(content['n_frames'], 'frame')} of {content['instrument']} "
-        "(del Toro Iniesta & Collados 2000)",
-        "",
-        " " + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
+def _table_lines(title, corner, names, content):
+    """Return a table of efficiencies by wavelength with the names of its rows."""
+    rows = zip(names, content["efficiency"], strict=True)
+    return [
+        *(title, "", corner + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm"),
+        *(name + "".join(f"{value:z8.3f}" for value in row) for name, row in rows),
     ]
-    for name, row in zip(content["components"], content["efficiency"], strict=True):
-        lines.append(name + "".join(f"{value:8.3f}" for value in row))
-    return "\n".join(lines)
-
-
-def _title(instrument):
-    return f"Polarimetric efficiency of {instrument.name}"
 
 
 def _on_sky(instrument, chain, grid, arguments):
@@ -169,6 +164,7 @@ def _on_sky(instrument, chain, grid, arguments):
 
 
 def _table(arguments, instrument, chain, grid):
+    """Return the table of an instrument with a half-wave plate, and what is printed of it."""
     from astropolcal.efficiency import has_derotator, polarimetric_efficiency
 
     turns = has_derotator(chain)
@@ -183,7 +179,18 @@ def _table(arguments, instrument, chain, grid):
     content |= {f"{key}_deg": a.value for key, a in pointing.items()}
     # absent where there is none, not empty
     content |= {"derotator_deg": derotator} if turns else {}
-    return content | {"wavelength_nm": grid.to_value(u.nm)[rows], "efficiency": values}
+    content |= {"wavelength_nm": grid.to_value(u.nm)[rows], "efficiency": values}
+    where = "downstream of the internal source"
+    if pointing:
+        where = "at altitude {altitude_deg:g} deg, parallactic angle {parallactic_deg:g} deg"
+    corner, names = "", [""]
+    if turns:
+        corner, names = "derotator", [f"{angle:8.2f} " for angle in derotator]
+    title = f"{_TITLE.format(instrument.name)} {where.format_map(content)}"
+    lines = _table_lines(title, corner, names, content)
+    if np.max(values) >= _ABOVE_ONE:
+        lines.append("Above 1: optics before the analyzer add polarization of their own.")
+    return content, lines
 
 
 def _pointing(arguments, chain):
@@ -222,17 +229,23 @@ def _rows(wanted, grid):
 
 
 def _best(arguments, instrument, chain, grid):
-    """Return the best derotator offset, and the statements on it."""
+    """Return the best derotator offset, the statements on it, and the same in words."""
     from astropolcal.efficiency import best_derotator
+    from astropolcal.observations import pointing
 
-    altitude, parallactic = _track(arguments, instrument)
+    if not (arguments.target and arguments.night):
+        raise ParameterError("--target and --night belong together")
+    if instrument.location is None:
+        raise InstrumentError(f"{instrument.name}: its site is not known")
+    target = common.sky_position(arguments.target, "--target")
+    altitude, parallactic = pointing(target, _times(arguments.night), instrument.location)
     mode = _mode(arguments, instrument)
     best = best_derotator(chain, grid, altitude, parallactic, law=mode, instrument=instrument)
     # north of the zenith the angle passes 180 deg, and goes on at -180 deg
     turned = np.unwrap(parallactic.to_value(u.deg), period=360)
     # the offset whose worst moment is the best
     row = int(np.argmax(best.table["least"]))
-    return best, {
+    found = {
         "law": best.law,
         "offset_deg": best.offset.to_value(u.deg),
         "least": best.table["least"][row],
@@ -241,19 +254,21 @@ def _best(arguments, instrument, chain, grid):
         "altitude_deg": [altitude.value.min(), altitude.value.max()],
         "parallactic_deg": [turned.min(), turned.max()],
     }
-
-
-def _track(arguments, instrument):
-    """Return altitude and parallactic angle over the observation."""
-    from astropolcal.observations import pointing
-
-    if not (arguments.target and arguments.night):
-        raise ParameterError("--target and --night belong together")
-    location = instrument.location
-    if location is None:
-        raise InstrumentError(f"{instrument.name}: its site is not known")
-    target = sky_position(arguments.target, "--target")
-    return pointing(target, _times(arguments.night), location)
+    (low, high), (east, west) = found["altitude_deg"], found["parallactic_deg"]
+    return (
+        best,
+        found,
+        [
+            f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
+            f"{west:z.1f} deg",
+            f"Best derotator offset of {instrument.name}, {best.law} still: "
+            f"{found['offset_deg']:zg} deg",
+            "  efficiency over times, wavelengths and angles of polarization: least "
+            f"{found['least']:z.3f},",
+            f"  mean {found['mean']:z.3f}; with the worst offset the least is "
+            f"{found['least_of_any_offset']:z.3f}",
+        ],
+    )
 
 
 def _times(text):
@@ -279,7 +294,7 @@ def _draw(arguments, instrument, chain, grid, best=None):
     from astropolcal.plotting._style import save
     from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
-    title = _title(instrument)
+    title = _TITLE.format(instrument.name)
     if best is not None:
         title = f"{title}\ntarget {arguments.target}, {arguments.night}"
         save(plot_derotator_offsets(best, title=title), arguments.output)
@@ -290,34 +305,3 @@ def _draw(arguments, instrument, chain, grid, best=None):
     settings = {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
     settings |= {"instrument": instrument, "mode": _mode(arguments, instrument), "title": title}
     save(plot_polarimetric_efficiency(chain, grid, **pointing, **settings), arguments.output)
-
-
-def _table_text(content):
-    turns, where = "derotator_deg" in content, "downstream of the internal source"
-    if "altitude_deg" in content:
-        where = f"at altitude {content['altitude_deg']:g} deg, parallactic angle "
-        where += f"{content['parallactic_deg']:g} deg"
-    lines = [
-        f"Polarimetric efficiency of {content['instrument']} {where}",
-        "",
-        "derotator" * turns + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
-    ]
-    for i, row in enumerate(content["efficiency"]):
-        angle = f"{content['derotator_deg'][i]:8.2f} " if turns else ""
-        lines.append(angle + "".join(f"{value:z8.3f}" for value in row))
-    if np.max(content["efficiency"]) >= _ABOVE_ONE:
-        lines.append("Above 1: optics before the analyzer add polarization of their own.")
-    return "\n".join(lines)
-
-
-def _best_text(best, instrument):
-    (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]
-    return (
-        f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
-        f"{west:z.1f} deg\n"
-        f"Best derotator offset of {instrument}, {best['law']} still: {best['offset_deg']:zg} deg\n"
-        f"  efficiency over times, wavelengths and angles of polarization: least "
-        f"{best['least']:z.3f},\n"
-        f"  mean {best['mean']:z.3f}; with the worst offset the least is "
-        f"{best['least_of_any_offset']:z.3f}"
-    )

@@ -1,8 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal health``: how an instrument does, from all its calibrations."""
 
+from contextlib import suppress
+
+from astropolcal.exceptions import ParameterError
 from astropolcal.progress import in_one_thread
-from astropolcal.scripts._common import PAGES, check_suffix, give, printer, say_written, wrapped
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
 HELP = "what changed over all calibrations of an instrument, and what needs care"
@@ -34,22 +37,18 @@ def run(arguments):
 
     from astropolcal.pipeline import Library, health, write_health
 
-    check_suffix("--html", arguments.html, *PAGES)
+    common.check_suffix("--html", arguments.html, *common.PAGES)
     library = Library(arguments.library)
-    content = health(
-        library,
-        goal=arguments.goal,
-        max_age=None if arguments.max_age is None else arguments.max_age * u.day,
-        events=arguments.event or (),
-        now=arguments.date,
-    )
+    age = None if arguments.max_age is None else arguments.max_age * u.day
+    asked = {"goal": arguments.goal, "max_age": age, "events": arguments.event or ()}
+    content = health(library, now=arguments.date, **asked)
     if arguments.html:
         figures = [_figures(library, group, arguments.goal) for group in content["groups"]]
         write_health(content, arguments.html, figures=figures)
     lines = [line for group in content["groups"] for line in _group(group)]
     lines += [f"UNREADABLE  {name}: {reason}" for name, reason in content["unreadable"].items()]
-    give(arguments, [wrapped(line, indent=4) for line in lines], content)
-    say_written(printer(arguments), [path for path in (arguments.html, arguments.json) if path])
+    lines = [common.wrapped(line, indent=4) for line in lines]
+    common.give(arguments, lines, content, arguments.html, arguments.json)
 
 
 def _group(group):
@@ -66,17 +65,14 @@ def _group(group):
     lines += [f"  Changed: {one['words']}" for one in group["events"]]
     # what is but more probably constant than not is told with its probability
     sure = [one for one in group["courses"] if one["constant"] >= LIKELY]
-    steady = [one["what"] for one in sure]
-    lines += [f"  Constant: {', '.join(steady)}"] if steady else []
-    moved = [one["words"] for one in group["courses"] if one not in sure]
-    lines += [f"  Course: {words}" for words in moved]
+    lines += [f"  Constant: {', '.join(one['what'] for one in sure)}"] if sure else []
+    lines += [f"  Course: {one['words']}" for one in group["courses"] if one not in sure]
     lines += [f"  Left out: {words}" for words in group["left_out"]]
     return lines + [f"  Next: {words}" for words in group["next"]]
 
 
 def _figures(library, group, goal):
     """Return the figures of a group by caption, as data URIs."""
-    from astropolcal.exceptions import ParameterError
     from astropolcal.plotting import plot_history
     from astropolcal.plotting.parameters import draw_accuracies, embedded
 
@@ -84,10 +80,7 @@ def _figures(library, group, goal):
     entries = [entry for entry in library.entries if entry.name in names]
     found = {"Accuracy of each calibration": draw_accuracies(group, goal)} if entries else {}
     for one in group["courses"] if len(entries) > 1 else ():
-        try:
-            figure = plot_history(entries, [one["what"]], title=one["words"])
-        except ParameterError:
-            # more parameters than a figure holds; the courses are in the table
-            continue
-        found[one["words"]] = figure
+        # more parameters than a figure holds; the courses are in the table
+        with suppress(ParameterError):
+            found[one["words"]] = plot_history(entries, [one["what"]], title=one["words"])
     return {caption: embedded(figure) for caption, figure in found.items()}

@@ -1,13 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal info``: what a file holds, or what this installation can do."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import one_line, plain
-from astropolcal.scripts._common import following, give, printer, wrapped, written_lines
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
@@ -20,9 +21,7 @@ file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or 
 --instruments  list the instruments only
 --frame FILE Input  of a folder: which calibration holds for this frame, and why none of the others
 --context NAME  of a folder: the files of this context only
-@ full
---json FILE Output  write it for machines (- for stdout)
-@ quiet
+@ full json quiet
 """
 # columns by which a table is known, the more special first
 _TABLES = (
@@ -54,7 +53,7 @@ def run(arguments):
     if arguments.instruments:
         from astropolcal import instruments
 
-        printer(arguments)("\n".join(instruments.names()))
+        common.say(arguments, *instruments.names())
         return
     if path is None:
         lines, content = _installation()
@@ -65,15 +64,15 @@ def run(arguments):
     elif Path(path).suffix.lower() == ".asdf":
         lines, content = _calibration(path, arguments)
     # a FITS file, or one that by its name claims to be one
-    elif str(path).lower().endswith(_FITS_NAMES) or _begins(path, b"SIMPLE  ="):
+    elif str(path).lower().endswith(_FITS_NAMES) or common.begins(path, b"SIMPLE  ="):
         lines, content = _wrapped(*describe_fits(path))
     else:
         lines, content = _table(path)
-    give(arguments, lines, content)
+    common.give(arguments, lines, content)
 
 
 def _wrapped(lines, content):
-    return [wrapped(line, indent=4) for line in lines], content
+    return [common.wrapped(line, indent=4) for line in lines], content
 
 
 def _installation():
@@ -90,7 +89,7 @@ def _installation():
     }
     lines = [f"astropolcal {version}"]
     for key in ("instruments", "optics", "observables"):
-        lines.append(wrapped(f"  {key + ':':<13}{', '.join(content[key])}", indent=15))
+        lines.append(common.wrapped(f"  {key + ':':<13}{', '.join(content[key])}", indent=15))
     return lines, content
 
 
@@ -115,7 +114,7 @@ def _calibration(path, arguments):
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
     content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
     lines, content = _wrapped(lines, content)
-    last, found = written_lines([arguments.json]), calibration.verdict()
+    last, found = common.written_lines([arguments.json]), calibration.verdict()
     if arguments.full:
         # its end is what stays on the screen
         return [calibration.summary(full=True), "", *lines, "", *found.words, *last], content
@@ -175,20 +174,12 @@ def _percent(value):
     return f"{value:.3f} %" if value == value else "-"
 
 
-def _begins(path, mark, unknown=False):
-    """Return whether a file begins so; what cannot be opened its reader says."""
-    try:
-        with open(path, "rb") as stream:
-            return stream.read(len(mark)) == mark
-    except OSError:
-        return unknown
-
-
 def _table(path):
     """Return what an ECSV table holds: beam fluxes, or something else."""
     from astropolcal.observations.reading import read_ecsv
 
-    if not _begins(path, b"# %ECSV", unknown=True):
+    # what cannot be opened its reader says
+    if os.access(path, os.R_OK) and not common.begins(path, b"# %ECSV"):
         raise ObservationError(
             f"{path}: info takes a calibration (.asdf), a folder of them, an ECSV table, or a FITS "
             "cube or product; this is none of them"
@@ -196,7 +187,16 @@ def _table(path):
     table = read_ecsv(path)
     if _OBSERVED & set(table.colnames) or {"frame", "flux"} <= set(table.colnames):
         return _observations(path)
-    return _wrapped(*_other_table(path, table))
+    kind = next((words for names, words in _TABLES if names <= set(table.colnames)), "table")
+    units = {name: str(getattr(table[name], "unit", None) or "") for name in table.colnames}
+    columns = ", ".join(f"{name} ({unit})" if unit else name for name, unit in units.items())
+    size = f"{counted(len(table), 'row')} x {counted(len(units), 'column')}"
+    lines, meta = [f"{path}: {kind}, {size}", f"  columns: {columns}"], _told(table.meta)
+    for key, value in meta.items():
+        words = ", ".join(map(str, value)) if isinstance(value, list) else value
+        lines.append(f"  {key}: {words}")
+    content = {"file": str(path), "type": kind, "n_rows": len(table), "columns": units}
+    return _wrapped(lines, content | {"meta": meta})
 
 
 def _observations(path):
@@ -221,29 +221,8 @@ def _observations(path):
         "wavelength_nm": observations.wavelength.to_value(u.nm),
         "content_hash": observations.content_hash,
     }
-    lines = [*observations.summary().splitlines(), f"Next: {following('calibrate', path)}"]
-    return [wrapped(line, indent=2) for line in lines], content
-
-
-# ---- tables ---------------------------------------------------------------------------------
-
-
-def _other_table(path, table):
-    """Return text and JSON content of a table that holds no beam fluxes."""
-    kind = next((words for names, words in _TABLES if names <= set(table.colnames)), "table")
-    units = {name: str(getattr(table[name], "unit", None) or "") for name in table.colnames}
-    columns = ", ".join(f"{name} ({unit})" if unit else name for name, unit in units.items())
-    meta = _told(table.meta)
-    lines = [
-        f"{path}: {kind}, {counted(len(table), 'row')} x {counted(len(units), 'column')}",
-        f"  columns: {columns}",
-        *(
-            f"  {key}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
-            for key, value in meta.items()
-        ),
-    ]
-    content = {"file": str(path), "type": kind, "n_rows": len(table), "columns": units}
-    return lines, content | {"meta": meta}
+    lines = [*observations.summary().splitlines(), f"Next: {common.following('calibrate', path)}"]
+    return [common.wrapped(line, indent=2) for line in lines], content
 
 
 def _told(values):
@@ -272,7 +251,7 @@ def describe_fits(path):
         # a product says in its first header what it is
         header = hdus[0].header
         if header.get("CONTENT") != PRODUCT:
-            return _describe_frame(path, header, [_hdu(hdu) for hdu in hdus])
+            return _describe_frame(path, header, [_hdu(each.name, each.header) for each in hdus])
     return _describe_product(path, Corrected.read(path))
 
 
@@ -320,13 +299,12 @@ def _describe_product(path, product):
     return lines, content
 
 
-def _hdu(hdu):
+def _hdu(name, header):
     """Return name, shape, type and unit of one HDU, read from its header alone."""
-    header = hdu.header
     # FITS counts the fastest axis first, numpy last
     shape = [int(header.get(f"NAXIS{i}", 0)) for i in range(int(header.get("NAXIS", 0)), 0, -1)]
     unit = str(header.get("BUNIT", ""))
-    return {"name": hdu.name, "shape": shape, "bits": header.get("BITPIX"), "unit": unit}
+    return {"name": name, "shape": shape, "bits": header.get("BITPIX"), "unit": unit}
 
 
 def _describe_frame(path, header, hdus):
@@ -351,7 +329,6 @@ def _short(value):
 def _known_frame(path, header, hdus):
     """Return the instrument of a file, what it reads in the header, and the kind of file."""
     from astropolcal import instruments
-    from astropolcal.exceptions import AstropolcalError
     from astropolcal.reduction.headers import read_header, tracking_error
 
     shapes = {tuple(hdu["shape"]) for hdu in hdus}

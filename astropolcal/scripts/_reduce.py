@@ -11,21 +11,12 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
+from astropolcal.scripts import _common as common
 from astropolcal.scripts._archive import is_archive, run_archive
-from astropolcal.scripts._common import (
-    check_suffix,
-    cube_files,
-    ending,
-    following,
-    number_or,
-    printer,
-    show,
-    with_ending,
-    write_json,
-    written_lines,
-)
 from astropolcal.words import counted
 
+# options that `reduce_run` calls the same
+_PASSED_ON = ("source", "raw", "dark", "flat", "workers", "cluster", "resume", "hwp_sequence")
 # a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
 
@@ -77,34 +68,34 @@ def _pair(text):
     return key.strip(), value.strip()
 
 
-TYPES = {"pair": _pair, "radius": number_or("fwhm", "growth")}
+TYPES = {"pair": _pair, "radius": common.number_or("fwhm", "growth")}
 
 
 def run(arguments):
-    """Reduce the cubes and write the table."""
-    from astropolcal import instruments
-    from astropolcal.reduction import reduce_run
-
+    """Reduce the cubes, or the archive, and write the table."""
     _options(arguments)
     if is_archive(arguments, ("resume", "quicklook")):
         return run_archive("reduce", arguments)
-    check_suffix("-o", arguments.output, ".ecsv")
-    files = cube_files(arguments.cubes)
-    instrument = instruments.get(arguments.instrument or _recognized(files))
-    reduction = reduce_run(
-        files,
-        instrument,
-        source=arguments.source,
-        raw=arguments.raw,
-        dark=arguments.dark,
-        flat=arguments.flat,
-        meta=dict(arguments.meta),
-        workers=arguments.workers,
-        cluster=arguments.cluster,
-        resume=arguments.resume,
-        hwp_sequence=arguments.hwp_sequence,
-        **_options(arguments),
-    )
+    common.check_suffix("-o", arguments.output, ".ecsv")
+    return work(arguments)
+
+
+def work(arguments):
+    """Reduce the cubes of one table."""
+    from astropolcal import instruments
+    from astropolcal.fitscheck import primary_header
+    from astropolcal.pipeline.headers import describe
+    from astropolcal.reduction import reduce_run
+
+    files, name = common.cube_files(arguments.cubes), arguments.instrument
+    # all are of one run; those that cannot be read are told of later
+    for path in files[:5] if name is None else ():
+        with suppress(AstropolcalError):
+            name = describe(primary_header(path), stated=("date", "mode"))["instrument"]
+            break
+    instrument = instruments.get(name or "charis")
+    passed = {name: getattr(arguments, name) for name in _PASSED_ON} | _options(arguments)
+    reduction = reduce_run(files, instrument, meta=dict(arguments.meta), **passed)
     reduction.write(arguments.output, overwrite=True)
     # after the table, which is what the time went into
     figures = []
@@ -114,21 +105,8 @@ def run(arguments):
         figures = save_quicklook(reduction, arguments.quicklook)
     if arguments.json:
         summary = {"output": str(arguments.output)} | reduction.summary()
-        write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
+        common.write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
     _report(reduction, arguments, figures)
-    return 0
-
-
-def _recognized(files):
-    """Return the name of the instrument that one of the first headers names."""
-    from astropolcal.fitscheck import primary_header
-    from astropolcal.pipeline.headers import describe
-
-    # all are of one run; those that cannot be read are told of later
-    for path in files[:5]:
-        with suppress(AstropolcalError):
-            return describe(primary_header(path), stated=("date", "mode"))["instrument"]
-    return "charis"
 
 
 def _options(arguments):
@@ -151,21 +129,16 @@ def _report(reduction, arguments, figures):
     """Say what was done on stdout, and what was left out on stderr."""
     for path, why in list(reduction.problems.items())[:_MAX_LISTED]:
         line = one_line(f"{Path(path).name}: {'; '.join(why)}", None)
-        show(f"astropolcal: left out: {line}", file=sys.stderr)
+        common.show(f"astropolcal: left out: {line}", file=sys.stderr)
     # on stderr also with -q: what was lost is a warning
     more = len(reduction.problems) - _MAX_LISTED
     if more > 0:
         words = f"{counted(more, 'more file')} (--json lists all)"
-        show(f"astropolcal: left out: {words}", file=sys.stderr)
+        common.show(f"astropolcal: left out: {words}", file=sys.stderr)
     # in the order of the files
     doubts = Counter(reason for reasons in reduction.doubts.values() for reason in reasons)
     for why, count in doubts.items():
-        show(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
-    printer(arguments)("\n".join(_words(reduction, arguments, figures)))
-
-
-def _words(reduction, arguments, figures):
-    """Return what is masked, and the summary."""
+        common.show(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
     summary, output = reduction.summary(), arguments.output
     n_masked, n_cells = summary["n_masked"], summary["n_cells"]
     lost = n_masked == n_cells
@@ -176,16 +149,16 @@ def _words(reduction, arguments, figures):
     if told:
         verdict += ("; " if lost else ": ") + ", ".join(told)
     masked = f"{n_masked} of {counted(n_cells, 'cell')} masked"
-    ends = ending(
+    ends = common.ending(
         verdict,
         _accuracy(reduction.table),
         f"{counted(summary['n_frames'], 'frame')}, {masked}",
-        "astropolcal info FILE tells of a cube" if lost else following("calibrate", output),
-        written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
+        "astropolcal info FILE tells of a cube" if lost else common.following("calibrate", output),
+        common.written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
     )
     flags = summary["flags"].items()
     body = [f"  masked, {reason}: {counted(count, 'cell')}" for reason, count in flags]
-    return with_ending(body, ends, arguments.full)
+    common.say(arguments, *common.with_ending(body, ends, arguments.full))
 
 
 def _accuracy(table):

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal sample``: samples of the posterior of a calibration's parameters."""
 
-import argparse
 import sys
 import warnings
 from pathlib import Path
@@ -9,18 +8,7 @@ from pathlib import Path
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.progress import in_one_thread
-from astropolcal.scripts._common import (
-    check_suffix,
-    is_quiet,
-    printer,
-    read_datasets,
-    show,
-    with_ending,
-    wrapped,
-    write_calibration,
-    written_calibration,
-)
-from astropolcal.units import plain_number
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
 HELP = "sample the posterior of a calibration's parameters"
@@ -59,35 +47,34 @@ files FILE + Input  the tables that it was made from (ECSV)
 DEFAULTS = {"may_replace": {"output": "calibration"}}
 
 
-def _burn_in(text):
-    """Return a number of steps; None for ``auto``."""
-    if text == "auto":
-        return None
-    try:
-        return plain_number(text, int)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor auto") from None
-
-
-TYPES = {"burn_in": _burn_in}
+TYPES = {"burn_in": common.number_or("auto", kind=int)}
 
 
 @in_one_thread
 def run(arguments):
     """Sample, print what came out and write what was asked for."""
     from astropolcal.calibration import Calibration
+    from astropolcal.calibration.posterior import LogPosterior
+    from astropolcal.calibration.posterior.samples import need
 
-    say = printer(arguments)
-    check_suffix("-o", arguments.output, ".asdf")
+    common.check_suffix("-o", arguments.output, ".asdf")
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
     # recognized by content, so that their order does not matter
-    calibration = calibration.with_observations(read_datasets(arguments.files))
-    _check_run(calibration, arguments)
+    tables = common.read_datasets(arguments.files)
+    calibration = calibration.with_observations(tables)
+    # names of parameters that are wrong, then packages that are missing, are refused at once
+    if arguments.parameters:
+        LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)
+    need("emcee", "sampling")
+    # the summary comes last, and must not fail after hours
+    need("arviz_stats.base", "the summary of a posterior")
+    if arguments.checkpoint:
+        need("h5py", "a checkpoint")
     calibration.posterior = _sample(calibration, arguments)
     # first the files: a reader of our words may have gone in the meantime
-    written = write_calibration(calibration, arguments, calibration.to_dict)
-    say(_words(calibration, arguments, written))
+    written = common.write_calibration(calibration, arguments, calibration.to_dict)
+    common.say(arguments, *_words(calibration, arguments, written))
 
 
 def _check_options(arguments):
@@ -103,26 +90,12 @@ def _check_options(arguments):
         )
 
 
-def _check_run(calibration, arguments):
-    """Refuse names of parameters that are wrong, then packages that are missing."""
-    from astropolcal.calibration.posterior import LogPosterior
-    from astropolcal.calibration.posterior.samples import need
-
-    if arguments.parameters:
-        LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)
-    need("emcee", "sampling")
-    # the summary comes last, and must not fail after hours
-    need("arviz_stats.base", "the summary of a posterior")
-    if arguments.checkpoint:
-        need("h5py", "a checkpoint")
-
-
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
     try:
         with warnings.catch_warnings():
-            if not is_quiet(arguments):
+            if not common.is_quiet(arguments):
                 # the summary says the same
                 warnings.filterwarnings("ignore", message="the chain (is|has)")
             return sample(
@@ -130,7 +103,7 @@ def _sample(calibration, arguments):
                 parameters=arguments.parameters,
                 n_walkers=arguments.walkers,
                 n_steps=arguments.steps,
-                burn_in=arguments.burn,
+                burn_in=None if arguments.burn == "auto" else arguments.burn,
                 seed=arguments.seed,
                 checkpoint=arguments.checkpoint,
                 # as for all commands, and not at all where that is not wanted
@@ -143,7 +116,7 @@ def _sample(calibration, arguments):
         raise FitError(words) from error
     except KeyboardInterrupt:
         if arguments.checkpoint and Path(arguments.checkpoint).exists():
-            show(
+            common.show(
                 f"astropolcal: the steps so far are in {one_line(arguments.checkpoint, None)}; the "
                 "same command with --resume goes on",
                 file=sys.stderr,
@@ -158,17 +131,16 @@ def _words(calibration, arguments, written):
     if complaints:
         words[0] = shortened(f"NOT CONVERGED: {complaints[0]}")
         words[-1] = "Next        more --steps; with --checkpoint FILE.h5, --resume goes on from it"
-    ends = [*words, *written_calibration(arguments, written)]
-    return "\n".join(with_ending(_table(posterior), ends, arguments.full))
+    return common.with_ending(_table(posterior), [*words, *written], arguments.full)
 
 
 def _table(posterior):
     """Return what is common to all wavelengths as a table, and the run in words."""
     parameters = posterior.report()["parameters"]
     # values of a wavelength end in [i]; hundreds of them do not fit a terminal
-    common = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
+    alike = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
     # if only such values varied, they are all there is
-    shown = common or parameters
+    shown = alike or parameters
     width = max(map(len, shown)) + 2
     lines = [" " * width + "".join(f"{text:>11}" for text in _COLUMNS)]
     for name, entry in shown.items():
@@ -181,5 +153,5 @@ def _table(posterior):
         lines.append(
             f"{counted(rest, 'value')} given per wavelength {are} in the file and in the JSON"
         )
-    lines += ["", *(wrapped(line, indent=2) for line in posterior.words().splitlines())]
+    lines += ["", *(common.wrapped(line, indent=2) for line in posterior.words().splitlines())]
     return lines

@@ -1,16 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
+from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
-from astropolcal.scripts._common import (
-    check_suffix,
-    edit_chains,
-    entries,
-    option,
-    printer,
-    write_json,
-)
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
 #: What the packaged example was made with.
@@ -52,7 +46,7 @@ _IMAGES = """
 """
 _USUAL = {
     flags[0].removeprefix("--").replace("-", "_"): settings.get("default", False)
-    for flags, settings in (option(entry, {}) for entry in entries(_IMAGES))
+    for flags, settings in (common.option(entry, {}) for entry in common.entries(_IMAGES))
 }
 OPTIONS = f"""
 -o --output OBS.ecsv Output  the table (required without --cubes; with it, the true fluxes);
@@ -85,41 +79,63 @@ OPTIONS = f"""
 def run(arguments):
     """Simulate and write the table, the cubes or both."""
     from astropolcal import instruments
+    from astropolcal.reduction import DetectorModel, ImageModel, simulate_cubes
+    from astropolcal.reduction.cubes import _usual_flux, true_observations
+    from astropolcal.simulation import simulate
 
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
-    check_suffix("-o", arguments.output, ".ecsv")
-    _check_images(arguments)
+    common.check_suffix("-o", arguments.output, ".ecsv")
+    for name, default in _USUAL.items():
+        if not arguments.cubes and getattr(arguments, name) != default:
+            raise AstropolcalError(f"--{name.replace('_', '-')}: is for --cubes DIR")
     instrument = instruments.get(arguments.instrument)
     chain, wavelength, meta = _truth(arguments, instrument)
     # free and prior mean nothing for what is true
-    (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
+    (chain,) = common.edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
+    image = ImageModel(**{name: getattr(arguments, name) for name in _IMAGE})
+    scene = {"wavelength": wavelength, "source": arguments.source}
     if arguments.flux is None:
-        arguments.flux = _flux(arguments, instrument, chain, wavelength, frames)
-    # of the set-up, less the optics taken out
-    meta = meta | instrument.meta_without(arguments.without) | {"simulated": True}
-    observations = _table(arguments, instrument, chain, wavelength, frames, meta)
+        arguments.flux = EXAMPLE["flux"]
+        if arguments.cubes:
+            place = {"image": image, "background": arguments.background}
+            arguments.flux = _usual_flux(
+                chain, instrument, frames, EXAMPLE["flux"], **scene, **place
+            )
+    given = {name: getattr(arguments, name) for name in ("seed", "flux", "gain", "read_noise")}
+    options = given | {
+        # beside cubes the table is the truth that a reduction must find again
+        "noise": not (arguments.no_noise or arguments.cubes),
+        # of the set-up, less the optics taken out
+        "meta": meta | instrument.meta_without(arguments.without) | {"simulated": True},
+        "name": "simulated",
+    }
+    if arguments.source == "internal":
+        observations = simulate(chain, wavelength, frames, **options)
+    else:
+        observations = true_observations(chain, instrument, frames, **scene, **options)
     written = []
     if arguments.cubes:
-        paths = _write_cubes(arguments, instrument, chain, wavelength, frames)
+        response = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
+        detector = DetectorModel(noise=not arguments.no_noise, **response)
+        options = {"image": image, "detector": detector, "flux": arguments.flux} | scene
+        options["seed"] = arguments.seed
+        paths = simulate_cubes(arguments.cubes, chain, instrument, frames, **options)
         written.append(f"{one_line(arguments.cubes, None)} ({counted(len(paths), 'cube')})")
     if arguments.output:
         observations.write(arguments.output, overwrite=True)
         size = counted(observations.n_frames, "frame"), counted(observations.n_bins, "wavelength")
         written.append(f"{one_line(arguments.output, None)} ({' x '.join(size)})")
-    if arguments.json:
-        write_json(_summary(observations, arguments), arguments.json)
-    printer(arguments)(f"Written: {', '.join(written)}")
-
-
-def _check_images(arguments):
-    """Refuse options of image cubes where none are made."""
-    if arguments.cubes:
-        return
-    for name, default in _USUAL.items():
-        if getattr(arguments, name) != default:
-            raise AstropolcalError(f"--{name.replace('_', '-')}: is for --cubes DIR")
+    content = {
+        "output": arguments.output and str(arguments.output),
+        "cubes": arguments.cubes and str(arguments.cubes),
+        "source": arguments.source,
+        "n_frames": observations.n_frames,
+        "n_wavelengths": observations.n_bins,
+        "content_hash": observations.content_hash,
+    }
+    common.give(arguments, [f"Written: {', '.join(written)}"], content | given)
 
 
 def _frames(arguments, chain):
@@ -127,7 +143,6 @@ def _frames(arguments, chain):
     import astropy.units as u
     import numpy as np
 
-    from astropolcal.chain import stages
     from astropolcal.reduction.cubes import both_states
     from astropolcal.simulation import half_wave_plate_cycles
 
@@ -147,66 +162,6 @@ def _frames(arguments, chain):
             frames[name] = np.linspace(ends[0], ends[-1], len(frames)) * u.deg
     # a modulator alternates within each setting of the plate
     return both_states(frames) if "flc_state" in stages(chain) else frames
-
-
-def _flux(arguments, instrument, chain, wavelength, frames):
-    """Return the flux where none is given."""
-    if not arguments.cubes:
-        return EXAMPLE["flux"]
-    from astropolcal.reduction.cubes import _usual_flux
-
-    return _usual_flux(
-        chain,
-        instrument,
-        frames,
-        EXAMPLE["flux"],
-        wavelength=wavelength,
-        source=arguments.source,
-        image=_image(arguments),
-        background=arguments.background,
-    )
-
-
-def _image(arguments):
-    from astropolcal.reduction import ImageModel
-
-    return ImageModel(**{name: getattr(arguments, name) for name in _IMAGE})
-
-
-def _table(arguments, instrument, chain, wavelength, frames, meta):
-    """Return the table: with noise, or beside cubes the true fluxes."""
-    from astropolcal.reduction.cubes import true_observations
-    from astropolcal.simulation import simulate
-
-    options = {
-        **{name: getattr(arguments, name) for name in ("flux", "gain", "read_noise", "seed")},
-        # beside cubes the table is the truth that a reduction must find again
-        "noise": not (arguments.no_noise or arguments.cubes),
-        "meta": meta,
-        "name": "simulated",
-    }
-    if arguments.source == "internal":
-        return simulate(chain, wavelength, frames, **options)
-    options |= {"wavelength": wavelength, "source": "star"}
-    return true_observations(chain, instrument, frames, **options)
-
-
-def _write_cubes(arguments, instrument, chain, wavelength, frames):
-    from astropolcal.reduction import DetectorModel, simulate_cubes
-
-    options = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
-    return simulate_cubes(
-        arguments.cubes,
-        chain,
-        instrument,
-        frames,
-        wavelength=wavelength,
-        source=arguments.source,
-        flux=arguments.flux,
-        image=_image(arguments),
-        detector=DetectorModel(noise=not arguments.no_noise, **options),
-        seed=arguments.seed,
-    )
 
 
 def _truth(arguments, instrument):
@@ -229,8 +184,6 @@ def _truth(arguments, instrument):
 
 def _behind_telescope(chain, instrument, wavelength):
     """Return the chain with star and telescope in the place of the internal source."""
-    from astropolcal.chain import join, leaves, stages
-
     # a calibration of stars has its telescope already
     if "parallactic" in stages(chain):
         return chain
@@ -240,15 +193,3 @@ def _behind_telescope(chain, instrument, wavelength):
     star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
     # the telescope as published, behind a star of its own polarization
     return join([star, *leaves(instrument.on_sky(chain))])
-
-
-def _summary(observations, arguments):
-    return {
-        "output": arguments.output and str(arguments.output),
-        "cubes": arguments.cubes and str(arguments.cubes),
-        "source": arguments.source,
-        "n_frames": observations.n_frames,
-        "n_wavelengths": observations.n_bins,
-        "content_hash": observations.content_hash,
-        **{name: getattr(arguments, name) for name in ("seed", "flux", "gain", "read_noise")},
-    }

@@ -6,8 +6,7 @@ import math
 import astropy.units as u
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import give, sky_position, wrapped
-from astropolcal.units import plain_number
+from astropolcal.scripts import _common as common
 from astropolcal.words import counted, did_you_mean
 
 HELP = "list polarimetric standard stars and when they are observable"
@@ -29,9 +28,8 @@ name NAME ?  a star, such as 'HD 293396'
 --night YYYY-MM-DD  date of the evening at the site
 --min-altitude DEG float =30  lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
---json FILE Output  write it for machines (- for stdout)
 --plot FILE Output  draw altitude and parallactic angle over the night
-@ online quiet
+@ json online quiet
 """
 # R, J, H and K, for what a calibration assumes of a star
 _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
@@ -58,7 +56,7 @@ def run(arguments):
         from astropolcal.plotting._style import save
 
         save(plot_observability(seen, total=total), arguments.plot)
-    give(arguments, lines, content)
+    common.give(arguments, lines, content)
 
 
 def _check(arguments):
@@ -88,9 +86,25 @@ def _one(arguments):
     if arguments.night is None:
         return lines, content, [], 1
     seen = _observability(star.name, arguments)
-    content |= {"site": arguments.site, "night": seen.night} | _angles(seen)
-    lines += ["", f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg"]
-    return lines + _night_lines(seen, content), content, [seen], 1
+    (low, high), (first, last) = seen.altitude.value, seen.parallactic.value
+    content |= {"site": arguments.site, "night": seen.night, "hours": seen.hours.value}
+    content |= {"transit": seen.transit.iso, "altitude_deg": [low, high]}
+    content |= {"parallactic_deg": [first, last]}
+    # of 32 frames, as in the table of a night
+    content["m3_error"] = seen.information(32).diattenuation
+    # hours and minutes of an ISO time
+    start, end = (seen.table["time"][seen.table["observable"]][i].iso[11:16] for i in (0, -1))
+    lines += [
+        "",
+        f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg",
+        f"  observable   {start} to {end} UTC, {content['hours']:.1f} h",
+        f"  highest      {seen.transit.iso[:16]} UTC",
+        # the format z: what rounds to zero has no sign
+        f"  altitude     {low:z.1f} to {high:z.1f} deg",
+        f"  parallactic  {first:z.1f} to {last:z.1f} deg",
+        f"  M3 error     {_pair(content['m3_error'], '.3f')} of one frame's error (32 frames)",
+    ]
+    return lines, content, [seen], 1
 
 
 def _observability(name, arguments):
@@ -113,69 +127,43 @@ def _describe(star, known):
     }
     facts = [f"  {name:<11} {words}" for name, words in facts.items() if words]
     lines = [f"{star.name}: {star.kind} standard star"]
-    lines += [wrapped(fact, indent=14) for fact in facts]
-    lines += [*_law_lines(star), *_known_lines(known)]
+    lines += [common.wrapped(fact, indent=14) for fact in facts]
+    if star.law is not None:
+        lines += ["", f"  Serkowski law ({star.law_reference})"]
+    units = {"p_max": " %", "lambda_max": " um", "K": "", "theta": " deg"}
+    for name, unit in units.items() if star.law is not None else ():
+        value, error = getattr(star.law, name).value, star.law_errors.get(name)
+        value = 100 * value if name == "p_max" else value
+        spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
+        lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
+    if known is not None:
+        lines += ["", "  In a calibration"]
+        for row in known["stokes"]:
+            degree = f"{_pair(row['p_percent'], '.2f', row['p_err_percent'])} %"
+            what = f"q, u {degree}"
+            if row["theta_deg"] is not None:
+                angle = _pair(row["theta_deg"], ".1f", row["theta_err_deg"])
+                what = f"p {degree}, theta {angle} deg"
+            lines.append(f"    {row['wavelength_um']:.2f} um   {what}")
+        lines += [common.wrapped(f"    - {words}", indent=6) for words in known["words"]]
     if len(star.polarization):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]
-    lines += [_measurement(row) for row in star.polarization]
+    for row in star.polarization:
+        mark = " " if row["checked"] else "*"
+        degree = _pair(row["p"].value, ".3f", row["p_err"].value)
+        angle = _pair(row["theta"].value, ".1f", row["theta_err"].value)
+        text = f"{mark} {row['band']:<8}  {row['wavelength'].value:.2f}   {degree:<13} {angle:<13}"
+        lines.append(f"{text} {row['reference']}")
     if not star.checked:
         lines.append("  * partly from memory: compare with the source before use")
     return lines
 
 
-def _law_lines(star):
-    if star.law is None:
-        return []
-    lines = ["", f"  Serkowski law ({star.law_reference})"]
-    units = {"p_max": " %", "lambda_max": " um", "K": "", "theta": " deg"}
-    for name, unit in units.items():
-        value, error = getattr(star.law, name).value, star.law_errors.get(name)
-        value = 100 * value if name == "p_max" else value
-        spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
-        lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
-    return lines
-
-
-def _known_lines(known):
-    if known is None:
-        return []
-    lines = ["", "  In a calibration"]
-    for row in known["stokes"]:
-        degree = f"{_pair(row['p_percent'], row['p_err_percent'], '.2f')} %"
-        what = f"q, u {degree}"
-        if row["theta_deg"] is not None:
-            what = f"p {degree}, theta {_pair(row['theta_deg'], row['theta_err_deg'], '.1f')} deg"
-        lines.append(f"    {row['wavelength_um']:.2f} um   {what}")
-    return lines + [wrapped(f"    - {words}", indent=6) for words in known["words"]]
-
-
-def _measurement(row):
-    mark = " " if row["checked"] else "*"
-    degree = _pair(row["p"].value, row["p_err"].value, ".3f")
-    angle = _pair(row["theta"].value, row["theta_err"].value, ".1f")
-    where = row["wavelength"].value
-    return f"{mark} {row['band']:<8}  {where:.2f}   {degree:<13} {angle:<13} {row['reference']}"
-
-
-def _pair(value, error, form):
+def _pair(value, form, error=math.nan):
+    """Return a number with its error, as far as they are known."""
     if not math.isfinite(value):
         return "-"
     return f"{value:{form}}" + (f" +- {error:{form}}" if math.isfinite(error) else "")
-
-
-def _night_lines(seen, content):
-    # hours and minutes of an ISO time
-    start, end = (seen.table["time"][seen.table["observable"]][i].iso[11:16] for i in (0, -1))
-    low, high = content["altitude_deg"]
-    first, last = content["parallactic_deg"]
-    # the format z: what rounds to zero has no sign
-    return [
-        f"  observable   {start} to {end} UTC, {content['hours']:.1f} h",
-        f"  highest      {seen.transit.iso[:16]} UTC",
-        f"  altitude     {low:z.1f} to {high:z.1f} deg",
-        f"  parallactic  {first:z.1f} to {last:z.1f} deg",
-        f"  M3 error     {_number(content['m3_error'], '.3f')} of one frame's error (32 frames)",
-    ]
 
 
 # ---- many stars ---------------------------------------------------------------------
@@ -185,15 +173,21 @@ def _many(arguments):
     from astropolcal import standards
 
     site = None if arguments.site is None else _site(arguments.site)
+    try:
+        given = arguments.magnitude
+        magnitude = None if given is None else common.numbers(given, 2)
+    except ValueError:
+        words = f"--magnitude {arguments.magnitude}: give 2 numbers with a comma between them"
+        raise ParameterError(words) from None
     radius = 15.0 if arguments.radius is None else arguments.radius
     near = {}
     if arguments.near:
-        near = {"center": sky_position(arguments.near, "--near"), "radius": radius * u.deg}
+        near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
     found = standards.search(
         **near,
         kind=arguments.kind,
         band=arguments.band,
-        magnitude=_numbers(arguments.magnitude, "--magnitude", 2),
+        magnitude=magnitude,
         site=site,
         night=arguments.night,
         min_altitude=arguments.min_altitude * u.deg,
@@ -251,7 +245,7 @@ def _table(found, band=None):
         hours = row["ra"].value / 15
         clock = f"{int(hours):02d} {60 * (hours % 1):04.1f}"
         away = f"  {row['separation'].value:5.1f}" if near else ""
-        degree = f"{_pair(row['p'].value, row['p_err'].value, '.3f'):<15}"
+        degree = f"{_pair(row['p'].value, '.3f', row['p_err'].value):<15}"
         mark = " " if _has_degree(row, band) else "*"
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+z6.1f}   "
@@ -268,7 +262,7 @@ def _night_table(found):
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:z2.0f} to "
             f"{high:z2.0f}  {first:z4.0f} to {last:z4.0f}  {row['hours'].value:4.1f} "
-            f"{_number(row['m3_error'], '6.3f'):>6}  {_number(row['m3_score'], '6.3f'):>6}"
+            f"{_pair(row['m3_error'], '6.3f'):>6}  {_pair(row['m3_score'], '6.3f'):>6}"
         )
     return [
         *lines,
@@ -282,10 +276,6 @@ def _night_table(found):
 def _magnitude(row):
     value = row["magnitude"].value
     return f"{value:4.1f} {row['magnitude_band']}" if math.isfinite(value) else "   -"
-
-
-def _number(value, form):
-    return f"{value:{form}}" if math.isfinite(value) else "-"
 
 
 # ---- machines -----------------------------------------------------------------------
@@ -329,30 +319,7 @@ def _row(row):
     }
 
 
-def _angles(seen):
-    return {
-        "hours": seen.hours.value,
-        "transit": seen.transit.iso,
-        "altitude_deg": seen.altitude.value,
-        "parallactic_deg": seen.parallactic.value,
-        # of 32 frames, as in the table of a night
-        "m3_error": seen.information(32).diattenuation,
-    }
-
-
 # ---- what the options mean ----------------------------------------------------------
-
-
-def _numbers(text, option, count):
-    if text is None:
-        return None
-    try:
-        values = tuple(plain_number(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise ParameterError(f"{option} {text}: give {count} numbers with commas between them")
-    return values
 
 
 def _site(text):
@@ -361,17 +328,14 @@ def _site(text):
 
     from astropolcal.standards.visibility import SITES, location
 
-    if "," not in text:
-        try:
-            return location(text)
-        except ParameterError:
-            raise ParameterError(
-                f"--site {text}: not known{did_you_mean(text, SITES)}; allowed are "
-                f"{', '.join(SITES)}, or LON,LAT,HEIGHT in deg, deg and m"
-            ) from None
-
-    lon, lat, height = _numbers(text, "--site", 3)
     try:
+        if "," not in text:
+            return location(text)
+        lon, lat, height = common.numbers(text, 3)
         return EarthLocation.from_geodetic(lon * u.deg, lat * u.deg, height * u.m)
     except ValueError as error:
-        raise ParameterError(f"--site {text}: {error}") from None
+        reason = error if "," in text else f"not known{did_you_mean(text, SITES)}"
+        raise ParameterError(
+            f"--site {text}: {reason}; allowed are {', '.join(SITES)}, or LON,LAT,HEIGHT in deg, "
+            "deg and m"
+        ) from None

@@ -45,11 +45,13 @@ class _OneLineParser(argparse.ArgumentParser):
     """
 
     def __init__(self, *arguments, **settings):
+        from astropolcal.units import plain_number
+
         super().__init__(*arguments, **settings)
         # argparse itself knows single numbers only, and takes a list for an unknown option
         self._negative_number_matcher = re.compile(r"-\.?\d")
         for kind in (float, int):
-            self.register("type", kind, partial(_number, kind))
+            self.register("type", kind, partial(plain_number, kind=kind))
 
     def parse_known_args(self, args=None, namespace=None):
         namespace, unknown = super().parse_known_args(args, namespace)
@@ -93,13 +95,6 @@ def _did_you_mean(text, known):
     from astropolcal.words import did_you_mean
 
     return did_you_mean(text, known)
-
-
-def _number(kind, text):
-    """Return the value of an option whose type is a number, which Python would read too gladly."""
-    from astropolcal.units import plain_number
-
-    return plain_number(text, kind)
 
 
 def build_parser():

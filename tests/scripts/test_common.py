@@ -30,17 +30,16 @@ from astropolcal.scripts._common import (
     Output,
     _normal,
     _value,
-    angles,
     check_paths,
     cube_files,
     edit_chains,
+    give,
     instrument_of,
     is_quiet,
     number_or,
-    printer,
+    numbers_type,
     read_datasets,
-    say_written,
-    show,
+    say,
     wrapped,
     write_json,
 )
@@ -211,7 +210,7 @@ def test_who_prints(capsys):
     ]:
         arguments = SimpleNamespace(quiet=quiet, json=to)
         assert is_quiet(arguments) == silent, (quiet, to, silent)
-        printer(arguments)("words")
+        say(arguments, "words")
         assert capsys.readouterr().out == ("" if silent else "words\n"), (quiet, to, silent)
 
 
@@ -235,9 +234,11 @@ def test_json_has_null_for_what_is_no_finite_number(capsys):
 
 
 def test_files_are_listed_a_line_each(capsys):
-    say_written(show, ["a.asdf", "b\n\x1b[2J.json"])
-    say_written(show, [])
-    assert capsys.readouterr().out == "\nWritten: a.asdf\n         b ?[2J.json\n"
+    arguments = SimpleNamespace(quiet=False, json=None)
+    give(arguments, ["words"], {}, "a.asdf", None, "b\n\x1b[2J.json", "-")
+    give(arguments, ["words"], {}, None)
+    written = "\nWritten:    a.asdf\nWritten:    b ?[2J.json\n"
+    assert capsys.readouterr().out == f"words\n{written}words\n"
 
 
 def test_lines_break_at_80_columns_and_words_stay_whole():
@@ -252,10 +253,14 @@ def test_lines_break_at_80_columns_and_words_stay_whole():
 
 
 def test_lists_of_angles():
+    angles = numbers_type("a list of angles in degree")
     assert angles("0,22.5,-45") == [0.0, 22.5, -45.0]
-    for text in ("", "0,", "a", "0;45"):
+    for text in ("", "0,", "a", "0;45", "0,nan"):
         with pytest.raises(argparse.ArgumentTypeError, match="is not a list of angles in degree"):
             angles(text)
+    assert numbers_type("X,Y", 2)("69.9, 1e2") == [69.9, 100.0]
+    with pytest.raises(argparse.ArgumentTypeError, match="'7' is not X,Y"):
+        numbers_type("X,Y", 2)("7")
 
 
 def test_words_or_a_number():
@@ -396,7 +401,7 @@ def test_bad_edits(chains):
         ({"fix": ["hwp.w_sio2=-1mm"]}, ParameterError, r"allowed is 0\.980388 to 2\.287572 mm"),
         ({"fix": ["hwp.theta=nan"]}, ParameterError, "hwp.theta=nan: not a number"),
         ({"prior": ["hwp.theta"]}, ParameterError, r"prior hwp.theta=: write it as MEAN\+-STD"),
-        ({"prior": ["hwp.theta=0+-1s"]}, ParameterError, "must be convertible to deg"),
+        ({"prior": ["hwp.theta=0+-1s"]}, ParameterError, "its unit is not convertible to deg"),
         ({"prior": ["hwp.theta=x+-1"]}, ParameterError, "hwp.theta=x: not a number"),
     ]:
         with pytest.raises(error, match=words):

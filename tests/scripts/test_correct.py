@@ -31,7 +31,6 @@ from astropolcal.scripts import _correct
 from astropolcal.scripts._correct import (
     _WAYS,
     _middle,
-    _point,
     _position_angles,
     choose_calibration,
 )
@@ -396,11 +395,6 @@ def test_pupil_needs_the_parallactic_angle():
         _position_angles(QTable({"hwp": [0.0] * u.deg}), arguments)
 
 
-def test_place_of_a_star():
-    for text, place in [("70,85", (70.0, 85.0)), ("69.9, 1e2", (69.9, 100.0))]:
-        assert _point(text) == place, (text, place)
-
-
 # ---- the report --------------------------------------------------------------------------
 
 
@@ -427,7 +421,7 @@ def test_middle_of_numbers():
         assert _middle(np.array(values, dtype=float), ".4f", "") == words, (values, words)
 
 
-def test_report_has_units(capsys):
+def test_report_has_units():
     for systematic, words in [
         (None, "not known"),
         (SimpleNamespace(is_open=False), "not known"),
@@ -443,8 +437,7 @@ def test_report_has_units(capsys):
             "aperture": aperture,
         }  # fmt: skip
         outputs = {"output": "o.fits", "spectrum": None, "plot": None, "json": "-", "full": False}
-        _correct._report(summary, systematic, SimpleNamespace(**outputs))
-        lines = capsys.readouterr().out.splitlines()
+        lines = _correct._words(summary, systematic, SimpleNamespace(**outputs))
         assert "  condition number of the solution for IQU: 1.5 to 1.6" in lines, systematic
         assert "    degree of linear polarization: 0.99 %" in lines, (systematic, words)
         assert "      statistical error: 0.12 %" in lines, (systematic, words)

@@ -176,7 +176,7 @@ def test_options_that_cannot_be_understood(capsys):
         (["simulate", "--hwp", "4_5,0"], "argument --hwp: '4_5,0' is not a list of angles"),
         (["challenge", "--snr", "8"], "argument --snr: '8' is not of the form LOW:HIGH"),
         (["correct", "x", "--centre", "7"], "argument --centre: '7' is not X,Y"),
-        (["sample", "c", "t", "--burn", "x"], "argument --burn: 'x' is neither a number nor auto"),
+        (["sample", "c", "t", "--burn", "x"], "argument --burn: 'x' is not auto or a number"),
         (["reduce", "c", "-o", "x", "--meta", "=in"], "argument --meta: '=in' is not KEY=VALUE"),
         (["simulate", "--source", "sun"], "argument --source: invalid choice: 'sun'"),
     ]:
@@ -202,7 +202,7 @@ def test_negative_values_are_values():
         (["efficiency", "--derotator", "-45", "0", "45", "-q"], "derotator", [-45, 0, 45]),
         (["efficiency", "--derotator", "0", "-4.5e1", "--altitude", "5"], "derotator", [0, -45]),
         (["efficiency", "--parallactic", "-30", "x.asdf"], "parallactic", -30),
-        (["correct", "x", "--calibration", "c", "-o", "o", "--centre", "-1,5"], "centre", (-1, 5)),
+        (["correct", "x", "--calibration", "c", "-o", "o", "--centre", "-1,5"], "centre", [-1, 5]),
     ]:
         assert getattr(build_parser().parse_args(argv), name) == value, (argv, name, value)
 

@@ -346,7 +346,7 @@ def test_bad_options_get_one_line_and_status_two(calibration, table, capsys, tmp
         (["--burn", "-1"], "--burn -1"),
         (["--steps", "1"], "--steps 1; allowed are whole numbers from 2 up"),
         (["-o", "out.fits"], "-o out.fits: the name must end with .asdf"),
-        (["--burn", "some"], "'some' is neither a number nor auto"),
+        (["--burn", "some"], "'some' is not auto or a number"),
         (["--seed", "-1"], "--seed -1"),
         (["--resume"], "--resume needs --checkpoint"),
         (["-o", "nowhere/out.asdf"], "no folder"),
