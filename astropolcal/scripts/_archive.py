@@ -19,6 +19,7 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
+from astropolcal.progress import counting
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
@@ -62,7 +63,6 @@ def is_archive(arguments, single):
 def run_archive(command, arguments):
     """Work on all sequences of a tree that are not done; return the exit status."""
     from astropolcal.pipeline.tasks import ended_tasks
-    from astropolcal.progress import counting
     from astropolcal.reduction.archive import Index, Manifest
 
     folder = Path(arguments.archive)

@@ -8,7 +8,10 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
+from astropolcal import standards
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.observations.grid import is_star
+from astropolcal.observations.observables import get_observable
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 
@@ -81,7 +84,6 @@ def run(arguments):
     from astropolcal.calibration.validation.cross_validation import add_standard
     from astropolcal.calibration.validation.stars import add_star_check
     from astropolcal.calibration.validation.targets import TARGETS
-    from astropolcal.observations.observables import get_observable
 
     common.check_suffix("-o", arguments.output, ".asdf")
     _check_start(arguments)
@@ -158,9 +160,6 @@ def _tell(arguments, calibration, targets, written):
 
 def _is_known(observations):
     """Return whether a table is of a star whose polarization the catalogue knows."""
-    from astropolcal import standards
-    from astropolcal.observations.grid import is_star
-
     if not is_star(observations.source):
         return False
     try:

@@ -4,6 +4,7 @@
 import multiprocessing
 import signal
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, GapError
@@ -107,8 +108,6 @@ def _workers(count):
     if count == 1:
         yield None
         return
-    from concurrent.futures import ProcessPoolExecutor
-
     others = multiprocessing.active_children()
     # what is forked from a process with threads may hang
     context = multiprocessing.get_context("spawn")

@@ -16,8 +16,10 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.modeling import models
 
+from astropolcal import instruments
 from astropolcal.chain import find_optic, follow, leaves, remove_optic
 from astropolcal.exceptions import (
     AstropolcalError,
@@ -26,6 +28,8 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
+from astropolcal.observations import Observations
+from astropolcal.observations.pointings import sky_angle
 from astropolcal.progress import clear
 from astropolcal.units import mjd_of, plain_number
 from astropolcal.words import HEIGHT, counted, did_you_mean, listed, shortened
@@ -119,8 +123,6 @@ def _named(arguments, kind):
 
 def _left_files(path):
     """Return the files of left beams that are read with a file of a right beam."""
-    from astropolcal import instruments
-
     layouts = [instruments.get(name).files for name in instruments.names()]
     pairs = [layout for layout in layouts if layout is not None and layout.beam_files]
     name = Path(path).name if os.path.isfile(path) else ""
@@ -325,10 +327,6 @@ def numbers_type(words, count=None, separator=","):
 
 def sky_position(text, option):
     """Return the position that RA,DEC mean; of names a server would have to be asked."""
-    from astropy.coordinates import SkyCoord
-
-    from astropolcal.observations.pointings import sky_angle
-
     try:
         right_ascension, declination = text.split(",")
         angles = sky_angle("right_ascension", right_ascension), sky_angle("", declination)
@@ -445,8 +443,6 @@ def cube_files(paths):
 
 def instrument_of(arguments, datasets):
     """Return the instrument that is asked for, or the one that the first table names."""
-    from astropolcal import instruments
-
     first = datasets[0]
     if arguments.instrument:
         return instruments.get(arguments.instrument)
@@ -465,8 +461,6 @@ def instrument_of(arguments, datasets):
 
 def read_datasets(paths):
     """Read observation tables; refuse one that is given twice."""
-    from astropolcal.observations import Observations
-
     datasets = []
     for path in paths:
         for mark, words in _NO_TABLES.items():

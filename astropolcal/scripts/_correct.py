@@ -10,6 +10,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
+from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
     CalibrationFileError,
@@ -19,6 +20,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.scripts import _common as common
 from astropolcal.scripts._archive import is_archive, run_archive
+from astropolcal.simulation import check_seed
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
@@ -145,7 +147,6 @@ def run(arguments):
 
 def work(arguments):
     """Correct the cubes of one product."""
-    from astropolcal import instruments
     from astropolcal.correction import ScienceFrames, correct
     from astropolcal.reduction.frames import configured, survey_frames
 
@@ -218,8 +219,6 @@ def _sorted(files, instrument):
 
 def _check_options(arguments):
     """Refuse options that have no meaning beside the others, before any work is done."""
-    from astropolcal.simulation import check_seed
-
     if arguments.rotation == "none" and arguments.camera_angle is not None:
         raise ParameterError(
             f"--camera-angle {arguments.camera_angle:g}: is for --rotation fixed or --rotation "
@@ -255,7 +254,6 @@ def choose_calibration(arguments, files):
     A file that says itself that it does not hold for the frames is refused like one in a library,
     unless the user asks for it for any date.
     """
-    from astropolcal import instruments
     from astropolcal.correction.rows import sky_chain
     from astropolcal.pipeline.headers import check_frames
     from astropolcal.reduction.frames import read_night

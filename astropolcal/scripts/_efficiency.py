@@ -6,11 +6,20 @@ from contextlib import suppress
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from astropy.time import Time
 
 from astropolcal import instruments
 from astropolcal.chain import stages
-from astropolcal.efficiency import demodulation, has_plate
+from astropolcal.efficiency import (
+    best_derotator,
+    demodulation,
+    has_derotator,
+    has_plate,
+    polarimetric_efficiency,
+)
 from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.observations import pointing
+from astropolcal.observations.pointings import offline
 from astropolcal.optics import COORDINATES
 from astropolcal.scripts import _common as common
 from astropolcal.units import iso_date
@@ -165,8 +174,6 @@ def _on_sky(instrument, chain, grid, arguments):
 
 def _table(arguments, instrument, chain, grid):
     """Return the table of an instrument with a half-wave plate, and what is printed of it."""
-    from astropolcal.efficiency import has_derotator, polarimetric_efficiency
-
     turns = has_derotator(chain)
     if arguments.derotator and not turns:
         raise ParameterError(f"--derotator: {instrument.name} has none in this chain")
@@ -230,9 +237,6 @@ def _rows(wanted, grid):
 
 def _best(arguments, instrument, chain, grid):
     """Return the best derotator offset, the statements on it, and the same in words."""
-    from astropolcal.efficiency import best_derotator
-    from astropolcal.observations import pointing
-
     if not (arguments.target and arguments.night):
         raise ParameterError("--target and --night belong together")
     if instrument.location is None:
@@ -273,10 +277,6 @@ def _best(arguments, instrument, chain, grid):
 
 def _times(text):
     """Return moments over the observation."""
-    from astropy.time import Time
-
-    from astropolcal.observations.pointings import offline
-
     try:
         with offline():
             start, end = (Time(iso_date(part), scale="utc") for part in text.split("/"))

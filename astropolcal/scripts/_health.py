@@ -3,6 +3,8 @@
 
 from contextlib import suppress
 
+import astropy.units as u
+
 from astropolcal.exceptions import ParameterError
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
@@ -33,8 +35,6 @@ library DIR Input  folder of calibrations
 @in_one_thread
 def run(arguments):
     """Say how the instruments do, and write the page."""
-    import astropy.units as u
-
     from astropolcal.pipeline import Library, health, write_health
 
     common.check_suffix("--html", arguments.html, *common.PAGES)

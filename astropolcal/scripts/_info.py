@@ -2,13 +2,22 @@
 """``astropolcal info``: what a file holds, or what this installation can do."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
+from astropy.io import fits
 
+from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import one_line, plain
+from astropolcal.observations import OBSERVABLES, Observations
+from astropolcal.observations.observables import default_observable
+from astropolcal.observations.reading import read_ecsv
+from astropolcal.optics import OPTICS
 from astropolcal.scripts import _common as common
+from astropolcal.version import version
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
@@ -51,8 +60,6 @@ def run(arguments):
     """Print what the file holds."""
     path = arguments.file
     if arguments.instruments:
-        from astropolcal import instruments
-
         common.say(arguments, *instruments.names())
         return
     if path is None:
@@ -76,11 +83,6 @@ def _wrapped(lines, content):
 
 
 def _installation():
-    from astropolcal import instruments
-    from astropolcal.observations import OBSERVABLES
-    from astropolcal.optics import OPTICS
-    from astropolcal.version import version
-
     content = {
         "astropolcal": version,
         "instruments": instruments.names(),
@@ -176,8 +178,6 @@ def _percent(value):
 
 def _table(path):
     """Return what an ECSV table holds: beam fluxes, or something else."""
-    from astropolcal.observations.reading import read_ecsv
-
     # what cannot be opened its reader says
     if os.access(path, os.R_OK) and not common.begins(path, b"# %ECSV"):
         raise ObservationError(
@@ -200,11 +200,6 @@ def _table(path):
 
 
 def _observations(path):
-    import astropy.units as u
-
-    from astropolcal.observations import Observations
-    from astropolcal.observations.observables import default_observable
-
     # again, with all checks; the first look was for the columns only
     observations = Observations.read(path)
     paired = default_observable([observations]) == "normalized_double_difference"
@@ -241,8 +236,6 @@ def _told(values):
 
 def describe_fits(path):
     """Return text and JSON content of a product, a cube, or any FITS file."""
-    from astropy.io import fits
-
     from astropolcal.correction import Corrected
     from astropolcal.correction.product import PRODUCT
     from astropolcal.fitscheck import open_fits, readable_fits
@@ -256,8 +249,6 @@ def describe_fits(path):
 
 
 def _describe_product(path, product):
-    from astropy import units as u
-
     made, wavelength = product.provenance, product.wavelength.to_value(u.nm)
     # frames have a key of their own
     frames = list(made.get("frames", []))
@@ -308,51 +299,37 @@ def _hdu(name, header):
 
 
 def _describe_frame(path, header, hdus):
-    name, frame, kind = _known_frame(path, header, hdus)
-    values = {} if frame is None else {k: frame.values[k] for k in _SHOWN if k in frame.values}
+    """Return text and JSON content of a FITS file, with what an instrument reads in its header."""
+    from astropolcal.reduction.headers import read_header, tracking_error
+
+    shapes = {tuple(hdu["shape"]) for hdu in hdus}
+    name, values, words = _instrument(header, shapes), {}, []
+    kind = "FITS file" if name is None else f"FITS file of {name}"
+    if name is not None:
+        with suppress(AstropolcalError):
+            # the mode tells which shape a cube has
+            layout = instruments.get(name).configured(header).files
+            frame = read_header(path, layout, header=header)
+            off = [tracking_error(frame.values, layout, on_sky=sky) for sky in (True, False)]
+            if None not in off and min(map(abs, off)) > layout.tracking_tolerance:
+                names = " and ".join(layout.keywords[key] for key in ("hwp", "hwp_true"))
+                frame.doubts.append(f"{names} agree neither on sky nor with the internal source")
+            values = {key: frame.values[key] for key in _SHOWN if key in frame.values}
+            words = [f"  problem: {one}" for one in frame.errors]
+            words += [f"  doubtful: {one}" for one in frame.doubts]
+            kind = f"cube of {name}" if _cube_shapes(layout) & shapes else kind
     lines = [f"{path}: {kind}, {counted(len(hdus), 'HDU')}"]
     for number, hdu in enumerate(hdus):
         size = " x ".join(map(str, hdu["shape"])) or "no data"
         lines.append(f"  {number} {hdu['name'] or '-'}: {size} {hdu['unit']}".rstrip())
-    if values:
-        lines.append(f"  header: {', '.join(f'{key} {_short(v)}' for key, v in values.items())}")
-    lines += [f"  problem: {words}" for words in (frame.errors if frame else [])]
-    lines += [f"  doubtful: {words}" for words in (frame.doubts if frame else [])]
+    shown = [f"{k} {v:zg} deg" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()]
+    lines += [f"  header: {', '.join(shown)}"] if values else []
     content = {"file": str(path), "type": kind, "instrument": name, "hdus": hdus}
-    return lines, content | {"header": _told(values)}
-
-
-def _short(value):
-    return f"{value:zg} deg" if isinstance(value, float) else str(value)
-
-
-def _known_frame(path, header, hdus):
-    """Return the instrument of a file, what it reads in the header, and the kind of file."""
-    from astropolcal import instruments
-    from astropolcal.reduction.headers import read_header, tracking_error
-
-    shapes = {tuple(hdu["shape"]) for hdu in hdus}
-    name = _instrument(header, shapes)
-    if name is None:
-        return None, None, "FITS file"
-    try:
-        # the mode tells which shape a cube has
-        layout = instruments.get(name).configured(header).files
-        frame = read_header(path, layout, header=header)
-        off = [tracking_error(frame.values, layout, on_sky=sky) for sky in (True, False)]
-        if None not in off and min(map(abs, off)) > layout.tracking_tolerance:
-            names = " and ".join(layout.keywords[key] for key in ("hwp", "hwp_true"))
-            frame.doubts.append(f"{names} agree neither on sky nor with the internal source")
-    except AstropolcalError:
-        return name, None, f"FITS file of {name}"
-    is_cube = bool(_cube_shapes(layout) & shapes)
-    return name, frame, f"cube of {name}" if is_cube else f"FITS file of {name}"
+    return [*lines, *words], content | {"header": _told(values)}
 
 
 def _instrument(header, shapes):
     """Return the instrument that a header names, or else the only one with such cubes."""
-    from astropolcal import instruments
-
     layouts = {name: instruments.get(name).files for name in instruments.names()}
     layouts = {name: layout for name, layout in layouts.items() if layout is not None}
     for name, layout in layouts.items():

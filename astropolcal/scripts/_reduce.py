@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts import _common as common
@@ -82,7 +83,6 @@ def run(arguments):
 
 def work(arguments):
     """Reduce the cubes of one table."""
-    from astropolcal import instruments
     from astropolcal.fitscheck import primary_header
     from astropolcal.pipeline.headers import describe
     from astropolcal.reduction import reduce_run

@@ -1,10 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
+import astropy.units as u
+import numpy as np
+
+from astropolcal import instruments
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts import _common as common
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.words import counted
 
 #: What the packaged example was made with.
@@ -78,10 +83,8 @@ OPTIONS = f"""
 
 def run(arguments):
     """Simulate and write the table, the cubes or both."""
-    from astropolcal import instruments
     from astropolcal.reduction import DetectorModel, ImageModel, simulate_cubes
     from astropolcal.reduction.cubes import _usual_flux, true_observations
-    from astropolcal.simulation import simulate
 
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
@@ -140,11 +143,7 @@ def run(arguments):
 
 def _frames(arguments, chain):
     """Return half-wave-plate cycles in all states, for a star with the pointing of each frame."""
-    import astropy.units as u
-    import numpy as np
-
     from astropolcal.reduction.cubes import both_states
-    from astropolcal.simulation import half_wave_plate_cycles
 
     star = arguments.source == "star"
     hwp = arguments.hwp or (_STAR_CYCLE if star else None)

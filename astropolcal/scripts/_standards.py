@@ -4,9 +4,13 @@
 import math
 
 import astropy.units as u
+from astropy.coordinates import EarthLocation
 
+from astropolcal import standards
 from astropolcal.exceptions import ParameterError
 from astropolcal.scripts import _common as common
+from astropolcal.standards.priors import assumed_polarization
+from astropolcal.standards.visibility import SITES, location
 from astropolcal.words import counted, did_you_mean
 
 HELP = "list polarimetric standard stars and when they are observable"
@@ -78,8 +82,6 @@ def _check(arguments):
 
 
 def _one(arguments):
-    from astropolcal import standards
-
     star = standards.get(arguments.name)
     content = _facts(star)
     lines = _describe(star, content["known"])
@@ -108,8 +110,6 @@ def _one(arguments):
 
 
 def _observability(name, arguments):
-    from astropolcal import standards
-
     limit = arguments.min_altitude * u.deg
     return standards.observability(name, _site(arguments.site), arguments.night, min_altitude=limit)
 
@@ -170,8 +170,6 @@ def _pair(value, form, error=math.nan):
 
 
 def _many(arguments):
-    from astropolcal import standards
-
     site = None if arguments.site is None else _site(arguments.site)
     try:
         given = arguments.magnitude
@@ -227,8 +225,6 @@ def _band_lines(shown, arguments):
 
 def _has_degree(row, band):
     """Return whether the degree of polarization of a star is known in a band, or none is asked."""
-    from astropolcal import standards
-
     if band is None:
         return True
     star = standards.get(str(row["name"]))
@@ -282,8 +278,6 @@ def _magnitude(row):
 
 
 def _facts(star):
-    from astropolcal.standards.priors import assumed_polarization
-
     law = star.law
     if law is not None:
         law = {
@@ -324,10 +318,6 @@ def _row(row):
 
 def _site(text):
     """Return the place, by name or as LON,LAT,HEIGHT."""
-    from astropy.coordinates import EarthLocation
-
-    from astropolcal.standards.visibility import SITES, location
-
     try:
         if "," not in text:
             return location(text)
