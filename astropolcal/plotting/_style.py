@@ -154,19 +154,13 @@ def degrees(angle):
 
 def rms(values, axis=None):
     """Return the root mean square of the known values, NaN where there is none."""
-    known = np.isfinite(values)
-    count = known.sum(axis=axis)
-    total = (np.where(known, values, 0.0) ** 2).sum(axis=axis)
-    return np.sqrt(np.where(count, total / np.maximum(count, 1), np.nan))
+    return np.sqrt(mean_known(values**2, axis))
 
 
-def mean_known(values):
-    """Return the mean over the first axis of the known values, NaN where there are none."""
-    known = np.isfinite(values)
-    count = known.sum(axis=0)
+def mean_known(values, axis=0):
+    """Return the mean of the known values, NaN where there are none."""
     # np.nanmean would warn of what is not known at all
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis=axis), np.nan)
 
 
 def cell_edges(centres):

@@ -363,37 +363,35 @@ def plot_star_check(calibration, entry=None, *, figure=None):
     values = {key: np.asarray(value) for key, value in entry.items() if isinstance(value, list)}
     with st.canvas(figure, 12, 6.4) as figure:
         panels = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
-        for (top, bottom), quantity in zip(panels.T, _QUANTITIES, strict=True):
-            _draw_star(top, bottom, values, *quantity)
+        for (top, bottom), (key, unit, label, short) in zip(panels.T, _QUANTITIES, strict=True):
+            # lines are drawn through the points as they come
+            order = np.argsort(values["wavelength_nm"])
+            lam = values["wavelength_nm"][order]
+            seen, error, known, spread, off = (
+                values[f"{key}{part}_{unit}"][order]
+                for part in ("", "_err", "_known", "_known_err", "_error")
+            )
+            points = {"color": st.BLUE, "marker": "o", "linestyle": "none"}
+            observed = f"observed, with 1{st.SIGMA} errors of the mean"
+            top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
+            # a star whose polarization no catalogue has is drawn alone
+            if np.isfinite(known).any():
+                top.plot(
+                    lam, known, color=st.VERMILION, label="catalogue, with the published errors"
+                )
+                st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
+            bottom.axhline(0, color=st.GREY, linewidth=1)
+            bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
+            # of the angle no such error is known
+            if key == "dolp":
+                single = values["s_dolp_percent"][order]
+                look = {"color": st.GREY, "linestyle": "--"}
+                bottom.plot(lam, single, label="± rms error of a single cycle", **look)
+                bottom.plot(lam, -single, **look)
+            top.set_ylabel(label)
+            bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")
             st.wavelength_label(bottom)
         what = f"{entry['star']}, which no fit saw"
         st.heading(figure, calibration, what, [entry["name"]])
         st.legend_outside(figure, list(st.legend_entries(panels.ravel()).values()), columns=2)
     return figure
-
-
-def _draw_star(top, bottom, values, key, unit, label, short):
-    # lines are drawn through the points as they come
-    order = np.argsort(values["wavelength_nm"])
-    lam = values["wavelength_nm"][order]
-    seen, error, known, spread, off = (
-        values[f"{key}{part}_{unit}"][order]
-        for part in ("", "_err", "_known", "_known_err", "_error")
-    )
-    points = {"color": st.BLUE, "marker": "o", "linestyle": "none"}
-    observed = f"observed, with 1{st.SIGMA} errors of the mean"
-    top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
-    # a star whose polarization no catalogue has is drawn alone
-    if np.isfinite(known).any():
-        top.plot(lam, known, color=st.VERMILION, label="catalogue, with the published errors")
-        st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
-    bottom.axhline(0, color=st.GREY, linewidth=1)
-    bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
-    # of the angle no such error is known
-    if key == "dolp":
-        single = values["s_dolp_percent"][order]
-        for sign in (1, -1):
-            label_of = "± rms error of a single cycle" if sign > 0 else None
-            bottom.plot(lam, sign * single, color=st.GREY, linestyle="--", label=label_of)
-    top.set_ylabel(label)
-    bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")

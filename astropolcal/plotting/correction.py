@@ -65,10 +65,21 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
     limit = _top(np.abs([panels[name] for name in _POLARIZED]))
+    height, width = corrected.stokes.shape[2:]
+    x, y = corrected._middle()
+    # milliarcseconds to arcseconds
+    step = 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
+    # pixel centres are whole numbers: the image reaches half a pixel further
+    extent = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
+    if corrected.north_up:
+        # east is positive, and to the left on the sky
+        extent *= [-1, -1, 1, 1]
     with st.canvas(figure, 12.5, 8.2) as figure:
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
-            _panel(figure, axes, name, image, corrected, limit)
+            drawn, extend = _draw_image(axes, name, image, extent, limit)
+            bar = figure.colorbar(drawn, ax=axes, shrink=0.85, extend=extend)
+            bar.set_label(f"flux ({corrected.unit.to_string()} per pixel)")
         for axes in grid[:, 0]:
             axes.set_ylabel(_axis_label(corrected, "north" if corrected.north_up else "y"))
         for axes in grid[1]:
@@ -102,8 +113,11 @@ def _panels(corrected, chosen):
     return panels | {f"{kind} error of Q": mean}
 
 
-def _panel(figure, axes, name, image, corrected, limit):
-    """Draw one image with its own scale of brightness, or the common one of polarization."""
+def _draw_image(axes, name, image, extent, limit):
+    """Draw an image with its own scale of brightness, or the common one of polarization.
+
+    Return it, and at which ends of the scale values lie beyond it.
+    """
     look = {"cmap": "viridis", "vmin": 0.0, "vmax": _top(image)}
     if name in _POLARIZED:
         look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
@@ -116,7 +130,7 @@ def _panel(figure, axes, name, image, corrected, limit):
         look = {"cmap": "viridis", "norm": LogNorm(low, top)}
         # what is darker, or negative, gets the darkest colour, not that of missing pixels
         image = np.where(image < low, low, image)
-    drawn = axes.imshow(image, origin="lower", extent=_extent(corrected), **look)
+    drawn = axes.imshow(image, origin="lower", extent=extent, **look)
     axes.grid(False)
     axes.set_facecolor("0.75")
     axes.set_title(name)
@@ -124,27 +138,13 @@ def _panel(figure, axes, name, image, corrected, limit):
     low, high = drawn.get_clim()
     with np.errstate(invalid="ignore"):
         beyond = (image > high).any() + 2 * (image < low).any()
-    extend = ("neither", "max", "min", "both")[beyond]
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.85, extend=extend)
-    bar.set_label(f"flux ({corrected.unit.to_string()} per pixel)")
+    return drawn, ("neither", "max", "min", "both")[beyond]
 
 
 def _top(values):
     known = values[np.isfinite(values)]
     top = np.quantile(known, _QUANTILE) if known.size else 1.0
     return top if top > 0 else 1.0
-
-
-def _extent(corrected):
-    """Return the edges of the image about the star; east is positive and to the left."""
-    height, width = corrected.stokes.shape[2:]
-    x, y = corrected._middle()
-    # milliarcseconds to arcseconds
-    step = 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
-    # pixel centres are whole numbers: the image reaches half a pixel further
-    edges = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
-    # east is to the left on the sky
-    return edges * ([-1, -1, 1, 1] if corrected.north_up else 1)
 
 
 def _axis_label(corrected, direction):
@@ -194,20 +194,15 @@ def plot_spectrum(corrected, *, figure=None):
             bottom.set_ylim(bottom=1)
         st.wavelength_label(bottom)
         figure.suptitle(f"Corrected polarization ({_MODES[corrected.mode]})")
-        st.legend_outside(figure, _handles(top, middle), columns=len(corrected.components))
+        handles = []
+        for axes in (top, middle):
+            entries = st.legend_entries([axes])
+            # the errors of each quantity below each other, the statistical one first
+            order = sorted(entries, key=lambda label: (label.split(",")[0], "systematic" in label))
+            handles += [entries[label] for label in order]
+        st.legend_outside(figure, handles, columns=len(corrected.components))
         figure.align_ylabels()
     return figure
-
-
-def _handles(*all_axes):
-    """Return what a legend shows: the errors of each quantity below each other."""
-    found = [sorted(st.legend_entries([axes]).items(), key=_first) for axes in all_axes]
-    # the statistical error comes first, in the order of q, u, v
-    return [handle for entries in found for _, handle in entries]
-
-
-def _first(labelled):
-    return labelled[0].split(",")[0], "systematic" in labelled[0]
 
 
 def _values(axes, nm, corrected, name):

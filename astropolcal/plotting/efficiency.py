@@ -65,7 +65,15 @@ def plot_polarimetric_efficiency(
             where = ", ".join(f"{words[key]} {_degree(angle)}" for key, angle in at.items())
             axes[0].set_title(where or "downstream of the internal source")
         elif not maps:
-            _without_derotator(axes[0], lam, asked, shown, "parallactic" in at)
+            ax = axes[0]
+            if "parallactic" in at:
+                angles = np.arange(-180, 181, 5.0)
+                _lines(ax, lam, angles, asked(parallactic=angles * u.deg), shown)
+                ax.set(xlabel="parallactic angle (deg)", xlim=(-180, 180))
+                ax.set(xticks=np.arange(-180, 181, 90))
+            else:
+                st.draw_line(ax, lam, np.atleast_2d(asked())[0], marker="o")
+                ax.set(xlabel="wavelength (nm)", ylabel=_SHARE, ylim=(0, 1.02))
         if maps:
             _map_of_pointings(fig, axes[-1], asked, derotator if turns else None)
         fig.suptitle(title or "Polarimetric efficiency")
@@ -112,17 +120,6 @@ def plot_efficiencies(found, wavelength, *, title=None, figure=None):
         ax.legend(ncols=len(found.components))
         fig.suptitle(title or "Efficiency of each Stokes parameter")
     return fig
-
-
-def _without_derotator(ax, lam, asked, shown, on_sky):
-    """Draw lines against the parallactic angle, or points at the wavelengths."""
-    if on_sky:
-        angles = np.arange(-180, 181, 5.0)
-        _lines(ax, lam, angles, asked(parallactic=angles * u.deg), shown)
-        ax.set(xlabel="parallactic angle (deg)", xlim=(-180, 180), xticks=np.arange(-180, 181, 90))
-        return
-    st.draw_line(ax, lam, np.atleast_2d(asked())[0], marker="o")
-    ax.set(xlabel="wavelength (nm)", ylabel=_SHARE, ylim=(0, 1.02))
 
 
 def _degree(angle):
@@ -231,7 +228,14 @@ def plot_comparison(members, *, title=None, figure=None):
             _draw_member(axes, table[table["label"] == label], label, *look)
             for label, look in zip(labels, st.looks(len(labels)), strict=True)
         ]
-        _label_panels(axes)
+        for ax, (title_of, ylabel) in zip(axes, _TITLES, strict=True):
+            ax.set(title=title_of, ylabel=ylabel)
+        axes[0].axhline(180, color="0.45", linewidth=0.9, linestyle="--")
+        # what has none lies on the zero line, in full
+        axes[2].set_ylim(bottom=-0.03 * axes[2].get_ylim()[1])
+        axes[3].set_ylim(-0.02, 1.02)
+        for ax in axes[2:]:
+            st.wavelength_label(ax)
         st.legend_outside(fig, handles, columns=min(4, len(labels)))
         fig.suptitle(title or "Polarization optics downstream of the telescope")
     return fig
@@ -258,17 +262,6 @@ def _draw_member(axes, rows, label, color, marker):
         for x in lam[np.isinf(std)]:
             axes[panel].axvline(x, color=color, linewidth=1.0, alpha=0.6)
     return handles[0]
-
-
-def _label_panels(axes):
-    for ax, (title, ylabel) in zip(axes, _TITLES, strict=True):
-        ax.set(title=title, ylabel=ylabel)
-    axes[0].axhline(180, color="0.45", linewidth=0.9, linestyle="--")
-    # what has none lies on the zero line, in full
-    axes[2].set_ylim(bottom=-0.03 * axes[2].get_ylim()[1])
-    axes[3].set_ylim(-0.02, 1.02)
-    for ax in axes[2:]:
-        st.wavelength_label(ax)
 
 
 # ---- standard stars over a night ---------------------------------------------------------------
@@ -315,7 +308,14 @@ def plot_observability(seen, *, total=None, figure=None):
     2
     """
     seen = list(seen)
-    _check(seen)
+    if not 1 <= len(seen) <= _MOST:
+        raise ParameterError(f"{len(seen)} stars cannot be drawn; allowed are 1 to {_MOST}")
+    first = seen[0]
+    for star in seen:
+        if star.night != first.night or not np.all(star.site == first.site):
+            raise ParameterError(
+                f"{star.name} and {first.name} are of different nights or sites; draw them apart"
+            )
     # UTC, before the first dark hour of the first star
     midnight = np.floor(seen[0].table["time"][0].mjd)
     stars = list(zip(seen, st.looks(len(seen)), strict=True))
@@ -336,17 +336,6 @@ def plot_observability(seen, *, total=None, figure=None):
         which = f"The first {len(seen)} of {total} standard stars" if few else "Standard stars"
         figure.suptitle(f"{which}, night of {seen[0].night}\n{_place(seen[0].site)}")
     return figure
-
-
-def _check(seen):
-    if not 1 <= len(seen) <= _MOST:
-        raise ParameterError(f"{len(seen)} stars cannot be drawn; allowed are 1 to {_MOST}")
-    first = seen[0]
-    for star in seen:
-        if star.night != first.night or not np.all(star.site == first.site):
-            raise ParameterError(
-                f"{star.name} and {first.name} are of different nights or sites; draw them apart"
-            )
 
 
 def _place(site):

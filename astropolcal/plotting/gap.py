@@ -49,7 +49,13 @@ def _finish(figure, axes, diagnosis, title):
     """Add the legend of a panel, which is that of all, and the title with the verdict."""
     if axes is not None:
         st.legend_outside(figure, axes.get_legend_handles_labels()[0], columns=3)
-    figure.suptitle(f"{title}\n{_verdict_line(diagnosis)}")
+    names = [cause.name for cause in diagnosis.causes]
+    several = names[0] if len(names) == 1 else f"{len(names)} causes"
+    verdict = {
+        "none": "no gap beyond the noise",
+        "unexplained": "a real gap that is not explained",
+    }.get(diagnosis.verdict, f"{diagnosis.verdict}: {several}")
+    figure.suptitle(f"{title}\n{verdict}")
     return figure
 
 
@@ -236,18 +242,6 @@ def _frame_axis(axes, observations):
 
 
 # ---- the causes -----------------------------------------------------------------------------
-# characters of a label beside a panel
-_LABEL = 26
-
-
-def _verdict_line(diagnosis):
-    """Return the verdict as a line that fits a figure."""
-    names = [cause.name for cause in diagnosis.causes]
-    several = names[0] if len(names) == 1 else f"{len(names)} causes"
-    return {
-        "none": "no gap beyond the noise",
-        "unexplained": "a real gap that is not explained",
-    }.get(diagnosis.verdict, f"{diagnosis.verdict}: {several}")
 
 
 def plot_cause_map(diagnosis, *, figure=None):
@@ -302,7 +296,13 @@ def plot_cause_map(diagnosis, *, figure=None):
                 words = textwrap.fill(words, _CELL, break_long_words=False)
                 axes.text(j, i - 0.06, words, va="top", fontsize=7.5, linespacing=0.95, **look)
         axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
-        axes.set_yticks(range(len(rows)), labels=[_place_label(place) for place in rows])
+        words = {"in": "in the {}", "after": "downstream of the {}"}
+        named = []
+        for place in rows:
+            head, _, optic = place.partition(":")
+            label = words.get(head, place).format(_STAGES.get(optic, optic))
+            named.append(textwrap.fill(label, 16))
+        axes.set_yticks(range(len(rows)), labels=named)
         axes.tick_params(length=0, labelsize=9.5)
         axes.xaxis.tick_top()
         axes.grid(visible=False)
@@ -314,6 +314,9 @@ def plot_cause_map(diagnosis, *, figure=None):
     return figure
 
 
+# characters of a label beside a panel
+_LABEL = 26
+_STAGES = {"hwp": "half-wave plate"}
 # columns of the map
 _OTHER = "other"
 _FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
@@ -369,13 +372,6 @@ def _on_map(effect, cell):
     return place, _FAMILIES[-2] if place == "detector" else family, "named"
 
 
-def _place_label(place):
-    head, _, optic = place.partition(":")
-    optic = {"hwp": "half-wave plate"}.get(optic, optic)
-    words = {"in": f"in the {optic}", "after": f"downstream of the {optic}"}
-    return textwrap.fill(words.get(head, place), 16)
-
-
 def plot_effect_sizes(diagnosis, effect, *, figure=None):
     """
     Draw the fitted size of a cause, by its name, with its errors.
@@ -391,57 +387,51 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
         sizes = diagnosis.content["causes"][names.index(effect)]["size"]
+    # a figure of a constant shows nothing
     sizes = {name: size for name, size in sizes.items() if _varies(size["value"])}
-    panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
+    dependence = _dependence(diagnosis, effect)
+    panels = [None, *sizes] if dependence else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
-    nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
+    columns = min(len(panels), 2)
     with st.canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
         for axes, name in zip(st.grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
-                _curve_panel(axes, diagnosis, effect)
-                continue
-            size = _in_percent(sizes[name])
-            _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name, size))
-            axes.set_ylabel(_label(diagnosis, effect, name, size["unit"]))
-            st.wavelength_label(axes)
+                _draw_curve(axes, diagnosis, effect, dependence)
+            else:
+                _draw_size(axes, diagnosis, effect, name, sizes[name])
     return figure
 
 
 def _varies(value):
-    # a figure of a constant shows nothing
-    if not isinstance(value, list):
-        return False
-    known = [abs(one) for one in value if one is not None]
+    known = [abs(one) for one in value if one is not None] if isinstance(value, list) else []
     return bool(known) and max(value) - min(value) > 1e-6 * max(known)
 
 
-def _in_percent(size):
-    """Return a share in percent, and all else as it is."""
-    if size["unit"]:
-        return size
-    return {
-        "value": [100 * one for one in size["value"]],
-        "std": [None if one is None else 100 * one for one in size["std"]],
-        "unit": "%",
-        "limit": 100 * size["limit"],
-    }
-
-
-def _absent(model, effect, name, size):
-    """Return the value at which an effect is absent in the unit of its size, scalar or (W,)."""
+def _draw_size(axes, diagnosis, effect, name, size):
+    """Draw the size of a parameter of a cause, a share in percent, against wavelength."""
+    model, cause = diagnosis.improved, _cause(diagnosis, effect)
+    nm, scale = 1000 * diagnosis.nominal.problem.wavelength, 1 if size["unit"] else 100
+    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
+    value, error = (scale * np.array(size[key], dtype=float) for key in ("value", "std"))
+    # mostly zero; a share that is retained counts from one, what the model held from its value
     (parameter,) = (p for p in model.added[effect] if p.name == name)
-    factor = model.problem.free.by_name[name].factor
-    return parameter.canonical_neutral / factor * (100 if size["unit"] == "%" else 1)
-
-
-def _label(diagnosis, effect, name, unit):
-    """Return what a size is, and its unit."""
-    cause = next(one for one in diagnosis.causes if one.name == effect)
-    names = [p.name for p in diagnosis.improved.added[effect]]
+    absent = scale * parameter.canonical_neutral / model.problem.free.by_name[name].factor
+    look = {"color": st.BLACK, "linewidth": 0.8}
+    axes.axhline(absent, **look) if np.ndim(absent) == 0 else st.draw_line(axes, nm, absent, **look)
+    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=st.BLUE, elinewidth=1.5)
+    if not known.all():
+        # x in data, y in shares of the panel: the crosses stay at its foot whatever the scale
+        look = {"color": st.VERMILION, "transform": axes.get_xaxis_transform()}
+        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", **look)
+        axes.set_title("crosses: not determined", loc="left", fontsize=10)
+    if not known.any():
+        axes.set_yticks([])
+    names = [p.name for p in model.added[effect]]
     entry = {"size": names, "cell": cause.cell.to_dict() if cause.cell else None}
-    words = dict(zip(names, labels(entry), strict=True))[name]
-    return f"{textwrap.fill(words, _LABEL)} ({unit})"
+    words = textwrap.fill(labels(entry)[names.index(name)], _LABEL)
+    axes.set_ylabel(f"{words} ({size['unit'] or '%'})")
+    st.wavelength_label(axes)
 
 
 # ---- what a cause depends on ------------------------------------------------------------------
@@ -449,20 +439,30 @@ def _label(diagnosis, effect, name, unit):
 _DRIVERS = {"sequence": "share of the run", "frame": "frame"}
 
 
-def _curve(diagnosis, effect):
+def _cause(diagnosis, effect):
+    return next(one for one in diagnosis.causes if one.name == effect)
+
+
+def _dependence(diagnosis, effect):
     """Return the dependence of a cause that is a cell and changes from frame to frame."""
-    cause = next(one for one in diagnosis.causes if one.name == effect)
+    cell = _cause(diagnosis, effect).cell
     keys = [p.name.partition(".")[2] for p in diagnosis.improved.added.get(effect) or ()]
-    if cause.cell is None or cause.cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
+    if cell is None or cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
         return None
-    dependence = Dependence(cause.cell.dependence)
+    dependence = Dependence(cell.dependence)
     return dependence if dependence.driver else None
 
 
-def _curve_panel(axes, diagnosis, effect):
-    dependence, model = _curve(diagnosis, effect), diagnosis.improved
+def _draw_curve(axes, diagnosis, effect, dependence):
+    """Draw the size of a cause against what it depends on."""
+    model = diagnosis.improved
     driver, problem = dependence.driver, model.problem
-    given = np.concatenate([_positions(dataset, driver) for dataset in problem.datasets])
+    given = []
+    for dataset in problem.datasets:
+        stood = dataset._given.get(driver)
+        stood = dataset.observations.position(driver) if stood is None else stood
+        given.append(stood.mean(axis=0) if stood.ndim == 2 else stood)
+    given = np.concatenate(given)
     x = np.linspace(given.min(), given.max(), 400)
     if dependence.kind == "direction":
         x = np.array([0.0, 1.0])
@@ -489,7 +489,7 @@ def _curve_panel(axes, diagnosis, effect):
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
     stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    stage = _STAGES.get(stage, stage)
     axes.set_xlabel(
         {
             "harmonic": f"angle of the {stage} (deg)",
@@ -500,27 +500,3 @@ def _curve_panel(axes, diagnosis, effect):
     )
     nm = 1000 * problem.wavelength[middle]
     axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
-
-
-def _positions(dataset, driver):
-    """Return where the driver of a dependence stood in every frame."""
-    given = dataset._given.get(driver)
-    given = dataset.observations.position(driver) if given is None else given
-    return given.mean(axis=0) if given.ndim == 2 else given
-
-
-def _size_panel(axes, nm, size, absent):
-    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
-    value = np.array(size["value"], dtype=float)
-    error = np.array(size["std"], dtype=float)
-    # mostly zero; a share that is retained counts from one, what the model held from its value
-    look = {"color": st.BLACK, "linewidth": 0.8}
-    axes.axhline(absent, **look) if np.ndim(absent) == 0 else st.draw_line(axes, nm, absent, **look)
-    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=st.BLUE, elinewidth=1.5)
-    if not known.all():
-        # x in data, y in shares of the panel: the crosses stay at its foot whatever the scale
-        look = {"color": st.VERMILION, "transform": axes.get_xaxis_transform()}
-        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", **look)
-        axes.set_title("crosses: not determined", loc="left", fontsize=10)
-    if not known.any():
-        axes.set_yticks([])

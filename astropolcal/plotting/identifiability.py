@@ -2,8 +2,7 @@
 """What the data determine, what they do not determine, and how parameters are correlated."""
 
 import textwrap
-from dataclasses import dataclass
-from itertools import pairwise
+from collections import namedtuple
 
 import astropy.units as u
 import numpy as np
@@ -11,19 +10,7 @@ import numpy as np
 from astropolcal.calibration.identifiability.analysis import _POOR, SETS, harmonic_conditions
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import (
-    BLACK,
-    BLUE,
-    GREY,
-    MINUS,
-    ORANGE,
-    SIGMA,
-    VERMILION,
-    canvas,
-    element_places,
-    heading,
-    note,
-)
+from astropolcal.plotting import _style as st
 from astropolcal.units import angle_to_rad
 
 __all__ = ["plot_correlations", "plot_identifiability"]
@@ -45,13 +32,8 @@ _ALIKE, _MOST_NEAR_NULL = 0.9, 6
 _COLUMNS = 125
 
 
-@dataclass
-class _Row:
-    """One direction: its name, its loadings (length 1), and what it is in words."""
-
-    name: str
-    loadings: np.ndarray
-    words: str
+# a direction: its name, its loadings (length 1), and what it is in words
+_Row = namedtuple("_Row", "name loadings words")
 
 
 def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
@@ -109,9 +91,11 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     weak = _weak_rows(finding, known, weakest)
     rows = [*_open_rows(finding), *weak]
     angles = _angles(calibration, hwp)
-    words = _wrapped(rows)
+    words = []
+    for row in (row for row in rows if row.words):
+        words += textwrap.wrap(f"{row.name}: {row.words}", _COLUMNS, subsequent_indent=" " * 5)
     heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
-    with canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
+    with st.canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
@@ -120,7 +104,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
         below.axis("off")
         where = {"transform": below.transAxes, "va": "top", "ha": "left"}
         below.text(0, 1, "\n".join(words), fontsize=9, linespacing=1.3, **where)
-        heading(figure, calibration, "What the data determine")
+        st.heading(figure, calibration, "What the data determine")
     return figure
 
 
@@ -172,7 +156,7 @@ def _weak_rows(finding, known, count):
 
 def _near_null_words(near_null, names, units, vector):
     """Return the words of the near-null direction that this is, or none."""
-    places = element_places(names)
+    places = st.element_places(names)
     for direction in near_null:
         change = np.zeros(len(names))
         for name, value in direction["parameters"].items():
@@ -186,24 +170,20 @@ def _near_null_words(near_null, names, units, vector):
 def _weak_words(names, units, vector, sigma):
     """Say what a step of one standard error along a direction changes."""
     parts = []
-    for stem, places in element_places(names).items():
+    for stem, places in st.element_places(names).items():
         part = vector[places]
         size = np.linalg.norm(part)
         if size > _WORTH_A_WORD:
-            unit, typical = _step_unit(units[places[0]]), sigma * size / np.sqrt(len(part))
+            unit, typical = units[places[0]], sigma * size / np.sqrt(len(part))
+            is_angle = unit is not None and u.Unit(unit).is_equivalent(u.deg)
+            unit = "%" if unit is None else "deg" if is_angle else "µm"
             words = f"{stem} by {sigma * part[0]:+.2g} {unit}"
             if len(part) > 1:
                 words = f"{stem} by {typical:.2g} {unit} (rms of {len(part)} wavelengths)"
             parts.append((size, words))
     named = [text for _, text in sorted(parts, reverse=True)]
     more = f" and {len(named) - _MOST_NAMES} more" if len(named) > _MOST_NAMES else ""
-    return f"1{SIGMA} changes {', '.join(named[:_MOST_NAMES])}{more}"
-
-
-def _step_unit(unit):
-    if unit is None:
-        return "%"
-    return "deg" if u.Unit(unit).is_equivalent(u.deg) else "µm"
+    return f"1{st.SIGMA} changes {', '.join(named[:_MOST_NAMES])}{more}"
 
 
 # ---- (a) singular values ---------------------------------------------------------------------
@@ -217,11 +197,18 @@ def _draw_values(axes, finding, known, n_weak):
     between = (values[rank] if n_open else 0.0, values[rank - 1] if rank else largest)
     threshold = float(np.clip(_OPEN_BELOW * largest, *between)) or 1e-12
     # singular values and errors go together where the data count as independent
-    known = known if known is not None and _are_inverse(values[:rank], known[2]) else None
-    is_weak = _is_weak(values[:rank], known, n_weak)
+    sigmas = np.empty(0) if known is None or not rank else known[2]
+    if len(sigmas):
+        ratio = (sigmas.max() / sigmas.min()) / (largest / values[:rank].min())
+        sigmas = sigmas if abs(np.log(ratio)) < _SAME else sigmas[:0]
+    is_weak = np.zeros(rank, dtype=bool)
+    for sigma in sigmas[len(sigmas) - n_weak :] if len(sigmas) else ():
+        # with priors or bounds the errors may have directions of their own
+        off = np.abs(np.log(values[:rank] * sigma / (sigmas.min() * largest)))
+        is_weak[off.argmin()] |= off.min() < _SAME
     low = threshold / 30 if n_open else values[rank - 1] / 3
     axes.set_yscale("log")
-    kinds = ((~is_weak, "o", BLUE, "determined"), (is_weak, "s", ORANGE, "shown in (b)"))
+    kinds = ((~is_weak, "o", st.BLUE, "determined"), (is_weak, "s", st.ORANGE, "shown in (b)"))
     for which, marker, color, label in kinds:
         if which.any():
             axes.plot(index[:rank][which], values[:rank][which], marker, color=color, label=label)
@@ -230,9 +217,11 @@ def _draw_values(axes, finding, known, n_weak):
         worst = values[rank:].max()
         rounding = f"at most {worst:.1g}" if worst > 0 else "exactly zero"
         label = f"{n_open} open: {rounding} (below the axis)"
-        at_edge = {"color": VERMILION, "label": label, "clip_on": False, "zorder": 3}
+        at_edge = {"color": st.VERMILION, "label": label, "clip_on": False, "zorder": 3}
         axes.plot(index[rank:], np.full(n_open, low), "v", **at_edge)
-        axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
+        axes.axhline(
+            threshold, color=st.BLACK, linestyle="--", linewidth=1, label="limit of the rank"
+        )
     axes.set_title(
         f"(a) {rank} of {finding.n_free} combinations determined, {n_open or 'none'} open"
     )
@@ -241,29 +230,8 @@ def _draw_values(axes, finding, known, n_weak):
     axes.set(xlim=(0, len(values) + 1), ylim=(low, largest * 3))
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend(loc="center left" if n_open else "lower left")
-    if known is not None and len(known[2]):
-        _add_error_axis(axes, known[2].min() * largest, threshold if n_open else low)
-
-
-def _are_inverse(values, sigmas):
-    """Return whether errors are one over singular values, by the best and the worst of them."""
-    if not (len(values) and len(sigmas)):
-        return False
-    ratio = (sigmas.max() / sigmas.min()) / (values.max() / values.min())
-    return abs(np.log(ratio)) < _SAME
-
-
-def _is_weak(values, known, count):
-    """Mark the singular values that belong to the directions with the largest errors."""
-    marked = np.zeros(len(values), dtype=bool)
-    if known is None or not count or not len(values):
-        return marked
-    sigmas = known[2]
-    for expected in sigmas.min() * values.max() / sigmas[-count:]:
-        nearest = np.argmin(np.abs(np.log(values / expected)))
-        # with priors or bounds the errors may have directions of their own
-        marked[nearest] |= abs(np.log(values[nearest] / expected)) < _SAME
-    return marked
+    if len(sigmas):
+        _add_error_axis(axes, sigmas.min() * largest, threshold if n_open else low)
 
 
 def _add_error_axis(axes, noise, lowest):
@@ -290,7 +258,7 @@ def _draw_loadings(figure, axes, finding, rows):
     if not rows:
         _say(axes, "no open direction; errors are not known")
         return
-    places = element_places(finding.names)
+    places = st.element_places(finding.names)
     # signed of a single parameter, the norm of one given per wavelength
     parts = [[row.loadings[at] for at in places.values()] for row in rows]
     table = np.array([[p[0] if len(p) == 1 else np.linalg.norm(p) for p in row] for row in parts])
@@ -306,20 +274,15 @@ def _draw_loadings(figure, axes, finding, rows):
         _write(axes, j, i, table[i, j], signs[j])
     n_open = sum(row.name.startswith("open") for row in rows)
     if 0 < n_open < len(rows):
-        axes.axhline(n_open - 0.5, color=BLACK, linewidth=1)
+        axes.axhline(n_open - 0.5, color=st.BLACK, linewidth=1)
     figure.colorbar(image, ax=axes, pad=0.01, label="|loading|")
 
 
 def _write(axes, x, y, value, sign="-"):
     """Write a number into its cell, in white on dark ground."""
     color = "white" if abs(value) > _PALE else "black"
-    text = f"{value:{sign}.2f}".replace("-", MINUS)
+    text = f"{value:{sign}.2f}".replace("-", st.MINUS)
     axes.text(x, y, text, color=color, ha="center", va="center")
-
-
-def _wrapped(rows):
-    texts = [f"{row.name}: {row.words}" for row in rows if row.words]
-    return [x for t in texts for x in textwrap.wrap(t, _COLUMNS, subsequent_indent=" " * 5)]
 
 
 # ---- (c) half-wave-plate angles ---------------------------------------------------------------
@@ -347,7 +310,7 @@ def _draw_conditions(axes, finding, angles):
     values = np.array([found[harmonics] for harmonics, _ in SETS])
     top = 10 * max(values[np.isfinite(values)].max(initial=_POOR), _POOR)
     for i, value in enumerate(values):
-        look = {"color": BLUE} if value <= _POOR else {"color": VERMILION, "hatch": "//"}
+        look = {"color": st.BLUE} if value <= _POOR else {"color": st.VERMILION, "hatch": "//"}
         length = min(value, top)
         axes.barh(i, length - _LEFT, left=_LEFT, edgecolor="white", height=0.55, **look)
         if np.isfinite(value):
@@ -355,8 +318,8 @@ def _draw_conditions(axes, finding, angles):
         else:
             paper = {"facecolor": "white", "edgecolor": "none", "pad": 1}
             axes.text(1.1, i, f" {_INFINITE}: too few angles", va="center", bbox=paper)
-    axes.axvline(_POOR, color=BLACK, linestyle="--", linewidth=1)
-    axes.text(_POOR, -0.62, " poor beyond", va="center", fontsize=9.5, color=GREY)
+    axes.axvline(_POOR, color=st.BLACK, linestyle="--", linewidth=1)
+    axes.text(_POOR, -0.62, " poor beyond", va="center", fontsize=9.5, color=st.GREY)
     axes.set(xscale="log", xlim=(_LEFT, top * 8), ylim=(len(values) - 0.5, -0.9))
     names = ["harmonics " + ", ".join(map(str, harmonics)) for harmonics, _ in SETS]
     axes.set_yticks(range(len(SETS)), names)
@@ -368,7 +331,7 @@ def _say(axes, text):
     """Write a sentence where there is nothing to draw."""
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
-    note(axes, text, fontsize=9)
+    st.note(axes, text, fontsize=9)
 
 
 # ---- correlations ---------------------------------------------------------------------------
@@ -424,9 +387,9 @@ def plot_correlations(calibration, *, figure=None):
     known = np.isfinite(np.diag(matrix))
     groups, left_out = _by_stem(covariance.names, known), _by_stem(covariance.names, ~known)
     matrix = matrix[np.ix_(known, known)]
-    with canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4) as figure:
+    with st.canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4) as figure:
         axes = figure.add_subplot()
-        heading(figure, calibration, "Correlations of the parameters")
+        st.heading(figure, calibration, "Correlations of the parameters")
         if left_out:
             named = ", ".join(_labels(left_out))
             words = f"not shown, as the data do not determine them or at a bound: {named}"
@@ -441,7 +404,16 @@ def plot_correlations(calibration, *, figure=None):
         look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
         image = axes.pcolormesh(edges, edges, matrix, **look)
         axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
-        _name_groups(axes, edges, groups)
+        # every group is named in its middle, and parted from the next
+        ends = edges[np.cumsum([0] + [count for _, count in groups])]
+        places = (ends[1:] + ends[:-1]) / 2
+        turned = {"rotation": 45, "ha": "right", "rotation_mode": "anchor"}
+        axes.set_xticks(places, _labels(groups), **turned)
+        axes.set_yticks(places, _labels(groups))
+        axes.tick_params(length=0)
+        for border in ends[1:-1]:
+            axes.axhline(border, color="0.25", linewidth=0.6)
+            axes.axvline(border, color="0.25", linewidth=0.6)
         middles = (edges[1:] + edges[:-1]) / 2
         for i, j in zip(*np.nonzero(np.isfinite(matrix)), strict=True):
             if len(matrix) <= _FEW:
@@ -452,22 +424,9 @@ def plot_correlations(calibration, *, figure=None):
 
 def _by_stem(names, which):
     """Return name and number of the parameters that are marked, those of wavelengths together."""
-    places = element_places(names).items()
+    places = st.element_places(names).items()
     return [(stem, int(which[at].sum())) for stem, at in places if which[at].any()]
 
 
 def _labels(groups):
     return [f"{stem} ({count})" if count > 1 else stem for stem, count in groups]
-
-
-def _name_groups(axes, edges, groups):
-    """Name every group in its middle, and part it from the next."""
-    ends = np.cumsum([0] + [count for _, count in groups])
-    middles = [(edges[a] + edges[b]) / 2 for a, b in pairwise(ends)]
-    labels = _labels(groups)
-    axes.set_xticks(middles, labels, rotation=45, ha="right", rotation_mode="anchor")
-    axes.set_yticks(middles, labels)
-    axes.tick_params(length=0)
-    for border in edges[ends[1:-1]]:
-        axes.axhline(border, color="0.25", linewidth=0.6)
-        axes.axvline(border, color="0.25", linewidth=0.6)

@@ -4,6 +4,7 @@
 import base64
 import io
 import textwrap
+from contextlib import suppress
 from datetime import timedelta
 from itertools import pairwise
 
@@ -42,7 +43,14 @@ def _draw_entry(axes, calibration, entry, look):
     """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
     lam, (color, marker) = st.nanometres(calibration.wavelength), look
     if not entry["value"].ndim:
-        _draw_constant(axes, lam, entry, color)
+        ends = np.array([lam.min(), lam.max()])
+        value, std = float(entry["value"]), float(entry["std"])
+        label = _FIXED if entry["fixed"] else "one value for all wavelengths"
+        if not (np.isfinite(std) or entry["fixed"]):
+            label += ", at a bound" if entry["at_bound"] else ", not determined alone"
+        axes.plot(ends, [value, value], color=color, label=label)
+        if np.isfinite(std):
+            st.draw_band(axes, ends, value, std, color, 0.25)
     elif entry["fixed"] or entry["tied"]:
         label = f"follows {entry['tied']}" if entry["tied"] else _FIXED
         st.draw_line(axes, lam, entry["value"], color=color, linestyle=":", label=label)
@@ -58,19 +66,6 @@ def _draw_entry(axes, calibration, entry, look):
             box = {"marker": "s", "markersize": 12, "markerfacecolor": "none", "color": st.BLACK}
             box |= {"linestyle": "none", "clip_on": False, "label": _BOUND}
             axes.plot(lam[bound], value[bound], **box)
-
-
-def _draw_constant(axes, lam, entry, color):
-    """Draw a parameter that has one value for all wavelengths."""
-    ends = np.array([lam.min(), lam.max()])
-    value, std = float(entry["value"]), float(entry["std"])
-    kind = _FIXED if entry["fixed"] else "one value for all wavelengths"
-    note = "" if np.isfinite(std) or entry["fixed"] else ", at a bound"
-    if note and not entry["at_bound"]:
-        note = ", not determined alone"
-    axes.plot(ends, [value, value], color=color, label=kind + note)
-    if np.isfinite(std):
-        st.draw_band(axes, ends, value, std, color, 0.25)
 
 
 # ---- laws in wavelength ----------------------------------------------------------
@@ -89,11 +84,26 @@ def _draw_law(axes, calibration, leaf, known, look):
     axes.plot(lam, value, color=look[0], label=label)
     if std is not None:
         st.draw_band(axes, lam, value, std, look[0], 0.3)
-    _draw_stage(axes, calibration, leaf)
+    # those of a first stage that fitted one per wavelength
+    grid, name = st.nanometres(calibration.wavelength), f"{leaf.name}.retardance"
+    stages = [stage["parameters"].get(name) for stage in calibration.stages]
+    stages = [value for value in stages if value is not None and np.size(value) == grid.size]
+    for value in stages[:1]:
+        value = u.Quantity(value, u.deg).value
+        # a turn more or less is the same retarder: draw the one near the law
+        value = value - 360 * np.round((value - _retardance(leaf, grid)) / 360)
+        axes.plot(grid, value, "o", color=st.GREY, label=_STAGE)
     # lines break between the values alone
     words = ", ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in _words(free or own))
-    words = textwrap.wrap(words, _TITLE_WIDTH)
-    axes.set_title("\n".join([f"{leaf.name}: law", *words]))
+    axes.set_title("\n".join([f"{leaf.name}: law", *textwrap.wrap(words, _TITLE_WIDTH)]))
+
+
+def _words(own):
+    for key, entry in own.items():
+        std = entry["std"]
+        error = f" ± {float(std):.4f}" if np.ndim(std) == 0 and np.isfinite(std) else ""
+        if np.ndim(entry["value"]) == 0:
+            yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
 
 
 def _retardance(leaf, lam):
@@ -108,43 +118,19 @@ def _law_std(calibration, leaf, lam):
     matrix = calibration.covariance.matrix[np.ix_(index, index)]
     if not keys or not np.isfinite(matrix).all():
         return None
-    slopes = np.stack([_slope(leaf, key, lam) for key in keys])
+    slopes = []
+    for key in keys:
+        parameter = getattr(leaf, key)
+        unit = 1 if parameter.unit is None else parameter.unit
+        # central differences; relative, but for parameters that are zero
+        step = _STEP * max(abs(float(parameter.value)), 1e-6)
+        high, low = (
+            _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
+            for sign in (1, -1)
+        )
+        slopes.append((high - low) / (2 * step))
     # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
     return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
-
-
-def _slope(leaf, key, lam):
-    """Return the derivative of the law to a parameter, per its unit, by central differences."""
-    parameter = getattr(leaf, key)
-    unit = 1 if parameter.unit is None else parameter.unit
-    # relative, but for parameters that are zero
-    step = _STEP * max(abs(float(parameter.value)), 1e-6)
-    high, low = (
-        _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
-        for sign in (1, -1)
-    )
-    return (high - low) / (2 * step)
-
-
-def _draw_stage(axes, calibration, leaf):
-    """Draw the retardances of the first stage that fitted one per wavelength."""
-    lam = st.nanometres(calibration.wavelength)
-    for stage in calibration.stages:
-        value = stage["parameters"].get(f"{leaf.name}.retardance")
-        if value is not None and np.size(value) == lam.size:
-            value = u.Quantity(value, u.deg).value
-            # a turn more or less is the same retarder: draw the one near the law
-            value = value - 360 * np.round((value - _retardance(leaf, lam)) / 360)
-            axes.plot(lam, value, "o", color=st.GREY, label=_STAGE)
-            return
-
-
-def _words(own):
-    for key, entry in own.items():
-        std = entry["std"]
-        error = f" ± {float(std):.4f}" if np.ndim(std) == 0 and np.isfinite(std) else ""
-        if np.ndim(entry["value"]) == 0:
-            yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
 
 
 # ---- legend -----------------------------------------------------------------------
@@ -340,16 +326,13 @@ def plot_parameters(calibration, names=None, *, figure=None):
     def draw(axes, name, look):
         _draw_entry(axes, calibration, known[name], look)
         optic, _, key = name.rpartition(".")
-        axes.set(title=name, ylabel=_describe(getattr(optics[optic], key)))
+        parameter = getattr(optics[optic], key)
+        words = textwrap.fill(parameter.__doc__ or parameter.name, _LABEL_WIDTH)
+        if parameter.unit is not None and parameter.unit != u.dimensionless_unscaled:
+            words += f" ({'°' if parameter.unit == u.deg else parameter.unit})"
+        axes.set(title=name, ylabel=words)
 
     return _draw_all(figure, calibration, "Parameters for each wavelength", names, draw)
-
-
-def _describe(parameter):
-    words = textwrap.fill(parameter.__doc__ or parameter.name, _LABEL_WIDTH)
-    if parameter.unit is None or parameter.unit == u.dimensionless_unscaled:
-        return words
-    return f"{words} ({'°' if parameter.unit == u.deg else parameter.unit})"
 
 
 def _per_wavelength(known):
@@ -451,7 +434,10 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
         raise ChainError("the calibration has no mirror to draw")
     tables = [mirror_values(calibration, name) for name in names]
     # an empty dict is a wish to see none
-    reference = _published(calibration) if reference is None else reference
+    if reference is None:
+        reference = {}
+        with suppress(InstrumentError):
+            reference = instruments.get(calibration.instrument).published_mirrors()
     retards = any("retardance" in table.colnames for table in tables)
     rows = ["diattenuation", "retardance"][: 1 + retards]
     with st.canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows)) as figure:
@@ -478,13 +464,6 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
             handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
         st.legend_outside(figure, list(entries.values()), columns=2)
     return figure
-
-
-def _published(calibration):
-    try:
-        return instruments.get(calibration.instrument).published_mirrors()
-    except InstrumentError:
-        return {}
 
 
 def _draw_mirror(axes, calibration, table, key, reference):
@@ -622,11 +601,10 @@ def _mark_changes(ax, calibrations, own, name):
     held = {row["calibration"]: row["date"].mjd for row in own}
     crowded = len(held) > _MOST_MARKS
     for first, second in pairwise(named_by_date(calibrations)):
-        try:
+        found = None
+        with suppress(ParameterError, FitError):
             found = significance([_Named(*first), _Named(*second)], [name])
-        except (ParameterError, FitError):
-            continue
-        if not found.dof or not {first[0], second[0]} <= set(held):
+        if found is None or not found.dof or not {first[0], second[0]} <= set(held):
             continue
         if crowded and found.p_value >= _SEEN:
             # of many, those that changed
@@ -654,12 +632,8 @@ def draw_accuracies(group, goal=None, *, figure=None):
         if goal is not None:
             ax.axhline(goal, color=st.BLACK, ls="--", lw=1, label="goal")
         for one in group["events"]:
-            ax.axvspan(
-                *Time([one["from"], one["to"]], scale="tai").datetime,
-                color=st.GREY,
-                alpha=0.2,
-                lw=0,
-            )
+            span = Time([one["from"], one["to"]], scale="tai").datetime
+            ax.axvspan(*span, color=st.GREY, alpha=0.2, lw=0)
         ax.set(ylabel="accuracy (% of polarization)", xlabel="date of the calibration data (UTC)")
         # what is highest stays off the edge, even if it is all there is
         ax.set_ylim(0, 1.1 * ax.get_ylim()[1])

@@ -144,27 +144,22 @@ def _finish_corner(figure, posterior, columns, samples, marks):
     for axes in figure.axes:
         axes.grid(False)
         axes.tick_params(labelsize=8.5)
-    correlations = np.corrcoef(samples.T) if n > 1 else None
-    for row, column in zip(*np.tril_indices(n, -1), strict=True):
-        text = f"r = {correlations[row, column]:.4f}"
-        look = {"xycoords": "axes fraction", "va": "top", "bbox": _PAPER, "fontsize": 8.5}
-        panels[row, column].annotate(text, (0.04, 0.96), **look)
-    if marks is not None:
-        _mark(panels, marks, np.ptp(samples, axis=0))
+    correlations, widths = np.atleast_2d(np.corrcoef(samples.T)), np.ptp(samples, axis=0)
+    for row, column in zip(*np.tril_indices(n), strict=True):
+        axes = panels[row, column]
+        lines = [(axes.axvline, axes.get_xlim(), column)]
+        if row != column:
+            text = f"r = {correlations[row, column]:.4f}"
+            look = {"xycoords": "axes fraction", "va": "top", "bbox": _PAPER, "fontsize": 8.5}
+            axes.annotate(text, (0.04, 0.96), **look)
+            lines.append((axes.axhline, axes.get_ylim(), row))
+        for draw, (low, high), k in lines if marks is not None else ():
+            # the fitted value, where that does not change the range by much
+            if low - _NEAR * widths[k] < marks[k] < high + _NEAR * widths[k]:
+                draw(marks[k], color=VERMILION, linewidth=1.2)
     width, height = figure.get_size_inches()
     figure.subplots_adjust(left=_MARGIN / width, bottom=_MARGIN / height)
     figure.suptitle(_heading(posterior, marks is not None), x=0.98, ha="right", va="top", y=0.98)
-
-
-def _mark(panels, marks, widths):
-    """Draw the fitted values where that does not change the range by much."""
-    for row, column in zip(*np.tril_indices(len(marks)), strict=True):
-        axes = panels[row, column]
-        lines = [(axes.axvline, axes.get_xlim(), column)]
-        lines += [(axes.axhline, axes.get_ylim(), row)] if row != column else []
-        for draw, (low, high), k in lines:
-            if low - _NEAR * widths[k] < marks[k] < high + _NEAR * widths[k]:
-                draw(marks[k], color=VERMILION, linewidth=1.2)
 
 
 def _heading(posterior, marked):
@@ -220,7 +215,6 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     """
     columns = _columns(posterior, parameters, MAX_TRACES)
     thinned = posterior.is_thinned
-    beside = _histogram if thinned else _correlation
     with canvas(figure, 10, 1.6 + 1.7 * len(columns)) as figure:
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
@@ -228,18 +222,20 @@ def plot_traces(posterior, parameters=None, *, figure=None):
             # the larger of both strides keeps either limit
             every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
             trace.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
-            trace.plot(
-                steps[::every], np.median(chain[::every], axis=1), color=BLACK, linewidth=1.0
-            )
+            middle = np.median(chain[::every], axis=1)
+            trace.plot(steps[::every], middle, color=BLACK, linewidth=1.0)
             if posterior.burn_in:
                 # steps are counted before thinning
-                trace.axvspan(
-                    0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0
-                )
+                end = posterior.burn_in * posterior.thin
+                trace.axvspan(0, end, color=GREY, alpha=0.25, linewidth=0)
             # the chain begins at the axis, so that a burn-in is seen as such
             trace.margins(x=0)
             trace.set_ylabel(_label(posterior, column), fontsize=9.5)
-            beside(right, posterior, column)
+            (_histogram if thinned else _correlation)(right, posterior, column)
+            time = posterior.autocorrelation_times[column]
+            if np.isfinite(time):
+                look = {"xycoords": "axes fraction", "ha": "right", "va": "top", "bbox": _PAPER}
+                right.annotate(f"τ = {time:.0f}", (0.97, 0.9), **look)
         burn_in = "burn-in left out" if thinned else "grey: burn-in, left out"
         _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
         if thinned:
@@ -269,14 +265,6 @@ def _histogram(axes, posterior, column):
     axes.set_xticks([])
     axes.tick_params(labelleft=False)
     axes.grid(False)
-    _write_time(axes, posterior, column)
-
-
-def _write_time(axes, posterior, column):
-    time = posterior.autocorrelation_times[column]
-    if np.isfinite(time):
-        look = {"xycoords": "axes fraction", "ha": "right", "va": "top", "bbox": _PAPER}
-        axes.annotate(f"τ = {time:.0f}", (0.97, 0.9), **look)
 
 
 def _correlation(axes, posterior, column):
@@ -289,4 +277,3 @@ def _correlation(axes, posterior, column):
     axes.axhline(0, color=BLACK, linewidth=0.7)
     if np.isfinite(time):
         axes.axvline(time, color=VERMILION, linewidth=1.2)
-    _write_time(axes, posterior, column)

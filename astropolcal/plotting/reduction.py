@@ -115,7 +115,16 @@ def _draw_frame(panel, index, reduction, k):
             image[~good[k]] = np.nan
     _draw_image(panel, image)
     if reduction.source == "star":
-        _draw_circles(panel, frame.photometry, k, reduction.options.get("annulus", 5.0))
+        from matplotlib.patches import Circle
+
+        ring = reduction.options.get("annulus", 5.0)
+        for beam, name in enumerate(BEAMS):
+            r, x, y = (getattr(frame.photometry, key)[beam, k] for key in ("radius", "x", "y"))
+            # a spot that was not found has neither centre nor radius
+            if r > 0 and (x, y) != (0.0, 0.0):
+                look = {"fill": False, "ec": _COLORS[name]}
+                panel.add_patch(Circle((x, y), r, ls=_LINES[name], lw=1.6, **look))
+                panel.add_patch(Circle((x, y), r + ring, ls=":", lw=1.2, **look))
     else:
         from matplotlib.patches import Rectangle
 
@@ -147,18 +156,6 @@ def _draw_image(panel, image):
     drawn.set_cmap(drawn.cmap.with_extremes(bad=_GAP))
 
 
-def _draw_circles(panel, photometry, k, annulus):
-    from matplotlib.patches import Circle
-
-    for beam, name in enumerate(BEAMS):
-        r, x, y = (getattr(photometry, key)[beam, k] for key in ("radius", "x", "y"))
-        # a spot that was not found has neither centre nor radius
-        if r > 0 and (x, y) != (0.0, 0.0):
-            look = {"fill": False, "ec": _COLORS[name]}
-            panel.add_patch(Circle((x, y), r, ls=_LINES[name], lw=1.6, **look))
-            panel.add_patch(Circle((x, y), r + annulus, ls=":", lw=1.2, **look))
-
-
 def plot_run(reduction, *, wavelength=None, figure=None):
     """Draw fluxes, single differences, and places and widths of stars over the run."""
     _chosen(reduction, None)
@@ -168,8 +165,14 @@ def plot_run(reduction, *, wavelength=None, figure=None):
     with st.canvas(figure, 9.0, 11.0 if star else 6.0) as figure:
         axes = figure.subplots(5 if star else 2, 1, sharex=True)
         _draw_fluxes(axes[0], axes[1], reduction, clock, k)
-        if star:
-            _draw_places(axes[2:], reduction, clock, k)
+        labels = f"x {st.MINUS} median\n(pixel)", f"y {st.MINUS} median\n(pixel)", "FWHM (pixel)"
+        for panel, key, words in zip(axes[2:], ("x", "y", "fwhm"), labels, strict=False):
+            panel.set_ylabel(words)
+            for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
+                # centres of both beams are far apart; their motion is what is looked for
+                if key != "fwhm" and np.isfinite(values).any():
+                    values = values - np.nanmedian(values)
+                panel.plot(clock, values, **_look(name))
         axes[-1].set_xlabel(label)
         figure.suptitle(f"The run at {at}")
         figure.align_ylabels()
@@ -222,17 +225,6 @@ def _look(name):
     """Return the look of a beam's points; the left one is open, for the two often coincide."""
     fill = {"mfc": "none", "ms": 8} if name == "left" else {"ms": 5}
     return {"color": _COLORS[name], "marker": _MARKERS[name], "ls": ""} | fill
-
-
-def _draw_places(panels, reduction, clock, k):
-    labels = (f"x {st.MINUS} median\n(pixel)", f"y {st.MINUS} median\n(pixel)", "FWHM (pixel)")
-    for panel, key, label in zip(panels, ("x", "y", "fwhm"), labels, strict=True):
-        panel.set_ylabel(label)
-        for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
-            # centres of both beams are far apart; their motion is what is looked for
-            if key != "fwhm" and np.isfinite(values).any():
-                values = values - np.nanmedian(values)
-            panel.plot(clock, values, **_look(name))
 
 
 def save_quicklook(reduction, folder):

@@ -92,7 +92,20 @@ class DataGrid:
         angle = np.mod(np.rad2deg(plate) + SAME_ANGLE, 180) - SAME_ANGLE
         number, state = clusters(angle[0], SAME_ANGLE), self._state()
         settings = sorted(set(zip(number, state, strict=True)))
-        return [self._one_series(angle, (number == n) & (state == now), now) for n, now in settings]
+        found = []
+        for n, now in settings:
+            member = (number == n) & (state == now)
+            angles = [st.degrees(value) for value in np.median(angle[:, member], axis=1)]
+            # where the states of a modulator make the difference the plate is static
+            still = now and len(set(angles)) == 1
+            label = angles[0] if still else f" {st.MINUS} ".join(angles)
+            moving = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
+            positions = {stage: a.mean(axis=1) for stage, a in moving.items()}
+            if any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values()):
+                positions = None
+            label = f"{label}, {now}" if now else label
+            found.append(Series(label, np.flatnonzero(member), positions))
+        return found
 
     def _state(self):
         """Return the states of a modulator in the frames of a datum, empty without one."""
@@ -102,18 +115,6 @@ class DataGrid:
         # the states of the frames, or the one that all of them have
         names = [one if len(set(one)) > 1 else one[:1] for one in np.where(state, "B", "A")]
         return np.array([f" {st.MINUS} ".join(one) for one in names])
-
-    def _one_series(self, angle, member, state):
-        angles = [st.degrees(value) for value in np.median(angle[:, member], axis=1)]
-        # where the states of a modulator make the difference the plate is static
-        still = state and len(set(angles)) == 1
-        plate = angles[0] if still else f" {st.MINUS} ".join(angles)
-        label = f"{plate}, {state}" if state else plate
-        others = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
-        positions = {stage: angle.mean(axis=1) for stage, angle in others.items()}
-        if any(np.ptp(angle, axis=1).max() > np.deg2rad(SAME_ANGLE) for angle in others.values()):
-            positions = None
-        return Series(label, np.flatnonzero(member), positions)
 
     # ---- the model ---------------------------------------------------------------
 
@@ -237,18 +238,27 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
-            wavelength = drawn.wavelength[row]
-            s_res = spread[row]
-            top, bottom = pair
+            wavelength, s_res, (top, bottom) = drawn.wavelength[row], spread[row], pair
             bottom.axhline(0, color=st.GREY, linewidth=1)
             known = np.isfinite(s_res)
             top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
             if known:
                 bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
             for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
-                _draw_series(pair, drawn, row, one, look)
+                angle, points = drawn.abscissa[0][one.data], look | {"linestyle": "none"}
+                value, residual, sigma = (
+                    a[row, one.data] for a in (drawn.observed, drawn.residual, drawn.sigma)
+                )
+                # bars of length zero would look like errors that are very small
+                bars = np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
+                percent = bars if bars is None else 100 * bars
+                top.errorbar(angle, value, yerr=bars, label=one.label, **points)
+                bottom.errorbar(angle, 100 * residual, yerr=percent, label=one.label, **points)
                 if curve is not None:
-                    pair[0].plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
+                    top.plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
+                else:
+                    # where a stage moves from datum to datum there is no model between the data
+                    top.plot(angle, value - residual, "x", color=look["color"], markersize=8)
         _label(pairs, drawn, columns)
         st.heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
         _legend(figure, drawn, series, bins, spread[bins])
@@ -277,19 +287,6 @@ def _looks(count):
         | {"markerfacecolor": "white" if again else color, "linestyle": "--" if again else "-"}
         for (color, marker), again in pairs
     ]
-
-
-def _draw_series(pair, grid, row, one, look):
-    """Draw the data of one setting of the half-wave plate, and their residuals."""
-    angle, points = grid.abscissa[0][one.data], look | {"linestyle": "none", "label": one.label}
-    value, residual, sigma = (a[row, one.data] for a in (grid.observed, grid.residual, grid.sigma))
-    # bars of length zero would look like errors that are very small
-    bars = np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
-    pair[0].errorbar(angle, value, yerr=bars, **points)
-    pair[1].errorbar(angle, 100 * residual, yerr=bars if bars is None else 100 * bars, **points)
-    # where a stage moves from datum to datum there is no model between the data
-    if one.positions is None:
-        pair[0].plot(angle, value - residual, "x", color=look["color"], markersize=8)
 
 
 def _fine(angle):

@@ -97,26 +97,17 @@ def save_all(calibration, folder):
         # no such optic, no data in a file, or no datum left: the figure has nothing to show
         with suppress(ChainError, CalibrationFileError, ObservationError):
             paths.append(save(draw(), folder / f"{name}.png"))
-    if calibration.posterior is not None:
-        paths += _save_posterior(calibration.posterior, folder)
-    return paths
-
-
-def _save_posterior(posterior, folder):
-    paths = []
-    for name, draw, most in (
-        ("traces", plot_traces, MAX_TRACES),
-        ("corner", plot_corner, MAX_CORNER),
-    ):
-        path = folder / f"{name}.png"
+    kinds = {"traces": (plot_traces, MAX_TRACES), "corner": (plot_corner, MAX_CORNER)}
+    for name, (draw, most) in kinds.items() if calibration.posterior is not None else ():
+        path, posterior = folder / f"{name}.png", calibration.posterior
         try:
             figure = draw(posterior, _drawn(posterior, most, fill=draw is plot_traces))
         # a package that is not installed, or a parameter that did not move, costs one figure, not
         # all
         except AstropolcalError as error:
-            warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=3)
-            continue
-        paths.append(save(figure, path))
+            warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=2)
+        else:
+            paths.append(save(figure, path))
     return paths
 
 

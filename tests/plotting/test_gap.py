@@ -209,7 +209,8 @@ def test_verdict_as_a_title():
         ("unexplained", ["beam_gain"], "a real gap that is not explained"),
     ):
         own = diagnosis(*map(cause, causes), verdict=verdict)
-        assert figures._verdict_line(own) == line
+        figure = figures._finish(Figure(), None, own, "Gap")
+        assert figure.get_suptitle() == f"Gap\n{line}"
 
 
 # ---- sizes ---------------------------------------------------------------------------------
