@@ -110,8 +110,7 @@ def _star(text):
     """Return the arguments of `Corrected.without_star`."""
     try:
         if text.startswith("annulus="):
-            inner, outer = (plain_number(part) for part in text.removeprefix("annulus=").split(","))
-            return {"annulus": (inner, outer)}
+            return {"annulus": tuple(common.numbers(text.removeprefix("annulus="), 2))}
         (dolp, s_dolp), (aolp, s_aolp) = (_with_error(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(

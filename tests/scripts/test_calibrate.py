@@ -239,6 +239,7 @@ def test_impossible_targets_get_one_line(tables, capsys):
         "1,x",
         "1,2,3",
         "1um",
+        "0.1 2",
         "1,5%",
         "5,200",
         "5,-181",
