@@ -12,12 +12,13 @@ of a ring of 5 pixels around it is the background.
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.nddata import Cutout2D
 from numpy.polynomial.legendre import legvander
 from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
-from astropolcal.reduction.finding import find_images, find_pair, fit_gaussians
+from astropolcal.reduction.finding import find_star, fit_gaussians
 from astropolcal.reduction.photometry import Photometry, flux_variance, shared_pixels
 from astropolcal.reduction.wings import wing_shares
 
@@ -67,11 +68,11 @@ def measure_stars(
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
     mean, known = _mean(cube, good)
-    if layout.two_beams and not layout.star_offsets:
-        pair = find_pair(mean, known, layout.star_offset, fwhm=layout.fwhm, companion=companion)
-    else:
-        places = layout.star_offsets or ((0.0, 0.0),) * len(layout.beams)
-        pair = find_images(mean, known, places, fwhm=layout.fwhm, companion=companion)
+    # of two beams the right image is so far from the left one
+    here = (0.0, 0.0)
+    usual = (layout.star_offset, here) if layout.two_beams else (here,) * len(layout.beams)
+    places = layout.star_offsets or usual
+    pair = find_star(mean, known, places, fwhm=layout.fwhm, companion=companion)
     if pair.reason:
         result.flag(True, pair.reason)
         return result
@@ -82,7 +83,15 @@ def measure_stars(
     _judge(result, fits, origin, pair)
     result.radius[:] = _radii(result.fwhm, radius, factor, max_radius, mean, known, pair)
     run = _Cube(cube, good, fits, origin, detector, layout.edge, annulus, max_masked)
-    level_variance = _measure(result, run)
+    # what the noise of the background adds to the variance of a flux
+    level_variance = np.zeros_like(result.flux)
+    for k in np.flatnonzero(~result.failed):
+        found = run.measured(result, k, result.radius[0, k])
+        if isinstance(found, str):
+            result.flag(np.arange(len(cube)) == k, found)
+        else:
+            result.flux[:, k], result.variance[:, k], result.background[:, k] = found[:3]
+            level_variance[:, k] = found[3]
     usable = ~result.failed
     if layout.two_beams:
         # between both images of a slice
@@ -120,8 +129,6 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked, correctio
 
 def _mean(cube, good):
     """Return the mean of the slices, and where at least one has a value."""
-    if good.all():
-        return cube.mean(axis=0, dtype=float), np.ones(cube.shape[1:], dtype=bool)
     number = good.sum(axis=0)
     total = np.where(good, cube, 0.0).sum(axis=0, dtype=float)
     # a pixel known in few slices would show their level, not that of the rest
@@ -200,10 +207,27 @@ def _radii(fwhm, radius, factor, max_radius, mean, known, pair):
         return np.minimum(factor * typical, max_radius)
     if radius != "growth":
         return float(radius)
-    image = np.where(known, mean, np.median(mean[known]))
-    radii = np.arange(1.0, max_radius + 0.5)
-    curves = [curve_of_growth(image, place, radii) for place in pair.positions]
-    return choose_radius(radii, np.mean(curves, axis=0))
+    return growth_radius(np.where(known, mean, np.median(mean[known])), pair.positions, max_radius)
+
+
+def growth_radius(image, places, largest, fraction=0.99):
+    """Return the radius in which the mean curve of growth reaches a part of that in the largest."""
+    from photutils.profiles import CurveOfGrowth
+
+    radii, curves = np.arange(1.0, largest + 0.5), []
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    for x, y in places:
+        distance = np.hypot(columns - x, rows - y)
+        ring = (distance > radii[-1]) & (distance < radii[-1] + 10)
+        level = np.median(image[ring]) if ring.any() else 0.0
+        curve = np.asarray(CurveOfGrowth(image - level, (x, y), radii).profile, dtype=float)
+        if not curve[-1] > 0:
+            raise ParameterError(f"no light within {radii[-1]:g} pixels of ({x:g}, {y:g})")
+        curves.append(curve / curve[-1])
+    curve = np.maximum.accumulate(np.mean(curves, axis=0))
+    first = int(np.argmax(curve >= fraction))
+    around = slice(max(first - 1, 0), first + 1)
+    return float(np.interp(fraction, curve[around], radii[around]))
 
 
 @dataclass(frozen=True)
@@ -219,104 +243,71 @@ class _Cube:
     annulus: float
     max_masked: float
 
-
-def _measure(result, cube):
-    """Sum the apertures of all slices that have not failed; return the levels' variances."""
-    level_variance = np.zeros_like(result.flux)
-    for k in np.flatnonzero(~result.failed):
-        found = _both(result, cube, k, result.radius[0, k])
-        if isinstance(found, str):
-            result.flag(np.arange(len(result.reasons)) == k, found)
-        else:
-            result.flux[:, k], result.variance[:, k], result.background[:, k] = found[:3]
-            level_variance[:, k] = found[3]
-    return level_variance
-
-
-def _both(result, cube, k, radius):
-    """Return flux, variance, background and its share in the variance, or why there are none."""
-    places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
-    found = [_aperture(cube, k, beam, places, radius) for beam in range(len(places))]
-    wrong = [one for one in found if isinstance(one, str)]
-    return wrong[0] if wrong else np.transpose(found)
+    def measured(self, result, k, radius):
+        """Return what `_aperture` does of each beam in a slice, (4, n_beams), or why it cannot."""
+        places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
+        found = [_aperture(self, k, beam, places, radius) for beam in range(len(places))]
+        wrong = [one for one in found if isinstance(one, str)]
+        return wrong[0] if wrong else np.transpose(found)
 
 
 def _aperture(cube, k, beam, places, radius):
-    """Return what `_flux` does of one aperture, or why it cannot be used."""
+    """
+    Return flux, its variance, background, and what the latter's noise adds to the variance.
+
+    Or why the aperture cannot be used.
+    """
     from photutils.aperture import CircularAperture
 
-    place, image, detector = places[beam], cube.cube[k], cube.detector.of(beam)
+    place, detector, (rows, columns) = places[beam], cube.detector.of(beam), cube.cube.shape[1:]
     # pixel 0 begins at -0.5
-    room = min(*place, image.shape[1] - 1 - place[0], image.shape[0] - 1 - place[1]) - radius + 0.5
-    if room < cube.edge:
+    if min(*place, columns - 1 - place[0], rows - 1 - place[1]) - radius + 0.5 < cube.edge:
         return "edge"
-    mask = CircularAperture(place, radius).to_mask(method="exact")
-    image, known, corner, inner = _cut(image, cube.good[k], mask.bbox, cube.annulus)
-    ring = image[known & _ring(image.shape, places - corner, beam, radius, cube.annulus)]
-    if ring.size < _FEWEST:
+    # with room for the ring
+    cut = Cutout2D(cube.cube[k], place, 2 * int(np.ceil(radius + cube.annulus)) + 3)
+    known = cube.good[k][cut.slices_original]
+    image = np.where(known, cut.data, 0.0).astype(float)
+    rows, columns = np.indices(image.shape)
+    places = places - cut.origin_original
+    distance = [np.hypot(columns - x, rows - y) for x, y in places]
+    ring = known & (distance[beam] >= radius) & (distance[beam] <= radius + cube.annulus)
+    # the other images of the star are no background
+    for other in distance[:beam] + distance[beam + 1 :]:
+        ring &= other > radius + cube.annulus
+    if ring.sum() < _FEWEST:
         return "no background"
-    inside, there = image[inner], known[inner]
-    if mask.data[~there].sum() > cube.max_masked * mask.data.sum():
+    weights = CircularAperture(places[beam], radius).to_mask(method="exact")
+    weights = weights.to_image(image.shape)
+    area, inside = weights.sum(), weights > 0
+    if weights[~known].sum() > cube.max_masked * area:
         return "aperture masked"
-    if inside[(mask.data > 0) & there].max() >= detector.saturation:
+    if image[inside & known].max() >= detector.saturation:
         return "saturated"
-    if not there.all():
-        gauss = (cube.fits, beam * len(cube.cube) + k, cube.origin[beam])
-        inside = _filled(image, known, gauss, corner)[inner]
-    return _flux(inside, mask.data, ring, detector)
-
-
-def _ring(shape, places, beam, radius, annulus):
-    """Return the pixels of the ring around a star's image, without those near the others."""
-    rows, columns = np.ogrid[: shape[0], : shape[1]]
-    own, *others = (np.hypot(columns - x, rows - y) for x, y in np.roll(places, -beam, axis=0))
-    ring = (own >= radius) & (own <= radius + annulus)
-    for other in others:
-        ring &= other > radius + annulus
-    return ring
-
-
-def _flux(inside, weights, ring, detector):
-    """Return flux, its variance, background, and what the latter's noise adds to the variance."""
-    level = float(np.median(ring))
-    area = weights.sum()
-    flux = float((weights * inside).sum() - level * area)
+    level = float(np.median(image[ring]))
+    spread = MAD_TO_SIGMA * np.median(np.abs(image[ring] - level))
+    if not known[inside].all():
+        # the Gaussian, and what nearby pixels have beyond it
+        x, y = np.subtract(cut.origin_original, cube.origin[beam])
+        model = cube.fits.image(beam * len(cube.cube) + k, columns + x, rows + y)
+        weight = ndimage.gaussian_filter(known.astype(float), 1.0, mode="constant")
+        beyond = np.where(known, image - model, 0.0)
+        nearby = ndimage.gaussian_filter(beyond, 1.0, mode="constant") / np.maximum(weight, 1e-3)
+        image = np.where(known, image, model + nearby)
+    flux = float((weights * image).sum() - level * area)
     if flux <= 0:
         return "lost star"
-    spread = MAD_TO_SIGMA * np.median(np.abs(ring - level))
     # what the ring shows, but never less than the detector's own noise
     pixel = max(spread**2, float(detector.variance(level)))
-    photons = detector.photon_noise(float((weights**2 * np.maximum(inside - level, 0.0)).sum()))
-    without = flux_variance(photons, area, pixel)
-    variance = flux_variance(photons, area, pixel, ring.size)
-    return flux, float(variance), level, float(variance - without)
-
-
-def _cut(image, good, box, annulus):
-    """Return the image around an aperture with room for the ring, and where it begins."""
-    room = int(np.ceil(annulus)) + 1
-    y0, x0 = max(box.iymin - room, 0), max(box.ixmin - room, 0)
-    part = (slice(y0, box.iymax + room), slice(x0, box.ixmax + room))
-    inner = (slice(box.iymin - y0, box.iymax - y0), slice(box.ixmin - x0, box.ixmax - x0))
-    return np.asarray(image[part], dtype=float), good[part], (x0, y0), inner
-
-
-def _filled(image, known, gauss, corner):
-    """Return the image with the Gaussian, and what is beyond it nearby, where values lack."""
-    fits, k, origin = gauss
-    rows, columns = np.indices(image.shape)
-    model = fits.image(k, columns + corner[0] - origin[0], rows + corner[1] - origin[1])
-    beyond = np.where(known, image - model, 0.0)
-    weight = ndimage.gaussian_filter(known.astype(float), 1.0, mode="constant")
-    nearby = ndimage.gaussian_filter(beyond, 1.0, mode="constant") / np.maximum(weight, 1e-3)
-    return np.where(known, image, model + nearby)
+    photons = detector.photon_noise(float((weights**2 * np.maximum(image - level, 0.0)).sum()))
+    variance = flux_variance(photons, area, pixel, ring.sum())
+    return flux, variance, level, variance - flux_variance(photons, area, pixel)
 
 
 def _growth_shares(result, cube, reach):
     """Return which part of the flux in wider circles both beams together have, and its noise."""
     share, spread = np.full((2, len(result.reasons)), np.nan)
     for k in np.flatnonzero(~result.failed):
-        wide = _both(result, cube, k, reach)
+        wide = cube.measured(result, k, reach)
         if isinstance(wide, str):
             continue
         total = wide[0].sum()
@@ -357,31 +348,3 @@ def _smooth(values, covariance, known):
     excess = max(1.0, (residuals**2).sum() / freedom) if freedom else 1.0
     spread = inverse @ covariance @ inverse.T * excess
     return terms @ inverse @ values, np.sqrt(np.einsum("ki,ij,kj->k", terms, spread, terms))
-
-
-def curve_of_growth(image, place, radii):
-    """
-    Return the flux within circles around a star, as part of that within the largest.
-
-    The radii (pixels) increase; the median of a ring beyond the largest is subtracted.
-    """
-    from photutils.profiles import CurveOfGrowth
-
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    distance = np.hypot(columns - place[0], rows - place[1])
-    ring = (distance > radii[-1]) & (distance < radii[-1] + 10)
-    level = np.median(image[ring]) if ring.any() else 0.0
-    curve = np.asarray(CurveOfGrowth(image - level, place, radii).profile, dtype=float)
-    if not curve[-1] > 0:
-        raise ParameterError(f"no light within {radii[-1]:g} pixels of {place}")
-    return curve / curve[-1]
-
-
-def choose_radius(radii, curve, fraction=0.99):
-    """Return the radius within which a curve of growth reaches a fraction of its end."""
-    if not 0 < fraction < 1:
-        raise ParameterError(f"fraction = {fraction:g}; allowed is between 0 and 1")
-    curve = np.maximum.accumulate(curve / curve[-1])
-    first = int(np.argmax(curve >= fraction))
-    around = slice(max(first - 1, 0), first + 1)
-    return float(np.interp(fraction, curve[around], radii[around]))

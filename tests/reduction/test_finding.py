@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reduction_lab import star_image
 
-from astropolcal.reduction.finding import find_pair
+from astropolcal.reduction.finding import find_star
 
 SHAPE, OFFSET = (60, 90), (40.0, 12.0)
 
@@ -25,7 +25,7 @@ def both(x=20.0, y=20.0, factor=1.0):
 
 def found(array, good=None, **options):
     good = np.isfinite(array) if good is None else good
-    return find_pair(array, good, OFFSET, **options)
+    return find_star(array, good, (OFFSET, (0.0, 0.0)), **options)
 
 
 @settings(max_examples=20)
@@ -66,9 +66,8 @@ def test_offset_may_be_wrong_by_the_tolerance():
 
 def test_faint_star_is_found_only_if_it_is_significant():
     # smoothing leaves about a quarter of the noise of a pixel
-    array = image(*both(factor=0.02), noise=1.0)
-    assert found(array).reason == ""
-    assert found(array, significance=60.0).reason == "no star"
+    assert found(image(*both(factor=0.02), noise=1.0)).reason == ""
+    assert found(image(*both(factor=0.002), noise=1.0)).reason == "no star"
 
 
 def test_bright_bad_pixels_are_no_star():

@@ -6,12 +6,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.exceptions import ParameterError
-from astropolcal.reduction.finding import _model, _sane, _step, fit_gaussians
+from astropolcal.reduction.finding import _model, _step, fit_gaussians
 
 SIZE = 25
 GRID = tuple(axis.ravel().astype(float) for axis in np.indices((SIZE, SIZE))[::-1])
 P = np.array([[100.0, 11.3, 12.8, 0.2, 0.05, 0.1, 7.0], [30.0, 13.0, 10.0, 0.05, 0.0, 0.3, -2.0]])
+
+
+def fit(images, good=None):
+    """Fit images from the middle."""
+    good = np.isfinite(images) if good is None else good
+    return fit_gaussians(images, good, x=12, y=12, fwhm=4)
 
 
 def ellipse(sigma_long, sigma_short, angle, x=12.2, y=11.7, amplitude=50.0, background=3.0):
@@ -36,19 +41,19 @@ def test_derivatives_agree_with_central_differences():
 @settings(max_examples=15)
 @given(st.floats(2.2, 3.5), st.floats(1.2, 2.0), st.floats(-1.5, 1.5))
 def test_axes_of_a_turned_ellipse(long, short, angle):
-    fit = fit_gaussians(ellipse(long, short, angle)[None], x=12, y=12, fwhm=4)
+    found = fit(ellipse(long, short, angle)[None])
     factor = np.sqrt(8 * np.log(2))
-    assert fit.fwhm[0] == pytest.approx(factor * np.sqrt(long * short), rel=1e-3)
-    assert fit.elongation[0] == pytest.approx(long / short, rel=1e-3)
-    assert (fit.x[0], fit.y[0]) == pytest.approx((12.2, 11.7), abs=1e-3)
-    assert (fit.amplitude[0], fit.background[0]) == pytest.approx((50.0, 3.0), rel=1e-3)
-    assert fit.converged[0]
+    assert found.fwhm[0] == pytest.approx(factor * np.sqrt(long * short), rel=1e-3)
+    assert found.elongation[0] == pytest.approx(long / short, rel=1e-3)
+    assert (found.x[0], found.y[0]) == pytest.approx((12.2, 11.7), abs=1e-3)
+    assert (found.amplitude[0], found.background[0]) == pytest.approx((50.0, 3.0), rel=1e-3)
+    assert found.converged[0]
 
 
 def test_image_of_a_fit_is_what_was_fitted():
     data = ellipse(3.0, 1.5, 0.7)
-    fit = fit_gaussians(np.stack([ellipse(2, 2, 0), data]), x=12, y=12, fwhm=4)
-    again = fit.image(1, *GRID).reshape(SIZE, SIZE)
+    found = fit(np.stack([ellipse(2, 2, 0), data]))
+    again = found.image(1, *GRID).reshape(SIZE, SIZE)
     np.testing.assert_allclose(again, data, atol=1e-2)
 
 
@@ -75,34 +80,19 @@ def test_damping_shortens_the_step():
     assert lengths[2] < lengths[0] / 50
 
 
-def test_only_closed_ellipses_are_sane():
-    for shape, sane in [
-        ((1, 0, 1), True),
-        ((1, 0.9, 1), True),
-        ((1, 1.1, 1), False),
-        ((-1, 0, -1), False),
-        ((1, 0, -1), False),
-        ((np.nan, 0, 1), False),
-        ((1, -1.0, 1), False),
-    ]:
-        p = np.array([[1.0, 0.0, 0.0, *shape, 0.0]])
-        assert _sane(p).tolist() == [sane], (shape, sane)
-
-
-def test_noise_is_the_rms_of_the_residuals():
+def test_centres_scatter_about_the_place():
     rng = np.random.default_rng(6)
     images = ellipse(2, 2, 0, amplitude=500.0) + rng.normal(0, 4.0, (30, SIZE, SIZE))
-    fit = fit_gaussians(images, x=12, y=12, fwhm=4.7)
-    assert fit.noise.mean() == pytest.approx(4.0, rel=0.01)
-    # centres scatter by about noise over slope, and are not shifted
-    assert abs(fit.x.mean() - 12.2) < 4 * fit.x.std() / np.sqrt(30)
+    found = fit(images)
+    assert 0 < found.x.std() < 0.1
+    assert abs(found.x.mean() - 12.2) < 4 * found.x.std() / np.sqrt(30)
 
 
 def test_an_image_does_not_depend_on_its_neighbours():
     images = np.stack([ellipse(2, 2, 0), ellipse(3, 1.5, 1.0), np.zeros((SIZE, SIZE))])
-    together = fit_gaussians(images, x=12, y=12, fwhm=4)
+    together = fit(images)
     for k, image in enumerate(images):
-        alone = fit_gaussians(image[None], x=12, y=12, fwhm=4)
+        alone = fit(image[None])
         np.testing.assert_allclose(alone.x, together.x[k : k + 1], rtol=1e-9)
         np.testing.assert_allclose(alone.shape, together.shape[k : k + 1], rtol=1e-6)
 
@@ -112,12 +102,5 @@ def test_masked_pixels_do_not_count_whatever_they_hold():
     good[10:13, 12], good[3, 3] = False, False
     spoilt = np.where(good, clean, np.nan)
     spoilt[3, 3] = 1e9
-    fit = fit_gaussians(spoilt[None], good[None], x=12, y=12, fwhm=4)
-    assert (fit.x[0], fit.y[0]) == pytest.approx((12.2, 11.7), abs=1e-3)
-
-
-def test_shapes_must_agree():
-    for shape, good in [((SIZE, SIZE), None), ((1, 5, 5), (1, 5, 4))]:
-        mask = None if good is None else np.ones(good, dtype=bool)
-        with pytest.raises(ParameterError, match=r"both must be \(K, rows, columns\)"):
-            fit_gaussians(np.zeros(shape), mask, x=1, y=1, fwhm=1)
+    found = fit(spoilt[None], good[None])
+    assert (found.x[0], found.y[0]) == pytest.approx((12.2, 11.7), abs=1e-3)

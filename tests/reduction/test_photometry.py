@@ -13,14 +13,14 @@ from photutils.aperture import CircularAperture, aperture_photometry
 from reduction_lab import Small, expose, pair, star_image
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.reduction.finding import find_pair, fit_gaussians
+from astropolcal.reduction.finding import find_star, fit_gaussians
 from astropolcal.reduction.photometry import (
     detector_of,
     measure_internal,
     rectangles,
     shared_pixels,
 )
-from astropolcal.reduction.stars import choose_radius, curve_of_growth, measure_stars
+from astropolcal.reduction.stars import growth_radius, measure_stars
 
 LAYOUT = Small.files
 DETECTOR = detector_of(LAYOUT)
@@ -152,7 +152,7 @@ def test_fit_agrees_with_astropy():
             900, *rng.uniform(11, 13, 2), *rng.uniform(1.5, 3.0, 2), theta=rng.uniform(0, 3)
         )
         images.append(model(x, y) + 12.0 + rng.normal(0, 4, x.shape))
-    fits = fit_gaussians(np.array(images), x=12, y=12, fwhm=5)
+    fits = fit_gaussians(np.array(images), np.ones((len(images), 25, 25), bool), x=12, y=12, fwhm=5)
     assert fits.converged.all()
     for k, image in enumerate(images):
         start = models.Gaussian2D(800, 12, 12, 2, 2.2) + models.Const2D(0)
@@ -171,22 +171,20 @@ def test_fit_finds_what_was_put_in(dx, dy, fwhm):
     y, x = np.indices((31, 31))
     sigma = fwhm / 2.354820045
     image = 50 * np.exp(-((x - 15 - dx) ** 2 + (y - 15 - dy) ** 2) / (2 * sigma**2)) - 3
-    fits = fit_gaussians(image[None], x=15, y=15, fwhm=5)
+    fits = fit_gaussians(image[None], np.isfinite(image)[None], x=15, y=15, fwhm=5)
     assert fits.x[0] == pytest.approx(15 + dx, abs=1e-3)
     assert fits.y[0] == pytest.approx(15 + dy, abs=1e-3)
     assert fits.fwhm[0] == pytest.approx(fwhm, rel=1e-3)
     assert fits.elongation[0] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_fit_ignores_bad_pixels_and_refuses_wrong_shapes():
+def test_fit_ignores_bad_pixels():
     image = star_image([(12, 12)], flux=1e4, shape=(25, 25))
     spoiled, good = image.copy(), np.ones(image.shape, dtype=bool)
     good[12, 13] = False
     spoiled[12, 13] = np.nan
     fits = fit_gaussians(spoiled[None], good[None], x=12, y=12, fwhm=5)
     assert (fits.x[0], fits.y[0]) == pytest.approx((12, 12), abs=1e-4)
-    with pytest.raises(ParameterError, match="shape"):
-        fit_gaussians(image, x=12, y=12, fwhm=5)
 
 
 # --- stars -----------------------------------------------------------------------
@@ -377,7 +375,7 @@ def test_star_options_are_checked(star_cube):
 
 def test_pair_has_right_beam_first_and_prefers_the_bright_one():
     image = star_image(pair(LAYOUT) + pair(LAYOUT, 40.0, 50.0, 0.05))
-    found = find_pair(image, np.isfinite(image), LAYOUT.star_offset)
+    found = find_star(image, np.isfinite(image), (LAYOUT.star_offset, (0.0, 0.0)))
     np.testing.assert_allclose(found.positions[1], (70.3, 85.2), atol=0.6)
     np.testing.assert_allclose(found.positions[0] - found.positions[1], (63.5, 33.1), atol=1.0)
     assert found.fwhm == pytest.approx(5.0, rel=0.3)
@@ -385,16 +383,12 @@ def test_pair_has_right_beam_first_and_prefers_the_bright_one():
 
 def test_curve_of_growth_of_a_gaussian():
     image = star_image([(50, 50)], fwhm=6.0, shape=(101, 101))
-    radii = np.arange(1.0, 31.0)
-    curve = curve_of_growth(image, (50, 50), radii)
     sigma = 6.0 / 2.354820045
-    np.testing.assert_allclose(curve, 1 - np.exp(-(radii**2) / (2 * sigma**2)), atol=0.02)
-    assert np.all(np.diff(curve) > -1e-9)
-    assert choose_radius(radii, curve, 0.5) == pytest.approx(sigma * np.sqrt(2 * np.log(2)), 0.05)
-    with pytest.raises(ParameterError, match="fraction"):
-        choose_radius(radii, curve, 1.0)
+    for fraction in (0.5, 0.99):
+        expected = sigma * np.sqrt(-2 * np.log(1 - fraction))
+        assert growth_radius(image, [(50, 50)], 30.0, fraction) == pytest.approx(expected, 0.05)
     with pytest.raises(ParameterError, match="no light"):
-        curve_of_growth(np.zeros((101, 101)), (50, 50), radii)
+        growth_radius(np.zeros((101, 101)), [(50, 50)], 30.0)
 
 
 # --- errors ----------------------------------------------------------------------
