@@ -69,17 +69,13 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     if not os.path.isdir(path.parent):
         raise error(f"{path}: cannot be written: there is no folder {path.parent}")
     for source in sources:
-        if _is_same(path, source):
+        same = False
+        # one of them may not be there
+        with suppress(OSError, ValueError):
+            same = os.path.samefile(path, source)
+        if same:
             raise error(f"{path}: what is to be written was made from this file; name another one")
     return path
-
-
-def _is_same(path, other):
-    try:
-        return os.path.samefile(path, other)
-    except (OSError, ValueError):
-        # one of them is not there
-        return False
 
 
 @contextmanager
@@ -186,12 +182,19 @@ def _standard_stream(path):
 
 
 def append_line(path, line, error=AstropolcalError):
-    """Append a line to a file, which is on the disk then; all of it or nothing."""
+    """
+    Append a line to a file, which is on the disk then; all of it or nothing.
+
+    A last line that was cut off, as its writer was killed, is ended first.
+    """
     path = _named(path, error)
     try:
         is_new = not os.path.exists(path)
-        with open(path, "ab", buffering=0) as stream:
+        with open(path, "a+b", buffering=0) as stream:
             size = stream.seek(0, os.SEEK_END)
+            if size:
+                stream.seek(-1, os.SEEK_END)
+                line = line if stream.read(1) == b"\n" else f"\n{line}"
             try:
                 write_bytes(stream.fileno(), f"{line}\n".encode())
                 os.fsync(stream.fileno())

@@ -19,7 +19,7 @@ from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
 from astropolcal.reduction.cubes import both_states, simulate_cubes
 from astropolcal.reduction.headers import read_header
-from astropolcal.reduction.images import Detector as SimulatedDetector
+from astropolcal.reduction.images import expose
 from astropolcal.reduction.photometry import Detector, detector_of
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
@@ -177,9 +177,9 @@ def test_excess_noise_doubles_the_photon_noise(em_gain, electrons):
 
 
 def test_simulated_multiplication_has_mean_and_scatter_of_a_register():
-    detector = SimulatedDetector(0.015, 0.3, np.zeros(1), np.inf, True, np.sqrt(2))
+    how = ReadOut(0.015, 0.3, excess_noise=np.sqrt(2))
     light = np.full((1, 200, 200), 400.0 / 0.015)
-    image, weight = detector.expose(light, 1.0, np.random.default_rng(5))
+    image, weight = expose(light, how, 1.0, np.random.default_rng(5))
     electrons = image * 0.015
     assert electrons.mean() == pytest.approx(400, rel=1e-3)
     assert electrons.var() == pytest.approx(2 * 400, rel=0.03)

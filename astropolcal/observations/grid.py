@@ -93,8 +93,20 @@ def build_grid(table, label):
     table = check_table(table, label, (*REQUIRED, "flux") if single else (*REQUIRED, *BEAMS))
     frame = _integers(table, "frame", label)
     bins = _integers(table, "bin", label)
-    wavelength = _wavelengths(table, label)
-    angles = {name: _angle(table, name, label) for name in _ANGLES if name in table.colnames}
+    micrometres, (low, high) = numeric_column(table, "wavelength", label, u.um), _WAVELENGTHS
+    wrong = ~((micrometres >= low) & (micrometres <= high))
+    # in the unit of the limits, whatever that of the table
+    shown, allowed = np.char.mod("%.9g um", micrometres), f"({low:g} to {high:g} um)"
+    first_bad_row(wrong, "wavelength", shown, label, f"lengths above zero {allowed}")
+    wavelength, angles = numeric_column(table, "wavelength", label), {}
+    for name in (name for name in _ANGLES if name in table.colnames):
+        degrees = numeric_column(table, name, label, u.deg)
+        allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
+        # written so that NaN, which compares as false, is bad
+        first_bad_row(~(np.abs(degrees) <= _MAX_ANGLE), name, degrees, label, allowed)
+        if name == "altitude":
+            first_bad_row(np.abs(degrees) > 90, name, degrees, label, "-90 to 90 deg")
+        angles[name] = numeric_column(table, name, label) * table[name].unit
 
     # first: row in which a frame appears first, for its own columns and for messages
     frame_numbers, first, frame_index = np.unique(frame, return_index=True, return_inverse=True)
@@ -103,7 +115,16 @@ def build_grid(table, label):
     _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
     unit = table["wavelength"].unit
     by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
-    frames = _frame_table(table, frame_numbers, first, frame_index, angles, label)
+    # the columns that belong to frames, after checking that they do
+    frames = QTable({"frame": frame_numbers})
+    for name in table.colnames:
+        if name == "frame" or name in CELL_COLUMNS:
+            continue
+        column = angles.get(name, table[name])
+        _check_constant(column, name, first[frame_index], frame, label)
+        frames[name] = column[first]
+        # a format of the file would round what is written again
+        frames[name].info.format = None
 
     flux_unit, values = _measured(table, label, ("flux",) if single else BEAMS)
     code, reasons = mask_rows(table, values, label)
@@ -182,26 +203,6 @@ def _integers(table, name, label):
     return values.astype(np.int64)
 
 
-def _angle(table, name, label):
-    values = numeric_column(table, name, label, u.deg)
-    allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
-    # written so that NaN, which compares as false, is bad
-    first_bad_row(~(np.abs(values) <= _MAX_ANGLE), name, values, label, allowed)
-    if name == "altitude":
-        first_bad_row(np.abs(values) > 90, name, values, label, "-90 to 90 deg")
-    return numeric_column(table, name, label) * table[name].unit
-
-
-def _wavelengths(table, label):
-    values = numeric_column(table, "wavelength", label, u.um)
-    # in the unit of the limits, whatever that of the table
-    shown = np.char.mod("%.9g um", values)
-    low, high = _WAVELENGTHS
-    allowed = f"lengths above zero ({low:g} to {high:g} um)"
-    first_bad_row(~((values >= low) & (values <= high)), "wavelength", shown, label, allowed)
-    return numeric_column(table, "wavelength", label)
-
-
 def _check_cells(cell, frame, bins, shape, label):
     """Refuse a cell given twice, and a grid that is nearly all holes."""
     # stable: among equal cells the first row stays the first
@@ -247,21 +248,6 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
     return by_bin * unit
 
 
-def _frame_table(table, frame_numbers, first, frame_index, angles, label):
-    """Return the columns that belong to frames, after checking that they do."""
-    frames = QTable()
-    frames["frame"] = frame_numbers
-    for name in table.colnames:
-        if name == "frame" or name in CELL_COLUMNS:
-            continue
-        column = angles.get(name, table[name])
-        _check_constant(column, name, first[frame_index], frame_numbers[frame_index], label)
-        frames[name] = column[first]
-        # a format of the file would round what is written again
-        frames[name].info.format = None
-    return frames
-
-
 def _check_constant(column, name, reference, frame, label):
     try:
         equal = _filled(column == column[reference])
@@ -299,27 +285,19 @@ def _measured(table, label, beams):
         raise ObservationError(
             f"{label}: column {beams[0]} has unit {flux_unit}, a linear unit such as adu is needed"
         )
+    # of the beams, else of the single differences, or none
+    errors = ()
+    for names in (BEAM_ERRORS, SINGLE_ERRORS) if beams == BEAMS else (("flux_err",),):
+        there = [name for name in names if name in table.colnames]
+        if 0 < len(there) < len(names):
+            (other,) = {*names} - {*there}
+            raise ObservationError(f"{label}: missing column {other}; it has {there[0]}")
+        errors = errors or tuple(there)
     # the right beam sets the unit; the left one and the errors are converted
-    errors = _error_columns(table, label, beams)
     values = {name: numeric_column(table, name, label, flux_unit) for name in (*beams, *errors)}
     for name in errors:
         first_bad_row(values[name] < 0, name, values[name], label, "errors above zero")
     return flux_unit, values
-
-
-def _error_columns(table, label, beams):
-    """Return the error columns to use: of the beams, of the single differences, or none."""
-    found = ()
-    if beams != BEAMS:
-        return ("flux_err",) if "flux_err" in table.colnames else found
-    for pair in (BEAM_ERRORS, SINGLE_ERRORS):
-        there = [name for name in pair if name in table.colnames]
-        if len(there) == 1:
-            other = pair[1 - pair.index(there[0])]
-            raise ObservationError(f"{label}: missing column {other}; it has {there[0]}")
-        if there and not found:
-            found = pair
-    return found
 
 
 # ---- cells that cannot be used -------------------------------------------------------------------
@@ -337,49 +315,34 @@ def mask_rows(table, values, label):
     Return codes (0 usable, else 1 + index of the reason) and reasons. What the column
     ``mask_reason`` declares is respected, the rest is warned of.
     """
+    code, reasons = np.zeros(len(table), dtype=int), []
     # what the file declares was warned of when it was made
-    code, reasons = _declared_reasons(table, label)
-    for names, bad, reason in _complaints(values):
-        # the first reason stays
-        bad &= code == 0
-        if bad.any():
-            code[bad] = _number(reason, reasons)
-            row = int(np.argmax(bad))
-            shown = ", ".join(f"{name} = {values[name][row]:g}" for name in names)
-            first = f"row {row + 1}: {shown}; allowed are finite numbers above zero"
-            _warn(label, int(bad.sum()), reason, first)
-    return code, reasons
-
-
-def _complaints(values):
-    """Yield what may be wrong with single rows: columns, bad rows, reason."""
+    if "mask_reason" in table.colnames:
+        column = table["mask_reason"]
+        if column.dtype.kind not in "US":
+            raise ObservationError(
+                f"{label}: column mask_reason has type {column.dtype}, strings are needed"
+            )
+        # an empty string in ECSV may come back as a masked value
+        text = np.where(getattr(column, "mask", False), "", np.ma.getdata(column).astype(str))
+        reasons = [str(reason) for reason in np.unique(text) if reason]
+        for number, reason in enumerate(reasons):
+            code[text == reason] = number + 1
     errors = [name for name in values if name.endswith("_err")]
     fluxes = [name for name in values if name not in errors]
-    for kind, pair in (("flux", fluxes), ("error", errors)):
-        if pair:
-            both = np.array([values[name] for name in pair])
-            # NaN compares as false and is lost too
-            lost = ~(np.abs(both) < _HUGE).all(axis=0)
-            yield pair, lost.copy(), f"{kind} not finite"
-            yield pair, ~lost & (both < 1.0 / _HUGE).any(axis=0), f"{kind} not positive"
-
-
-def _declared_reasons(table, label):
-    """Read the column ``mask_reason``, which a written table has where cells were masked."""
-    code = np.zeros(len(table), dtype=int)
-    if "mask_reason" not in table.colnames:
-        return code, []
-    column = table["mask_reason"]
-    if column.dtype.kind not in "US":
-        raise ObservationError(
-            f"{label}: column mask_reason has type {column.dtype}, strings are needed"
-        )
-    # an empty string in ECSV may come back as a masked value
-    # code 0 means usable
-    text = np.where(getattr(column, "mask", False), "", np.ma.getdata(column).astype(str))
-    reasons = [str(reason) for reason in np.unique(text) if reason]
-    for number, reason in enumerate(reasons):
-        code[text == reason] = number + 1
+    for kind, names in (("flux", fluxes), ("error", errors)):
+        both = np.array([values[name] for name in names]).reshape(-1, len(table))
+        # NaN compares as false and is lost too
+        lost = ~(np.abs(both) < _HUGE).all(axis=0)
+        low = ~lost & (both < 1.0 / _HUGE).any(axis=0)
+        for bad, reason in ((lost, f"{kind} not finite"), (low, f"{kind} not positive")):
+            # the first reason stays
+            bad &= code == 0
+            if bad.any():
+                row = int(np.argmax(bad))
+                shown = ", ".join(f"{name} = {values[name][row]:g}" for name in names)
+                first = f"row {row + 1}: {shown}; allowed are finite numbers above zero"
+                _mask_cells(code, bad, reason, reasons, label, first)
     return code, reasons
 
 
@@ -388,21 +351,17 @@ def mask_missing(code, reasons, frame_numbers, bin_numbers, label):
     # a hole in the grid is masked like a bad value: a pair that needs it drops out
     missing = code < 0
     if missing.any():
-        code[missing] = _number("missing", reasons)
         frame, column = np.argwhere(missing)[0]
         first = f"frame {frame_numbers[frame]}, bin {bin_numbers[column]} has no row"
-        _warn(label, int(missing.sum()), "missing", first)
+        _mask_cells(code, missing, "missing", reasons, label, first)
 
 
-def _number(reason, reasons):
-    """Return the code of a reason, adding it to the list where it is new."""
+def _mask_cells(code, bad, reason, reasons, label, first):
+    """Give cells the code of a reason, which is added to the list where it is new; warn of them."""
     if reason not in reasons:
         reasons.append(reason)
-    return reasons.index(reason) + 1
-
-
-def _warn(label, count, reason, first):
-    message = f"{label}: {counted(count, 'cell')} masked, {reason} (first: {first})"
+    code[bad] = reasons.index(reason) + 1
+    message = f"{label}: {counted(int(bad.sum()), 'cell')} masked, {reason} (first: {first})"
     warnings.warn(message, AstropolcalWarning, stacklevel=2)
 
 

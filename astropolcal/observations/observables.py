@@ -510,38 +510,92 @@ def pair_frames(
     an error, frames left over a warning.
     """
     hwp = np.atleast_1d(angle_to_rad(hwp, "hwp"))
-    tolerance = float(angle_to_rad(tolerance, "tolerance"))
-    derotator_tolerance = float(angle_to_rad(derotator_tolerance, "derotator_tolerance"))
-    labels = range(len(hwp)) if labels is None else labels
+    n_frames, tolerance = len(hwp), float(angle_to_rad(tolerance, "tolerance"))
+    labels = range(n_frames) if labels is None else labels
     there = np.sort(np.mod(hwp, _HALF))
     # the neighbours across 0 and 90 deg
     there = np.concatenate([there - _HALF, there, there + _HALF])
     wanted = np.mod(hwp + _QUARTER, _HALF)
     place = np.searchsorted(there, wanted)
-    nearest = np.minimum(wanted - there[place - 1], there[place] - wanted)
-    lonely = nearest > tolerance
+    lonely = np.minimum(wanted - there[place - 1], there[place] - wanted) > tolerance
     if lonely.any():
         frame = int(np.argmax(lonely))
-        where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
         raise ObservationError(
-            f"{name}, {where}: hwp = {np.rad2deg(hwp[frame]):g} deg has no partner; a frame "
-            "with the half-wave plate 45 deg from it (modulo 180 deg) is needed"
+            f"{name}, {_where(frame, rows)}: hwp = {np.rad2deg(hwp[frame]):g} deg has no partner; "
+            "a frame with the half-wave plate 45 deg from it (modulo 180 deg) is needed"
         )
-    steps = np.arange(len(hwp)) if time is None else np.asarray(time, dtype=float)
-    setting = _Setting(hwp, derotator, flc_state, steps, tolerance, derotator_tolerance)
-    pairs, left = _paired(setting, share)
-    if left:
-        shown = ", ".join(
-            f"{labels[frame]} (hwp {np.rad2deg(hwp[frame]):g} deg)" for frame in left[:_MAX_NAMED]
-        )
+    steps = np.arange(n_frames) if time is None else np.asarray(time, dtype=float)
+    setting = {"hwp": hwp, "steps": steps, "tolerance": tolerance, "flc_state": flc_state}
+    if derotator is not None:
+        setting["derotator"] = np.atleast_1d(angle_to_rad(derotator, "derotator"))
+        setting["derotator_tolerance"] = float(angle_to_rad(derotator_tolerance, "tolerance"))
+    # in long tables partners are sought among the neighbours in time first, and farther away for
+    # the frames that found none, so that the work grows as the number of frames
+    left, width, chosen = np.argsort(steps, kind="stable"), _WINDOW, []
+    while left.size:
+        everything = share or left.size <= _SMALL or width >= left.size
+        reach = left.size if everything else width
+        pairs, used = _choose(*_candidates(left, reach, **setting), n_frames, share)
+        chosen += pairs
+        left = left[~used[left]]
+        if everything:
+            break
+        width *= 4
+    if left.size:
+        left = sorted(left.tolist())
+        shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in left[:_MAX_NAMED]]
         more = f" and {len(left) - _MAX_NAMED} more" if len(left) > _MAX_NAMED else ""
         warnings.warn(
-            f"{name}: {len(left)} of {len(hwp)} frames left out, their partner 45 deg of half-wave "
-            f"plate away is missing or used: frame {shown}{more}",
+            f"{name}: {len(left)} of {n_frames} frames left out, their partner 45 deg of half-wave "
+            f"plate away is missing or used: frame {', '.join(shown)}{more}",
             AstropolcalWarning,
             stacklevel=3,
         )
-    return pairs
+    return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
+
+
+def _where(frame, rows):
+    return f"frame index {frame}" if rows is None else f"row {rows[frame]}"
+
+
+def _candidates(
+    frames, width, *, hwp, steps, tolerance, flc_state, derotator=None, derotator_tolerance=0.0
+):
+    """
+    Return plus and minus frame of all possible pairs, the best first.
+
+    Only frames at most ``width`` places apart in ``frames`` count.
+    """
+    ahead = np.arange(1, min(width, frames.size - 1) + 1)
+    place = np.arange(frames.size)[:, None] + ahead
+    here, there = np.nonzero(place < frames.size)
+    first, second = frames[here], frames[place[here, there]]
+    # shifted, so that an angle slightly below 0 counts as 0 and not as 90 deg
+    phase = np.mod(hwp + tolerance, _HALF)
+    # 45 and 135 degrees are alike for a pair: both are 45 from a multiple of 90
+    good = np.abs(np.mod(hwp[second] - hwp[first], _HALF) - _QUARTER) <= tolerance
+    good &= phase[first] != phase[second]
+    if flc_state is not None:
+        good &= np.asarray(flc_state)[first] == np.asarray(flc_state)[second]
+    first, second = first[good], second[good]
+    drift = np.zeros(first.size, dtype=bool)
+    if derotator is not None:
+        distance = _apart(derotator[first], derotator[second])
+        close = distance <= derotator_tolerance
+        first, second = first[close], second[close]
+        # a derotator that drifts pairs neighbours; one that is static is better
+        drift = distance[close] > 0.5 * derotator_tolerance
+    plus, minus = np.where(phase[first] < phase[second], (first, second), (second, first))
+    backwards = _apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
+    order = np.lexsort((*_nearness(plus, minus, steps), drift, backwards))
+    return plus[order], minus[order]
+
+
+def _nearness(first, second, steps):
+    """Return keys to sort by: nearest in time, then in the table, then the earliest."""
+    # the last key counts most
+    apart = np.abs(steps[first] - steps[second])
+    return np.minimum(first, second), np.abs(first - second), apart
 
 
 def pair_states(
@@ -575,16 +629,14 @@ def pair_states(
     lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
     if lonely:
         frame = min(lonely)
-        where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
-        own, other = ("A", "B") if state[frame] == 0 else ("B", "A")
+        own, other = "AB" if state[frame] == 0 else "BA"
         hwp, derotator = (np.rad2deg(angle[frame]) for angle in angles)
         raise ObservationError(
-            f"{name}, {where}: flc_state {own} at hwp = {hwp:g} deg and derotator = "
+            f"{name}, {_where(frame, rows)}: flc_state {own} at hwp = {hwp:g} deg and derotator = "
             f"{derotator:g} deg has no partner; a frame in state {other} at these angles is needed"
         )
     i, j = (frames[k] for frames, k in zip((first, second), np.nonzero(alike), strict=True))
-    # the last key counts most: nearest in time, then in the file, then the earliest
-    order = np.lexsort((np.minimum(i, j), np.abs(i - j), np.abs(steps[i] - steps[j])))
+    order = np.lexsort(_nearness(i, j, steps))
     chosen, used = _choose(i[order], j[order], len(state), share)
     if not used.all():
         warnings.warn(
@@ -596,122 +648,21 @@ def pair_states(
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
 
 
-def quadruples(
-    states, hwp, derotator, time=None, *, labels=None, rows=None, name="table", **limits
-):
-    """
-    Combine pairs of states, (P, 2), whose half-wave plates stand 45 deg apart.
-
-    Returns indices (Q, 4): both states of the plus angle, both of the minus angle. Arguments as for
-    `pair_frames`, one per frame.
-    """
-    # both frames of a pair stand at the same angles, so that one speaks for both
-    first = np.asarray(states)[:, 0]
-    found = pair_frames(
-        hwp[first],
-        derotator[first],
-        time=first if time is None else np.asarray(time)[first],
-        labels=first.tolist() if labels is None else [labels[i] for i in first],
-        rows=None if rows is None else [rows[i] for i in first],
-        name=name,
-        **limits,
-    )
-    # (Q, 2, 2): plus and minus, then states; flat it is A+, B+, A-, B-
-    return np.asarray(states)[found].reshape(-1, 4)
-
-
 def _apart(first, second):
     """Return the smallest angle between two axes, in [0, 90] degrees."""
     return np.abs(np.mod(first - second + _HALF, _TURN) - _HALF)
 
 
-class _Setting:
-    """What the frames of a pair must agree in, and how good a pair they make."""
-
-    def __init__(self, hwp, derotator, flc_state, steps, tolerance, derotator_tolerance):
-        self.hwp, self.steps, self.tolerance = hwp, steps, tolerance
-        # shifted, so that an angle slightly below 0 counts as 0 and not as 90 deg
-        self.phase = np.mod(hwp + tolerance, _HALF)
-        self.derotator_tolerance = derotator_tolerance
-        self.derotator = None
-        if derotator is not None:
-            self.derotator = np.atleast_1d(angle_to_rad(derotator, "derotator"))
-        self.state = None if flc_state is None else np.asarray(flc_state)
-
-    def candidates(self, frames, width):
-        """
-        Return plus and minus frame of all possible pairs, the best first.
-
-        Only frames at most ``width`` places apart in ``frames`` count.
-        """
-        ahead = np.arange(1, min(width, frames.size - 1) + 1)
-        place = np.arange(frames.size)[:, None] + ahead
-        here, there = np.nonzero(place < frames.size)
-        first, second = frames[here], frames[place[here, there]]
-        gap = self.hwp[second] - self.hwp[first]
-        # 45 and 135 degrees are alike for a pair: both are 45 from a multiple of 90
-        good = np.abs(np.mod(gap, _HALF) - _QUARTER) <= self.tolerance
-        good &= self.phase[first] != self.phase[second]
-        if self.state is not None:
-            good &= self.state[first] == self.state[second]
-        first, second = first[good], second[good]
-        drift = np.zeros(first.size, dtype=bool)
-        if self.derotator is not None:
-            distance = _apart(self.derotator[first], self.derotator[second])
-            close = distance <= self.derotator_tolerance
-            first, second = first[close], second[close]
-            # a derotator that drifts pairs neighbours; one that is static is better
-            drift = distance[close] > 0.5 * self.derotator_tolerance
-        forward = self.phase[first] < self.phase[second]
-        plus, minus = np.where(forward, (first, second), (second, first))
-        backwards = _apart(self.hwp[minus], self.hwp[plus] + _QUARTER) > self.tolerance
-        order = np.lexsort(
-            (
-                np.minimum(plus, minus),
-                np.abs(plus - minus),
-                np.abs(self.steps[plus] - self.steps[minus]),
-                drift,
-                backwards,
-            )
-        )
-        return plus[order], minus[order]
-
-
-def _paired(setting, share):
-    """
-    Return the pairs, and the frames left over.
-
-    In long tables partners are sought among the neighbours in time first, and farther away for
-    the frames that found none, so that the work grows as the number of frames.
-    """
-    left = np.argsort(setting.steps, kind="stable")
-    n_frames, width, chosen = left.size, _WINDOW, []
-    while left.size:
-        everything = share or left.size <= _SMALL or width >= left.size
-        reach = left.size if everything else width
-        pairs, used = _choose(*setting.candidates(left, reach), n_frames, share)
-        chosen += pairs
-        left = left[~used[left]]
-        if everything:
-            break
-        width *= 4
-    return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2), sorted(left.tolist())
-
-
 def _choose(plus, minus, n_frames, share):
     """Take candidates in order of preference, each frame once; then share if allowed."""
-    used = np.zeros(n_frames, dtype=bool)
-    chosen = []
-    for p, m in zip(plus.tolist(), minus.tolist(), strict=True):
-        if not (used[p] or used[m]):
-            used[p] = used[m] = True
-            chosen.append((p, m))
-    if share:
+    used, chosen = [False] * n_frames, []
+    # at first without frames that are used, then with one of the two
+    for most in (0, 1) if share else (0,):
         for p, m in zip(plus.tolist(), minus.tolist(), strict=True):
-            if not (used[p] and used[m]):
-                used[[p, m]] = True
+            if used[p] + used[m] <= most:
+                used[p] = used[m] = True
                 chosen.append((p, m))
-    return chosen, used
+    return chosen, np.array(used)
 
 
 # ---- data of a table -----------------------------------------------------------------------------
@@ -726,19 +677,23 @@ def frame_groups(observations, kind, rows, label, **limits):
     of `pair_frames`, rows and label are for messages.
     """
     frames, time = observations.frames, clock(observations.frames)
-    plate = observations.position("hwp") * u.rad
-    angles = plate, angle_or_zero(observations, "derotator") * u.rad
-    named = limits | {"rows": rows, "name": label}
-    labels = np.asarray(frames["frame"]).tolist()
+    angles = observations.position("hwp") * u.rad, angle_or_zero(observations, "derotator") * u.rad
+    labels, rows, limits = np.asarray(frames["frame"]), np.asarray(rows), limits | {"name": label}
     if kind == "hwp":
         # the plate cancels what is static: both frames must be in one state
         state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
-        found = pair_frames(*angles, state, time, labels=labels, **named)
+        found = pair_frames(*angles, state, time, labels=labels, rows=rows, **limits)
     else:
         # states first: they alternate within an exposure and so share its atmosphere
-        found = pair_states(observations.position("flc_state"), *angles, time, **named)
+        found = pair_states(observations.position("flc_state"), *angles, time, rows=rows, **limits)
     if kind == "both":
-        found = quadruples(found, *angles, time, labels=labels, **named)
+        # both frames of a pair stand at the same angles, so that one speaks for both
+        first = found[:, 0]
+        time = first if time is None else time[first]
+        settings = {"time": time, "labels": labels[first], "rows": rows[first]} | limits
+        pairs = pair_frames(*(angle[first] for angle in angles), **settings)
+        # (Q, 2, 2): plus and minus, then states; flat it is A+, B+, A-, B-
+        found = found[pairs].reshape(-1, 4)
     if not len(found) and kind != "flc_state":
         raise ObservationError(
             f"{label}: none of its {counted(observations.n_frames, 'frame')} can be paired; two "

@@ -104,6 +104,8 @@ def _warn_of_uncovered(time):
             )
 
 
+# the frames of a target have the same text
+@lru_cache(maxsize=1024, typed=True)
 def sky_angle(name, value):
     """
     Return a right ascension or a declination, by name, in degree.
@@ -114,18 +116,14 @@ def sky_angle(name, value):
     try:
         angle = plain_number(value)
     except (TypeError, ValueError):
-        angle = _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
+        unit = u.hourangle if name == "right_ascension" else u.deg
+        angle = float(Angle(str(value), unit=unit).to_value(u.deg))
     if not np.isfinite(angle):
         raise ValueError(f"{value!r} is not finite")
     return angle
 
 
 # the frames of a target have the same text
-@lru_cache(maxsize=1024)
-def _sexagesimal(text, unit):
-    return float(Angle(text, unit=unit).to_value(u.deg))
-
-
 def pointing(coord, time, location):
     """
     Return altitude and parallactic angle of a target.
@@ -277,14 +275,6 @@ def motion(observations, angle, duty=None):
         if not 0 <= duty <= 1:
             raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
         return duty * np.gradient(steady)
-    seconds, exposure = _seconds(observations)
-    if np.any(np.diff(seconds) <= 0):
-        raise ObservationError(f"{observations.name}: the times of the frames do not increase")
-    # second order also where the frames are not evenly spaced
-    return np.gradient(steady, seconds) * exposure
-
-
-def _seconds(observations):
     frames, times = observations.frames, _times(observations)
     numbers = clock(frames)
     if "exposure_time" not in frames.colnames or (times is None and numbers is None):
@@ -295,8 +285,13 @@ def _seconds(observations):
     exposure = numeric_column(frames, "exposure_time", observations.name, u.s)
     if times is not None:
         # differences before the factor, which would cost five digits
-        return (times.mjd - times.mjd[0]) * 86400.0, exposure
-    return (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s), exposure
+        seconds = (times.mjd - times.mjd[0]) * 86400.0
+    else:
+        seconds = (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s)
+    if np.any(np.diff(seconds) <= 0):
+        raise ObservationError(f"{observations.name}: the times of the frames do not increase")
+    # second order also where the frames are not evenly spaced
+    return np.gradient(steady, seconds) * exposure
 
 
 def smeared(angle, change, nodes=3, when="middle"):
@@ -412,7 +407,15 @@ def frame_coordinate(observations, name):
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
     if name in MOVES:
-        return _last_move(time, observations.position(name.rpartition("_")[0]), name)
+        angle = observations.position(name.rpartition("_")[0])
+        order, out = np.argsort(time, kind="stable"), np.zeros_like(angle)
+        moved = np.diff(angle[order], prepend=angle[order[:1]])
+        if name.endswith("_direction"):
+            # a stage that stays where it is was last moved as before
+            last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))
+            moved = moved[last] < 0
+        out[order] = moved
+        return out
     if name.endswith("_rate"):
         return angle_change(observations, observations.position(name.removesuffix("_rate")))
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
@@ -481,20 +484,6 @@ def in_state(frames, name, label):
 def plain_states(column):
     """Return the states of a column as text, by which optics know them."""
     return np.array([str(value).strip() for value in column])
-
-
-def _last_move(time, angle, name):
-    """Return of every frame the last move of a stage: whether it was backwards, or how far."""
-    order = np.argsort(time, kind="stable")
-    steps = np.diff(angle[order], prepend=angle[order[:1]])
-    out = np.zeros_like(angle)
-    if name.endswith("_move"):
-        out[order] = steps
-        return out
-    # a stage that stays where it is was last moved as before
-    moved = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
-    out[order] = steps[moved] < 0
-    return out
 
 
 def angle_change(observations, angle):

@@ -35,8 +35,9 @@ _SINGLE = ("single_difference", "single_sum")
 
 def read_ecsv(path):
     """Read an ECSV file into a table without trusting it."""
-    # read once: what is checked is what is loaded, even if the file changes meanwhile
-    text = _read_text(path)
+    with understood(path, ObservationError, "cannot be read as text, an ECSV table is needed"):
+        # read once: what is checked is what is loaded, even if the file changes meanwhile
+        text = Path(path).read_bytes().decode("utf-8")
     # astropy would guess another format, and make one column of it
     if not text.startswith("# %ECSV"):
         raise ObservationError(
@@ -50,18 +51,6 @@ def read_ecsv(path):
             if _ODD_NUMBERS.search(text):
                 _check_numbers(path, text)
         return table
-
-
-def _read_text(path):
-    try:
-        with understood(path, ObservationError, "cannot be read"):
-            return Path(path).read_bytes().decode("utf-8")
-    except ObservationError as error:
-        if str(error).endswith("is a folder, not a file"):
-            raise ObservationError(f"{path}: is a folder, an ECSV file is needed") from None
-        if isinstance(error.__cause__, UnicodeDecodeError):
-            raise ObservationError(f"{path}: not a text file, an ECSV table is needed") from None
-        raise
 
 
 def _check_header(path, text):
@@ -164,7 +153,13 @@ def complete_table(table, label):
         wavelength = stated_wavelength(table.meta, label)
         new |= {} if wavelength is None else {"wavelength": np.full(n, 1.0) * wavelength}
     if not there & {"flux_right", "flux_left"} and there >= set(_SINGLE):
-        new |= _beams(table, label)
+        check_table(table, label, _SINGLE)
+        unit = getattr(table[_SINGLE[0]], "unit", None) or u.dimensionless_unscaled
+        difference, total = (numeric_column(table, name, label, unit) for name in _SINGLE)
+        # what is beyond all numbers becomes infinite, and is masked like that
+        with np.errstate(over="ignore", invalid="ignore"):
+            new["flux_right"] = 0.5 * (total + difference) * unit
+            new["flux_left"] = 0.5 * (total - difference) * unit
     if not new:
         return table
     kept = [name for name in table.colnames if name not in _SINGLE or "flux_right" not in new]
@@ -175,16 +170,6 @@ def complete_table(table, label):
     for name in kept:
         completed[name] = table[name]
     return completed
-
-
-def _beams(table, label):
-    check_table(table, label, _SINGLE)
-    unit = getattr(table[_SINGLE[0]], "unit", None) or u.dimensionless_unscaled
-    difference, total = (numeric_column(table, name, label, unit) for name in _SINGLE)
-    # what is beyond all numbers becomes infinite, and is masked like that
-    with np.errstate(over="ignore", invalid="ignore"):
-        right, left = 0.5 * (total + difference), 0.5 * (total - difference)
-    return {"flux_right": right * unit, "flux_left": left * unit}
 
 
 def numeric_column(table, name, label, unit=None):

@@ -721,39 +721,9 @@ def masked_grid(grid, mask, reason, label):
 
 def some_frames(grid, frames, label):
     """Return the grid of some frames, by booleans or indices, in the order of the table."""
-    index = _frame_index(np.asarray(frames), len(grid.frames), label)
-    if grid.reason[index].all():
-        raise ObservationError(
-            f"{label}: the {counted(len(index), 'frame')} selected have no usable cell"
-        )
-    cells = _picked(grid, (index,))
-    return dataclasses.replace(grid, frames=grid.frames[index], rows=grid.rows[index], **cells)
-
-
-def some_bins(grid, bins, label):
-    """Return the grid at some wavelengths, one boolean per bin."""
-    chosen, n_bins = np.asarray(bins), len(grid.bin)
-    if chosen.dtype != bool or chosen.shape != (n_bins,):
-        raise ObservationError(
-            f"{label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
-            f"are {n_bins} booleans"
-        )
-    if grid.reason[:, chosen].all():
-        raise ObservationError(f"{label}: the bins selected have no usable cell")
-    own = {"bin": grid.bin[chosen], "wavelength": grid.wavelength[chosen]}
-    return dataclasses.replace(grid, **own, **_picked(grid, (slice(None), chosen)))
-
-
-def _picked(grid, place):
-    """Return what a grid has of every frame and wavelength, at some of them."""
-    arrays = {key: getattr(grid, key)[place] for key in ("flux_right", "flux_left", "reason")}
-    return arrays | {"errors": {name: error[place] for name, error in grid.errors.items()}}
-
-
-def _frame_index(frames, n_frames, label):
-    """Return the indices of frames, ascending; negative ones count from the end."""
+    frames, n_frames = np.asarray(frames), len(grid.frames)
     if frames.dtype == bool and frames.shape == (n_frames,):
-        return np.flatnonzero(frames)
+        frames = np.flatnonzero(frames)
     # an empty list has type float, and selects nothing that could be used
     if frames.dtype.kind not in "iu" or frames.ndim != 1:
         raise ObservationError(
@@ -772,7 +742,29 @@ def _frame_index(frames, n_frames, label):
             f"{label}: frame index {index[counts > 1][0]} is given twice, "
             "each frame is allowed once"
         )
-    return index
+    words = f"the {counted(len(index), 'frame')} selected have"
+    return _part(grid, (index,), label, words, frames=grid.frames[index], rows=grid.rows[index])
+
+
+def some_bins(grid, bins, label):
+    """Return the grid at some wavelengths, one boolean per bin."""
+    chosen, n_bins = np.asarray(bins), len(grid.bin)
+    if chosen.dtype != bool or chosen.shape != (n_bins,):
+        raise ObservationError(
+            f"{label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
+            f"are {n_bins} booleans"
+        )
+    own = {"bin": grid.bin[chosen], "wavelength": grid.wavelength[chosen]}
+    return _part(grid, (slice(None), chosen), label, "the bins selected have", **own)
+
+
+def _part(grid, place, label, words, **own):
+    """Return some of the cells of a grid, which have columns of their own."""
+    if grid.reason[place].all():
+        raise ObservationError(f"{label}: {words} no usable cell")
+    arrays = {key: getattr(grid, key)[place] for key in ("flux_right", "flux_left", "reason")}
+    errors = {name: error[place] for name, error in grid.errors.items()}
+    return dataclasses.replace(grid, errors=errors, **arrays, **own)
 
 
 # ---- fingerprint ---------------------------------------------------------------------------------

@@ -111,8 +111,7 @@ def _draw_frame(panel, index, reduction, k):
     layout = reduction.instrument.files
     with open_cube(frame.path, layout, reduction.masters) as (_, _, cube, good):
         image = np.array(cube[k], dtype=float)
-        if good is not None:
-            image[~good[k]] = np.nan
+        image[~good[k]] = np.nan
     _draw_image(panel, image)
     if reduction.source == "star":
         from matplotlib.patches import Circle

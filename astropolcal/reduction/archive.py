@@ -12,10 +12,12 @@ import os
 import re
 import sqlite3
 import warnings
+from collections import namedtuple
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -115,15 +117,20 @@ class Index:
             "SELECT seen.* FROM seen LEFT JOIN frames USING (path) WHERE frames.path IS NULL "
             "OR frames.size != seen.size OR frames.changed != seen.changed ORDER BY path"
         ).fetchall()
-        n_read, reader = len(rows), _Reader(instrument)
+        n_read, reader = len(rows), partial(_read_headers, instrument)
         batches = (rows[i : i + _BATCH] for i in range(0, n_read, _BATCH))
         given = {"workers": workers, "cluster": cluster, "preload": [__name__]}
         put = f"INSERT OR REPLACE INTO frames ({keys}) VALUES ({', '.join('?' * len(_COLUMNS))})"
         ended = ended_tasks(reader, batches, **given)
         with closing(ended), counting(total, "headers", total - n_read) as add:
             for each in ended:
+                found = each.result
+                if each.reason is not None:
+                    # its process died
+                    lost = [_row(file) | {"problem": each.reason} for file in each.task]
+                    found = [tuple(row.values()) for row in lost]
                 with base:
-                    base.executemany(put, _rows(each))
+                    base.executemany(put, found)
                 add(len(each.task))
         base.execute("DROP TABLE seen")
         return total, n_read
@@ -173,77 +180,62 @@ def _files(tree, besides):
                     yield os.path.abspath(path), state.st_size, state.st_mtime_ns
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """Reads the headers of some files into rows of the index."""
-
-    instrument: str | None = None
-
-    def __call__(self, files):
-        # once for all files: plug-ins are looked for on the disk
-        names = [self.instrument] if self.instrument else instruments.names()
-        known = list(map(instruments.get, names))
-        return [self._row(known, *file) for file in files]
-
-    def _row(self, known, path, size, changed):
-        row = dict.fromkeys(_COLUMNS) | {"path": path, "size": size, "changed": changed}
+def _read_headers(instrument, files):
+    """Return the rows of the index of some files."""
+    # once for all files: plug-ins are looked for on the disk
+    known = list(map(instruments.get, [instrument] if instrument else instruments.names()))
+    rows = []
+    for file in files:
+        row = _row(file)
         try:
-            row |= self._values(known, path)
+            row |= _values(known, row["path"])
         except AstropolcalError as problem:
-            row["problem"] = one_line(str(problem).removeprefix(f"{path}: "), None)
-        return tuple(row.values())
-
-    def _values(self, known, path):
-        header = primary_header(path)
-        if "CALHASH" in header and "POLCONV" in header:
-            raise ObservationError("a corrected product of this package, not a frame")
-        found = known[0] if self.instrument else recognized(header, known)
-        with suppress(InstrumentError):
-            # which keyword holds the mode may depend on the mode
-            found = found.configured(header)
-        if found.files is None:
-            raise InstrumentError(f"{found.name}: it is not known how its files look")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            frame = read_header(path, found.files, header=header)
-        values, moment = frame.values, None
-        with suppress(ObservationError):
-            moment = observation_time(values).mjd
-        name = re.sub(r"[^\w+-]|_", "", values.get("object") or "").casefold()
-        return {
-            "instrument": found.name,
-            "object": name or None,
-            "mode": values.get("filter"),
-            "mjd": None if moment is None else float(moment),
-            "seconds": values.get("exposure_time", 0.0) * values.get("exposures", 1.0),
-            "hwp": values.get("hwp"),
-            "number": frame.number,
-        }
+            row["problem"] = one_line(str(problem).removeprefix(f"{row['path']}: "), None)
+        rows.append(tuple(row.values()))
+    return rows
 
 
-def _rows(ended):
-    """Return the rows of a batch of files, with the reason if its process died."""
-    if ended.reason is None:
-        return ended.result
-    lost = dict.fromkeys(_COLUMNS) | {"problem": ended.reason}
-    files = (dict(zip(_COLUMNS, file, strict=False)) for file in ended.task)
-    return [tuple((lost | file).values()) for file in files]
+def _row(file):
+    """Return a row of the index that says nothing yet."""
+    return dict.fromkeys(_COLUMNS) | dict(zip(("path", "size", "changed"), file, strict=True))
+
+
+def _values(known, path):
+    """Return what the header of a file says, which is of one of some instruments."""
+    header = primary_header(path)
+    if "CALHASH" in header and "POLCONV" in header:
+        raise ObservationError("a corrected product of this package, not a frame")
+    found = known[0] if len(known) == 1 else recognized(header, known)
+    with suppress(InstrumentError):
+        # which keyword holds the mode may depend on the mode
+        found = found.configured(header)
+    if found.files is None:
+        raise InstrumentError(f"{found.name}: it is not known how its files look")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        frame = read_header(path, found.files, header=header)
+    values, moment = frame.values, None
+    with suppress(ObservationError):
+        moment = float(observation_time(values).mjd)
+    name = re.sub(r"[^\w+-]|_", "", values.get("object") or "").casefold()
+    return {
+        "instrument": found.name,
+        "object": name or None,
+        "mode": values.get("filter"),
+        "mjd": moment,
+        "seconds": values.get("exposure_time", 0.0) * values.get("exposures", 1.0),
+        "hwp": values.get("hwp"),
+        "number": frame.number,
+    }
 
 
 # ---- sequences -----------------------------------------------------------------------------------
 
 
-class _Frame:
+class _Frame(namedtuple("_Frame", _COLUMNS[:-1])):
     """A row of the index."""
 
-    __slots__ = _COLUMNS[:-1]
-
-    @classmethod
-    def _make(cls, row):
-        frame = cls()
-        for name, value in zip(cls.__slots__, row, strict=True):
-            setattr(frame, name, value)
-        return frame
+    __slots__ = ()
 
     def kind(self):
         return self.instrument, self.object, self.mode
@@ -316,24 +308,25 @@ class Manifest:
 
     def __init__(self, path):
         self.path, self.entries = Path(path), {}
-        self._is_cut = False
         if os.path.exists(self.path):
             self._read()
 
     def _read(self):
-        n_bad = 0
-        with understood(self.path, AstropolcalError, "cannot be read as a manifest"):
-            with closing(open(self.path, encoding="utf-8")) as lines:
-                for line in lines:
-                    self._is_cut = not line.endswith("\n")
-                    try:
-                        entry = json.loads(line)
-                        self.entries[str(entry["name"])] = entry
-                    except (ValueError, KeyError, TypeError, RecursionError):
-                        n_bad += 1
+        n_bad, line = 0, "\n"
+        with (
+            understood(self.path, AstropolcalError, "cannot be read as a manifest"),
+            open(self.path, encoding="utf-8") as lines,
+        ):
+            for line in lines:
+                try:
+                    entry = json.loads(line)
+                    self.entries[str(entry["name"])] = entry
+                except (ValueError, KeyError, TypeError, RecursionError):
+                    n_bad += 1
         if n_bad and not self.entries:
             raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
-        if n_bad > self._is_cut:
+        # the last one may have been cut off
+        if n_bad > (not line.endswith("\n")):
             warnings.warn(
                 f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
                 AstropolcalWarning,
@@ -342,8 +335,7 @@ class Manifest:
 
     def add(self, entry):
         """Write down what became of a sequence."""
-        start, self._is_cut = "\n" if self._is_cut else "", False
-        append_line(self.path, start + json.dumps(entry), AstropolcalError)
+        append_line(self.path, json.dumps(entry), AstropolcalError)
         self.entries[entry["name"]] = entry
 
     def state(self, name, key, source=None):
@@ -358,21 +350,17 @@ class Manifest:
             return ""
         if entry.get("state") != "done":
             return "failed" if entry.get("source") == source else ""
-        if not _is_there(self.path.parent / str(entry.get("product")), entry):
-            return ""
-        return "done" if entry.get("source") == source else "older"
-
-
-def _is_there(path, entry):
-    """Return whether a product is the one that was written."""
-    try:
-        state = os.stat(path)
-    except (OSError, ValueError):
-        return False
-    if state.st_size != entry.get("size"):
-        return False
-    # a copy has another time, and the same content
-    return state.st_mtime_ns == entry.get("changed") or checksum(path) == entry.get("sha256")
+        product = self.path.parent / str(entry.get("product"))
+        # a name may be one that no system takes
+        with suppress(OSError, ValueError):
+            state = os.stat(product)
+            same = state.st_mtime_ns == entry.get("changed")
+            # a copy has another time, and the same content
+            if state.st_size == entry.get("size") and (
+                same or checksum(product) == entry.get("sha256")
+            ):
+                return "done" if entry.get("source") == source else "older"
+        return ""
 
 
 def checksum(path):

@@ -11,7 +11,7 @@ two images.
 import os
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import astropy.units as u
@@ -32,8 +32,9 @@ from astropolcal.instruments.layout import TEXTS, unit_of
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import offline, tracked
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.images import Detector, Scene, choice, number, per_wavelength, pixels
+from astropolcal.reduction.images import Scene, expose, number, per_wavelength, pixels
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
+from astropolcal.words import check_choice
 
 __all__ = [
     "CubeFiles",
@@ -95,10 +96,11 @@ class ImageModel:
 
     def _scene(self, layout, source, n_wavelengths):
         """Return what falls on the detector, of numbers that have been checked."""
+        check_choice("psf", self.psf, _PROFILES, ParameterError)
         return Scene(
             layout,
             source=source,
-            psf=choice("psf", self.psf, _PROFILES),
+            psf=self.psf,
             fwhm=pixels("fwhm", self.fwhm, layout, n_wavelengths),
             beta=number("beta", self.beta, above=1.0),
             halo=number("halo", self.halo, most=1.0),
@@ -155,25 +157,16 @@ class DetectorModel:
     flat_error: float = 0.0
 
     def _read_by(self, how, n_wavelengths):
-        """Return the detector as read out in one way, before which numbers given here go."""
+        """Return the way in which the detector is read out, and the background (W, 1, 1)."""
         gain = how.gain if self.gain is None else self.gain
         noise = how.read_noise if self.read_noise is None else self.read_noise
-        return Detector(
+        how = replace(
+            how,
             gain=number("gain", gain, above=0.0),
             read_noise=number("read_noise", noise),
-            background=per_wavelength("background", self.background, n_wavelengths)[:, None, None],
             saturation=how.saturation if self.saturate else np.inf,
-            noise=self.noise,
-            excess_noise=how.excess_noise,
         )
-
-    def _defects(self, rng, shape):
-        """Return the response of the pixels, and which of them have no value."""
-        spread = number("flat_error", self.flat_error, most=0.5)
-        share = number("bad_pixels", self.bad_pixels, most=0.9)
-        # negative responses do not exist; beyond 2 sigma at the most allowed spread
-        response = (1 + spread * rng.standard_normal(shape)).clip(0.0) if spread else 1.0
-        return response, rng.random(shape) < share
+        return how, per_wavelength("background", self.background, n_wavelengths)[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -311,16 +304,15 @@ def simulate_cubes(
     """
     image, detector = image or ImageModel(), detector or DetectorModel()
     files = files or CubeFiles()
-    instrument, wavelength, more = _of_mode(instrument, wavelength)
+    layout, wavelength, more = _of_mode(instrument, wavelength)
     # what is given goes before what the mode says
     more |= files.headers or {}
-    layout = _layout(instrument)
-    choice("source", source, _SOURCES)
+    check_choice("source", source, _SOURCES, ParameterError)
     frames = _with_headers(frames, layout, source, files.exposure_time, files.start)
-    n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
-    scene = image._scene(layout, source, n_wavelengths)
-    how = _read_out(frames, layout)
-    reading = detector._read_by(how, n_wavelengths)
+    n_frames = len(frames)
+    scene = image._scene(layout, source, len(wavelength))
+    saturation = _read_out(frames, layout).saturation
+    how, background = detector._read_by(_read_out(frames, layout), len(wavelength))
     light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
     if flux is None:
         looks = {"image": image, "background": detector.background}
@@ -332,20 +324,29 @@ def simulate_cubes(
     )
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)
-    response, bad = detector._defects(of_pixels, layout.shape)
+    spread = number("flat_error", detector.flat_error, most=0.5)
+    share = number("bad_pixels", detector.bad_pixels, most=0.9)
+    # negative responses do not exist; beyond 2 sigma at the most allowed spread
+    flat = (1 + spread * of_pixels.standard_normal(layout.shape)).clip(0.0) if spread else 1.0
+    bad = of_pixels.random(layout.shape) < share
     names = file_names(Path(directory), layout, files, n_frames)
     brightest = 0.0
     with shown(progress):
         for i in steps(range(n_frames), "cubes"):
-            falling = scene.light(beams[:, i], centres[i], widths[i])
-            brightest = max(brightest, float((falling + reading.background).max()))
-            cube, weight = reading.expose(falling, response, seeds[i])
+            falling = scene.light(beams[:, i], centres[i], widths[i]) + background
+            brightest = max(brightest, float(falling.max()))
+            cube, weight = expose(falling, how, flat, seeds[i] if detector.noise else None)
             # as extraction marks pixels without a value
             cube[bad], weight[bad] = np.nan, 0.0
             header = layout.to_header(header_of(frames[i], layout) | more)
             write_cube(*names[i], cube, weight, header, layout)
-    if brightest > how.saturation and not detector.saturate:
-        _warn_of_saturation(brightest, how)
+    if brightest > saturation and not detector.saturate:
+        warnings.warn(
+            f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
+            f"{saturation:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
     return [cube for cube, _ in names]
 
 
@@ -357,24 +358,21 @@ def _usual_flux(
     *,
     wavelength=None,
     source="internal",
-    stokes=(1.0, 0.0, 0.0, 0.0),
-    lamp=None,
     image=None,
     background=0.0,
+    **light,
 ):
     """Return the flux of cubes for which none is given, at most so much."""
-    instrument, wavelength, _ = _of_mode(instrument, wavelength)
-    layout = _layout(instrument)
-    n = _count(layout, wavelength)
+    layout, wavelength, _ = _of_mode(instrument, wavelength)
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
-    share = (image or ImageModel())._scene(layout, source, n).peak()
-    light = _beam_fluxes(chain, frames, wavelength, source, flux=1.0, lamp=lamp, stokes=stokes)
+    share = (image or ImageModel())._scene(layout, source, len(wavelength)).peak()
+    fluxes = _beam_fluxes(chain, frames, wavelength, source, **light)
     room = _FILLED * _read_out(frames, layout).saturation
-    room = room - per_wavelength("background", background, n)
+    room = room - per_wavelength("background", background, len(wavelength))
     if np.any(room <= 0):
         # no flux is low enough, which is warned of later
         return most
-    brightest = np.max(light.max(axis=(0, 1)) * share / room)
+    brightest = np.max(fluxes.max(axis=(0, 1)) * share / room)
     if most * brightest <= 1:
         return most
     # two digits, rounded down
@@ -435,7 +433,7 @@ def true_observations(
     >>> true_observations(charis.published(), charis, half_wave_plate_cycles()).n_frames
     8
     """
-    choice("source", source, _SOURCES)
+    check_choice("source", source, _SOURCES, ParameterError)
     wavelength = instrument.wavelength if wavelength is None else wavelength
     known = _with_headers(frames, _layout(instrument), source, 1 * u.s, "2025-01-01")
     kept = [c for c in QTable(frames).colnames if not isinstance(known[c], Time)]
@@ -462,14 +460,6 @@ def _layout(instrument):
             "(attribute files, with internal_apertures)"
         )
     return layout
-
-
-def _count(layout, wavelength):
-    if np.shape(wavelength) != layout.shape[:1]:
-        raise ParameterError(
-            f"wavelength has shape {np.shape(wavelength)}; the cubes have {layout.shape[0]} slices"
-        )
-    return layout.shape[0]
 
 
 # --- what is true ----------------------------------------------------------------
@@ -503,10 +493,15 @@ def both_states(frames):
 
 
 def _of_mode(instrument, wavelength):
-    """Return the instrument in the mode of the wavelengths, these, and keywords of the mode."""
+    """Return the layout of files in the mode of the wavelengths, these, and keywords of it."""
     wavelength = instrument.wavelength if wavelength is None else np.atleast_1d(wavelength)
     header = dict(instrument.mode_header(wavelength))
-    return instrument.configured(header), wavelength, header
+    layout = _layout(instrument.configured(header))
+    if wavelength.shape != layout.shape[:1]:
+        raise ParameterError(
+            f"wavelength has shape {wavelength.shape}; the cubes have {layout.shape[0]} slices"
+        )
+    return layout, wavelength, header
 
 
 def _read_out(frames, layout):
@@ -521,8 +516,17 @@ def _with_headers(frames, layout, source, exposure_time, start):
     missing = {"hwp", "derotator"} - set(frames.colnames)
     if missing or not len(frames):
         raise ObservationError(f"frames: column {', '.join(sorted(missing)) or 'hwp'} is missing")
-    if "hwp_true" not in frames.colnames:
-        frames["hwp_true"] = _tracked(frames, layout) if source == "star" else frames["hwp"]
+    if "hwp_true" not in frames.colnames and source == "star":
+        missing = {"parallactic", "altitude"} - set(frames.colnames)
+        if missing:
+            raise ObservationError(
+                f"frames: {' and '.join(sorted(missing))} missing, which a star needs"
+            )
+        sky = frames["parallactic"], frames["altitude"]
+        # encoders count within one turn
+        frames["hwp_true"] = tracked(frames["hwp"], *sky, layout.tracking) % (360 * u.deg)
+    elif "hwp_true" not in frames.colnames:
+        frames["hwp_true"] = frames["hwp"]
     if "exposure_time" not in frames.colnames:
         frames["exposure_time"] = u.Quantity(exposure_time) * np.ones(len(frames))
     number("exposure_time", frames["exposure_time"].to_value(u.s).min(), above=0.0)
@@ -534,18 +538,7 @@ def _with_headers(frames, layout, source, exposure_time, start):
     return frames
 
 
-def _tracked(frames, layout):
-    missing = {"parallactic", "altitude"} - set(frames.colnames)
-    if missing:
-        raise ObservationError(
-            f"frames: {' and '.join(sorted(missing))} missing, which a star needs"
-        )
-    angle = tracked(frames["hwp"], frames["parallactic"], frames["altitude"], layout.tracking)
-    # encoders count within one turn
-    return angle % (360 * u.deg)
-
-
-def _beam_fluxes(chain, frames, wavelength, source, *, flux, lamp, stokes):
+def _beam_fluxes(chain, frames, wavelength, source, flux=1.0, lamp=None, stokes=(1, 0, 0, 0)):
     """Return what reaches the detector, (beam, frame, wavelength), the right beam first."""
     table = frames[sorted({"hwp", *stages(chain)} & set(frames.colnames))]
     if source == "star":
@@ -554,15 +547,6 @@ def _beam_fluxes(chain, frames, wavelength, source, *, flux, lamp, stokes):
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # (beam, frame, wavelength)
     return np.stack([fluxes.T * scale for fluxes in right_left])
-
-
-def _warn_of_saturation(brightest, how):
-    warnings.warn(
-        f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
-        f"{how.saturation:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
-        AstropolcalWarning,
-        stacklevel=3,
-    )
 
 
 # ---- files ---------------------------------------------------------------------------------------

@@ -121,8 +121,8 @@ def open_cube(path, layout, masters=None):
     """
     Give primary header, header, cube (W, Y, X) and known pixels, for a ``with`` block.
 
-    The cube is memory-mapped. Pixels with a value and an inverse variance above zero are known;
-    None if all are. ``masters`` are dark and flat, see `Masters`.
+    The cube is memory-mapped. Pixels with a value and an inverse variance above zero are known.
+    ``masters`` are dark and flat, see `Masters`.
     """
     with ExitStack() as stack:
         with readable_fits(path), warnings.catch_warnings():
@@ -144,7 +144,7 @@ def _read(path, hdus, layout, masters):
     primary, header, cube, good = _read_beams(path, hdus, layout, masters)
     left = layout.left_file(path)
     if left is None:
-        return primary, header, cube, None if good.all() else good
+        return primary, header, cube, good
     if not left.is_file():
         raise ObservationError(f"{path}: no file {left.name} of the left beam beside it")
     # what is joined is in memory, so that this file need not stay open
@@ -152,7 +152,7 @@ def _read(path, hdus, layout, masters):
         own = masters and masters.of_left(layout)
         _, _, other, known = _read_beams(left, others, layout, own)
     joined, good = (np.concatenate(pair, axis=-1) for pair in ((other, cube), (known, good)))
-    return primary, header, joined, None if good.all() else good
+    return primary, header, joined, good
 
 
 def _read_beams(path, hdus, layout, masters):
@@ -321,8 +321,18 @@ def match_beams(frame, layout, cube, detector):
     other = read_header(path, layout)
     frame.errors += [f"{path.name}: {error}" for error in other.errors]
     # what the plate did while the cameras were exposed must be one thing
-    frame.errors += _contradictions(frame.values, other.values, path.name)
-    frame.errors += _wrong_cameras(frame, other, layout)
+    for column, tolerance in _COMMON.items():
+        ours, theirs = frame.values.get(column), other.values.get(column)
+        same = ours == theirs
+        if tolerance is not None and None not in (ours, theirs):
+            same = abs(ours - theirs) <= tolerance
+        if not same:
+            frame.errors.append(f"{column} = {ours}, but {theirs} in {path.name}")
+    for one, mark in zip((frame, other), layout.beam_files, strict=True):
+        camera = one.values.get("camera")
+        if camera is not None and not mark.endswith(f"{camera:g}"):
+            keyword = layout.keywords["camera"]
+            frame.errors.append(f"{keyword} = {camera:g}, its name says {mark!r}")
     # each camera is read out in its own way
     unit, exposure = detector.unit.to_string(), other.values.get("exposure_time")
     left = detector_of(layout, unit, exposure, other.values)
@@ -343,29 +353,6 @@ def beam_detectors(path, layout, values, unit=None):
     left = layout.left_file(path)
     both = (values, values if left is None else read_header(left, layout).values)
     return [detector_of(layout, unit, known.get("exposure_time"), known) for known in both]
-
-
-def _contradictions(right, left, name):
-    """Return what the headers of both beams do not agree in."""
-    found = []
-    for column, tolerance in _COMMON.items():
-        ours, theirs = right.get(column), left.get(column)
-        same = ours == theirs
-        if tolerance is not None and None not in (ours, theirs):
-            same = abs(ours - theirs) <= tolerance
-        if not same:
-            found.append(f"{column} = {ours}, but {theirs} in {name}")
-    return found
-
-
-def _wrong_cameras(frame, other, layout):
-    """Return which files are not of the camera that their names say."""
-    keyword = layout.keywords.get("camera")
-    return [
-        f"{keyword} = {one.values['camera']:g}, its name says {mark!r}"
-        for one, mark in zip((frame, other), layout.beam_files, strict=True)
-        if "camera" in one.values and not mark.endswith(f"{one.values['camera']:g}")
-    ]
 
 
 # ---- science frames, before their light is measured ---------------------------------------------

@@ -125,8 +125,16 @@ def read_header(path, layout, *, header=None, raw=None):
     # only for these is a raw header opened
     missing = [c for c in layout.raw_columns if look_up(headers, c, layout)[1] is None]
     if raw is not None and missing:
-        # behind the cube: its own keywords come first
-        headers += _raw_header(frame, raw)
+        if frame.number is None:
+            frame.errors.append("its name holds no frame number to find the raw frame by")
+        elif frame.number not in raw:
+            frame.errors.append(f"no raw frame of number {frame.number}")
+        else:
+            try:
+                # behind the cube: its own keywords come first
+                headers.append(primary_header(raw[frame.number]))
+            except ObservationError as error:
+                frame.errors.append(f"raw frame: {error}")
     for column in columns:
         keyword, value = look_up(headers, column, layout)
         if value is not None and column not in frame.values:
@@ -171,36 +179,27 @@ def not_of_instrument(values, layout):
     return f"{keyword} = {own!r}, allowed are {', '.join(layout.identities)}"
 
 
-def _raw_header(frame, raw):
-    if frame.number is None:
-        frame.errors.append("its name holds no frame number to find the raw frame by")
-    elif frame.number not in raw:
-        frame.errors.append(f"no raw frame of number {frame.number}")
-    else:
-        try:
-            return [primary_header(raw[frame.number])]
-        except ObservationError as error:
-            frame.errors.append(f"raw frame: {error}")
-    return []
-
-
 def _convert(frame, column, keyword, value, layout):
     """Store a value in the unit of its column, or say why it cannot be right."""
     if column == "flc_state":
-        _add_state(frame, keyword, value, layout)
-    elif column == "date":
+        known = {"A": "A", "B": "B"} | layout.states
+        # a whole number may be written as 1.0
+        word = f"{value:g}" if isinstance(value, float) else str(value).strip()
+        if word not in known:
+            frame.errors.append(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
+        elif known[word]:
+            frame.values["flc_state"] = known[word]
+        return
+    if column == "date":
         try:
             frame.values[column] = iso_date(value, keyword)
         except ParameterError as error:
             # the time may stand in another keyword
             frame.doubts.append(f"{error}; it was left out")
-    elif column in TEXTS or column in layout.texts:
+        return
+    if column in TEXTS or column in layout.texts:
         frame.values[column] = " ".join(str(value).split())
-    else:
-        _add_number(frame, column, keyword, value, layout)
-
-
-def _add_number(frame, column, keyword, value, layout):
+        return
     unit = {"exposure_time": "s"}.get(column, unit_of(column, layout))
     target = u.deg if column in ANGLES else u.Unit(unit)
     try:
@@ -218,28 +217,6 @@ def _add_number(frame, column, keyword, value, layout):
     allowed = "finite numbers" if np.isinf(low) else "numbers above zero"
     allowed = f"{low:g} to {high:g} {target}".strip() if np.isfinite(high) else allowed
     frame.errors.append(f"{keyword} = {value}, allowed are {allowed}")
-
-
-def _add_state(frame, keyword, value, layout):
-    """Store the state of a modulator, A or B."""
-    known = {"A": "A", "B": "B"} | layout.states
-    # a whole number may be written as 1.0
-    word = f"{value:g}" if isinstance(value, float) else str(value).strip()
-    if word not in known:
-        frame.errors.append(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
-    elif known[word]:
-        frame.values["flc_state"] = known[word]
-
-
-def pointing(values, site):
-    """
-    Return altitude and parallactic angle of a target, degree.
-
-    By ``right_ascension`` (hours, or degrees if a plain number), ``declination`` (J2000) and the
-    time; ``site`` is (longitude, latitude, height).
-    """
-    (angles,) = _pointings([_target(values, site)], site)
-    return angles
 
 
 def add_pointing(frames, layout, needed=True):
@@ -261,9 +238,16 @@ def add_pointing(frames, layout, needed=True):
         except ObservationError as error:
             if needed:
                 frame.errors.append(f"no keyword {' and '.join(words)} in its header, and {error}")
-    angles = _pointings([target for *_, target in found], layout.site)
-    for (frame, missing, _), (altitude, parallactic) in zip(found, angles, strict=True):
-        known = {"altitude": altitude, "parallactic": parallactic}
+    if not found:
+        return
+    # all at once, as the transformation costs the same for one
+    ra, dec, mjd = np.array([target for *_, target in found], dtype=float).T
+    coordinate = SkyCoord(ra, dec, unit=u.deg, frame=FK5(equinox="J2000"))
+    time = Time(mjd, format="mjd", scale="utc")
+    angles = sky_pointing(coordinate, time, location_of(layout.site))
+    angles = dict(zip(("altitude", "parallactic"), angles, strict=True))
+    for i, (frame, missing, _) in enumerate(found):
+        known = {name: float(angle[i].to_value(u.deg)) for name, angle in angles.items()}
         # a header value goes before a computed one
         frame.values.update({name: known[name] for name in missing})
         frame.doubts.append(f"{' and '.join(missing)} computed from the coordinates and the time")
@@ -282,17 +266,6 @@ def _target(values, site):
     except (ValueError, TypeError, u.UnitsError) as error:
         raise ObservationError(f"right ascension and declination: {one_line(error)}") from None
     return ra, dec, time.mjd
-
-
-def _pointings(targets, site):
-    """Return altitude and parallactic angle of each, in degree."""
-    if not targets:
-        return []
-    # all at once, as the transformation costs the same for one
-    ra, dec, mjd = np.array(targets, dtype=float).T
-    coordinate = SkyCoord(ra, dec, unit=u.deg, frame=FK5(equinox="J2000"))
-    angles = sky_pointing(coordinate, Time(mjd, format="mjd", scale="utc"), location_of(site))
-    return list(zip(*(angle.to_value(u.deg).tolist() for angle in angles), strict=True))
 
 
 def observation_time(values):
@@ -340,7 +313,11 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     # an uneven angle is a step of its own, which no sequence has
     steps[uneven] = 1e6 + np.flatnonzero(uneven)
     blocks = np.split(np.arange(len(hwp)), np.flatnonzero(np.abs(np.diff(derotator)) > 1.0) + 1)
-    sequence = _sequence([tuple(steps[block]) for block in blocks])
+    # the steps that most blocks have, if there is a majority
+    ranked = Counter(tuple(steps[block]) for block in blocks if max(steps[block]) < 1e6)
+    (sequence, count), (_, second) = [*ranked.most_common(2), (None, 0), (None, 0)][:2]
+    if len(blocks) < 2 or count == second:
+        sequence = None
     found = {}
     for i, expected in (one for b in blocks for one in _misfits(b, steps, sequence, uneven)):
         found[int(i)] = f"half-wave plate at {hwp[i]:g} deg"
@@ -349,13 +326,6 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
         if expected is not None and expected < 1e6:
             found[int(i)] += f"; the sequence has {expected * layout.hwp_step:g} deg"
     return found
-
-
-def _sequence(blocks):
-    """Return the steps that most blocks have, or None if there is no majority."""
-    ranked = Counter(block for block in blocks if max(block) < 1e6).most_common(2)
-    tied = len(ranked) == 2 and ranked[0][1] == ranked[1][1]
-    return None if len(blocks) < 2 or not ranked or tied else ranked[0][0]
 
 
 def _misfits(block, steps, sequence, uneven):

@@ -1,18 +1,17 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Images of the beams of a dual-beam polarimeter: field stop, stars, detector."""
 
-from dataclasses import dataclass
-
 import astropy.units as u
 import numpy as np
 from astropy.stats import gaussian_fwhm_to_sigma
+from scipy import ndimage
 from scipy.special import erf
 
 from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.reduction.photometry import rectangles, turned
 from astropolcal.reduction.wings import HALO_BETA
 from astropolcal.simulation import check_electrons
 from astropolcal.units import angle_to_rad
-from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -34,35 +33,25 @@ class Scene:
         # the field stop moves with the star from beam to beam
         # place in the left beam whose image in the right one is as far off its aperture
         self.centre = (np.add(left, right) - self.offset) / 2
-        # margin on all sides: an aperture must not see the edge of the stop
-        size = (width + 2 * margin, height + 2 * margin)
-        stops = [rectangle(layout.shape[1:], c, size, angle) for c in self.centres(self.centre)]
-        # a stop fills a part of the image only; profiles are computed inside
-        self.boxes = [_bounding_box(stop) for stop in stops]
-        self.stops = [stop[box] for stop, box in zip(stops, self.boxes, strict=True)]
         # flux of a lamp is what an aperture of the layout gets, whatever the stop
         self.area = width * height
-        for beam, place in zip(BEAMS, (right, left), strict=True):
-            self._check_inside(beam, place, (width, height), angle)
-        apertures = [rectangle(layout.shape[1:], c, (width, height), angle) for c in (right, left)]
-        for stop, aperture in zip(stops, apertures, strict=True):
-            if source == "internal" and np.any(stop[aperture > 0] < 1):
+        # margin on all sides: an aperture must not see the edge of the stop
+        size = (width + 2 * margin, height + 2 * margin)
+        self.boxes, self.stops = [], []
+        apertures = rectangles(layout.internal_apertures, layout.shape[1:])
+        places = self.centres(self.centre)
+        for place, (rows, columns, weights) in zip(places, apertures, strict=True):
+            stop = rectangle(layout.shape[1:], place, size, angle)
+            if not stop.any():
+                raise InstrumentError("internal_apertures: a beam lies outside the cube")
+            if source == "internal" and np.any(stop[rows, columns][weights > 0] < 1):
                 raise ParameterError(
                     f"margin = {margin:g} pixels: the field stop cuts the apertures of the layout"
                 )
-
-    def _check_inside(self, beam, place, size, angle):
-        """Refuse an aperture of which a corner lies outside of the image."""
-        # half the width and height of the upright box around a turned rectangle
-        cos, sin = np.abs(np.cos(angle)), np.abs(np.sin(angle))
-        reach = 0.5 * np.array([size[0] * cos + size[1] * sin, size[0] * sin + size[1] * cos])
-        rows, columns = self.shape[1:]
-        # the outer edge of pixel 0 is at -0.5
-        if np.any(place - reach < -0.5) or np.any(place + reach > (columns - 0.5, rows - 0.5)):
-            raise InstrumentError(
-                f"internal_apertures: the {beam} beam at ({place[0]:g}, {place[1]:g}) leaves the "
-                f"image of {columns} x {rows} pixels"
-            )
+            # a stop fills a part of the image only; profiles are computed inside
+            (box,) = ndimage.find_objects((stop > 0).astype(int))
+            self.boxes.append(box)
+            self.stops.append(stop[box])
 
     def check_places(self, centres):
         """Refuse frames whose star lies outside of the image, in either beam."""
@@ -118,21 +107,9 @@ class Scene:
 
 def rectangle(shape, centre, size, angle):
     """Return the part of each pixel within a turned rectangle, its edges a pixel wide."""
-    y, x = np.indices(shape)
-    # into the axes of the rectangle
-    dx, dy = x - centre[0], y - centre[1]
-    along = dx * np.cos(angle) + dy * np.sin(angle)
-    across = dy * np.cos(angle) - dx * np.sin(angle)
-    sides = zip((along, across), size, strict=True)
+    sides = zip(turned(shape, centre, angle), size, strict=True)
     # linear over one pixel: the area stays that of the rectangle at any angle
     return np.prod([np.clip(full / 2 - np.abs(d) + 0.5, 0, 1) for d, full in sides], axis=0)
-
-
-def _bounding_box(stop):
-    used = np.nonzero(stop)
-    if not used[0].size:
-        raise InstrumentError("internal_apertures: a beam lies outside the cube")
-    return tuple(slice(index.min(), index.max() + 1) for index in used)
 
 
 def _by_width(profile, box, place, fwhm, beta):
@@ -169,47 +146,34 @@ def moffat(box, place, fwhm, beta):
     return pixels * (beta - 1) / (np.pi * core**2)
 
 
-@dataclass(frozen=True)
-class Detector:
-    """What a detector does to the electrons of a pixel, and what its errors follow from."""
+def expose(light, how, response, rng):
+    """
+    Return the image in adu that a detector, `ReadOut`, makes of light, and inverse variances.
 
-    gain: float
-    read_noise: float
-    background: np.ndarray
-    saturation: float
-    noise: bool
-    excess_noise: float = 1.0
-
-    def expose(self, light, response, rng):
-        """Return the image in adu, and the inverse of its variance."""
-        electrons = self.gain * response * (light + self.background)
-        # in adu^2; of the expectation, not of what was drawn, so that weights are unbiased
-        variance = (self.excess_noise**2 * electrons + self.read_noise**2) / self.gain**2
-        check_electrons(electrons)
-        if self.noise:
-            electrons = rng.poisson(electrons)
-            # each becomes an exponentially distributed number of them; F^2 = 1 + the variance of
-            # what one becomes, in units of the gain squared
-            extra = self.excess_noise**2 - 1
-            electrons = extra * rng.gamma(electrons / extra) if extra > 0 else electrons
-            electrons = electrons + self.read_noise * rng.standard_normal(light.shape)
-        # in adu, as the layout gives it
-        image = np.minimum(electrons / self.gain, self.saturation)
-        with np.errstate(divide="ignore"):
-            weight = np.where(variance > 0, 1 / variance, 0.0)
-        return image.astype(np.float32), weight.astype(np.float32)
+    Of the light in each pixel, with that of the background; without noise where ``rng`` is None.
+    """
+    electrons = how.gain * response * light
+    # in adu^2; of the expectation, not of what was drawn, so that weights are unbiased
+    variance = (how.excess_noise**2 * electrons + how.read_noise**2) / how.gain**2
+    check_electrons(electrons)
+    if rng is not None:
+        electrons = rng.poisson(electrons)
+        # each becomes an exponentially distributed number of them; F^2 = 1 + the variance of
+        # what one becomes, in units of the gain squared
+        extra = how.excess_noise**2 - 1
+        electrons = extra * rng.gamma(electrons / extra) if extra > 0 else electrons
+        electrons = electrons + how.read_noise * rng.standard_normal(light.shape)
+    # in adu, as the layout gives it
+    image = np.minimum(electrons / how.gain, how.saturation)
+    with np.errstate(divide="ignore"):
+        weight = np.where(variance > 0, 1 / variance, 0.0)
+    return image.astype(np.float32), weight.astype(np.float32)
 
 
 # ---- arguments -----------------------------------------------------------------------------------
 
 # milliarcsecond in a degree, the unit of a layout's pixel scale
 _MAS_PER_DEG = 3.6e6
-
-
-def choice(name, value, allowed):
-    """Return a word, or refuse it if it is not among those allowed."""
-    check_choice(name, value, allowed, ParameterError)
-    return value
 
 
 def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):

@@ -117,7 +117,18 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
 
     A rate needs the exposure time in seconds. The ``values`` of the header say how it was read out.
     """
-    own = _unit(unit)
+    # counts and DN are adu
+    words = str(unit or "adu").strip()
+    # the longer name first: "count" would leave an s behind
+    for name in ("counts", "count", "Counts", "DN", "ADU", "dn"):
+        words = words.replace(name, "adu")
+    words = words.replace("e-", "electron").replace("electrons", "electron")
+    try:
+        own = u.Unit(words)
+    except (ValueError, TypeError):
+        own = u.dimensionless_unscaled
+    if not any(own.is_equivalent(kind / per) for kind in (u.adu, u.electron) for per in (1, u.s)):
+        raise ObservationError(f"BUNIT = {unit!r}; allowed are adu, electron, and these per second")
     # of a rate the photon noise depends on how long it was collected
     rate = own.is_equivalent(u.adu / u.s) or own.is_equivalent(u.electron / u.s)
     if rate and exposure_time is None:
@@ -132,22 +143,6 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
     return Detector(own, electrons, noise, full, how.excess_noise)
 
 
-def _unit(text):
-    """Return the unit that BUNIT names; counts and DN are adu."""
-    words = str(text or "adu").strip()
-    # the longer name first: "count" would leave an s behind
-    for name in ("counts", "count", "Counts", "DN", "ADU", "dn"):
-        words = words.replace(name, "adu")
-    words = words.replace("e-", "electron").replace("electrons", "electron")
-    try:
-        unit = u.Unit(words)
-    except (ValueError, TypeError):
-        unit = u.dimensionless_unscaled
-    if not any(unit.is_equivalent(kind / per) for kind in (u.adu, u.electron) for per in (1, u.s)):
-        raise ObservationError(f"BUNIT = {text!r}; allowed are adu, electron, and these per second")
-    return unit
-
-
 def flux_variance(photons, area, background_variance, n_background=np.inf):
     """
     Return the variance of an aperture's flux after background subtraction.
@@ -156,13 +151,12 @@ def flux_variance(photons, area, background_variance, n_background=np.inf):
     ``n_background`` pixels.
     """
     # the same error of the level in every pixel: it grows as the area
-    median = _MEDIAN * np.square(area) / np.asarray(n_background, dtype=float)
-    return np.asarray(photons) + (area + median) * np.asarray(background_variance)
+    return photons + (area + _MEDIAN * area**2 / n_background) * background_variance
 
 
 def shared_background(area_right, area_left, background_variance, n_background):
     """Return the covariance of two beams from which the same median background was subtracted."""
-    return _MEDIAN * np.multiply(area_right, area_left) * background_variance / n_background
+    return _MEDIAN * area_right * area_left * background_variance / n_background
 
 
 def shared_pixels(centre_distance, radius, background_variance):
@@ -194,6 +188,13 @@ _SAMPLED = 5
 _EVEN = 0.5
 
 
+def turned(shape, centre, angle):
+    """Return the distances of all pixels along the axes of a turned rectangle."""
+    y, x = np.indices(shape)
+    dx, dy = x - centre[0], y - centre[1]
+    return dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+
+
 @lru_cache(maxsize=8)
 def rectangles(apertures, shape):
     """
@@ -217,22 +218,6 @@ def rectangles(apertures, shape):
     return tuple(found)
 
 
-@lru_cache(maxsize=8)
-def _outside(apertures, shape):
-    """Return the pixels that are clear of all rectangles."""
-    *centres, width, height, angle = apertures
-    # the wings of the beams reach farther than the rectangles
-    grown = width + 2 * _CLEAR, height + 2 * _CLEAR
-    y, x = np.indices(shape)
-    clear = np.ones(shape, dtype=bool)
-    for cx, cy in centres:
-        # into the axes of the rectangle
-        along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
-        across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
-        clear &= (np.abs(along) > grown[0] / 2) | (np.abs(across) > grown[1] / 2)
-    return clear
-
-
 def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
     """
     Measure the beams of an internal source in all slices of a cube (W, Y, X).
@@ -244,6 +229,7 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     check_choice("background", background, _BACKGROUNDS, ParameterError)
     if not 0 <= max_masked < 1:
         raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
+    good = np.isfinite(cube) if good is None else good
     result = Photometry.empty(len(cube), len(layout.beams))
     level, spread, number = np.zeros(len(cube)), np.full(len(cube), detector.read_noise**2), np.inf
     if background == "outside":
@@ -252,21 +238,24 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     areas = []
     inside = rectangles(layout.internal_apertures, cube.shape[1:])
     for beam, (rows, columns, weights) in enumerate(inside):
-        own, cut = detector.of(beam), cube[:, rows, columns]
-        known = None if good is None else good[:, rows, columns]
+        own, cut, known = detector.of(beam), cube[:, rows, columns], good[:, rows, columns]
         single = _outliers(cut, known, weights, own)
         result.outliers += int(single.sum())
-        used = known if not single.any() else ~single if known is None else known & ~single
-        total, area, kept = _weighted(cut, used, weights)
+        used = known & ~single
+        # one product for all slices: the weighted sum, and the area that has values
+        total, kept = (
+            pixels.reshape(len(cube), -1) @ weights.ravel()
+            for pixels in (np.where(used, cut, 0.0), used)
+        )
+        area = weights.sum()
         scale = area / np.where(kept > 0, kept, 1.0)
         result.flux[beam] = total * scale - level * area
         photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
         pixel = np.maximum(spread, own.read_noise**2)
         result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
         result.flag(kept < (1 - max_masked) * area, f"{layout.beams[beam]} aperture masked")
-        # -inf never is the brightest
-        values = cut if known is None else np.where(known, cut, -np.inf)
-        result.flag(values[:, weights > 0].max(axis=1) >= own.saturation, "saturated")
+        full = known & (weights > 0) & (cut >= own.saturation)
+        result.flag(full.any(axis=(1, 2)), "saturated")
         areas.append(area)
     if background == "outside" and layout.two_beams:
         result.covariance[:] = shared_background(*areas, spread, number)
@@ -282,11 +271,10 @@ def evenly_lit(cube, good, layout):
     """
     beams = []
     for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
-        inside = (slice(None), rows, columns)
-        known = np.ones((1, 1, 1), bool) if good is None else good[inside]
+        known = good[:, rows, columns]
         # in the precision of the cube a damaged pixel would overflow
-        total = np.sum(cube[inside], axis=0, dtype=float, where=known)
-        number = np.broadcast_to(known, cube[inside].shape).sum(axis=0)
+        total = np.sum(cube[:, rows, columns], axis=0, dtype=float, where=known)
+        number = known.sum(axis=0)
         whole = (weights >= 1.0) & (number > 0)
         pixels = total[whole] / number[whole]
         beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
@@ -295,73 +283,61 @@ def evenly_lit(cube, good, layout):
     return bool(median >= _EVEN * mean)
 
 
-def _weighted(cut, known, weights):
-    """Return the weighted sum of each slice, the area, and the area that has values."""
-    # (W, pixels) @ (pixels,): one product for all slices
-    flat, w = cut.reshape(len(cut), -1), weights.ravel()
-    area = w.sum()
-    if known is None:
-        return flat @ w, area, np.full(len(cut), area)
-    known = known.reshape(len(cut), -1)
-    return np.where(known, flat, 0.0) @ w, area, known @ w
-
-
+# damaged pixels may be beyond all numbers, and are then infinitely far off
 # damaged pixels may be beyond all numbers, and are then infinitely far off
 @np.errstate(over="ignore", invalid="ignore")
 def _outliers(cut, known, weights, detector):
     """Return the single pixels that are far off their neighbours."""
     sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
-    pixels, there = cut[sample], None if known is None else known[sample]
-    level = _median(pixels, there)
-    spread = MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), there)
+    level = _median(cut[sample], known[sample])
+    spread = MAD_TO_SIGMA * _median(np.abs(cut[sample] - level[:, None]), known[sample])
+
+    def limits(level, spread):
+        """Return between which values pixels are like those around them."""
+        reach = _SIGMAS * np.sqrt(spread**2 + detector.variance(level))
+        high = np.maximum(_FACTOR * level, level + reach + _ELECTRONS / detector.gain)
+        # there may be less light, down to none
+        return np.minimum(level, 0.0) - reach, high
+
     # first those far off the others of their slice: only of these the neighbours are looked at
-    low, high = (limit[:, None, None] for limit in _limits(level, spread, detector))
     kind = np.result_type(cut, np.float32)
-    found = ((cut > high.astype(kind)) | (cut < low.astype(kind))) & (weights > 0)
-    if known is not None:
-        found &= known
+    low, high = (limit[:, None, None].astype(kind) for limit in limits(level, spread))
+    found = ((cut > high) | (cut < low)) & (weights > 0) & known
     k, rows, columns = places = np.nonzero(found)
     if k.size:
-        values = np.asarray(cut if known is None else np.where(known, cut, np.nan), dtype=float)
+        values = np.where(known, cut, np.nan).astype(float)
         padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
         steps = [step for step in np.ndindex(3, 3) if step != (1, 1)]
         around = np.stack([padded[k, rows + y, columns + x] for y, x in steps], axis=1)
-        low, high = _limits(_median(around, ~np.isnan(around)), spread[k], detector)
+        low, high = limits(_median(around, ~np.isnan(around)), spread[k])
         # false where no neighbour has a value
         found[places] = (values[places] > high) | (values[places] < low)
     return found
 
 
-def _limits(level, spread, detector):
-    """Return between which values pixels are like those around them."""
-    reach = _SIGMAS * np.sqrt(spread**2 + detector.variance(level))
-    high = np.maximum(_FACTOR * level, level + reach + _ELECTRONS / detector.gain)
-    # there may be less light, down to none
-    return np.minimum(level, 0.0) - reach, high
-
-
 def _median(pixels, known):
     """Return the median of each row, infinite without a value."""
     # nanmedian takes ten times as long; of no value the infinite ones are left
-    number = np.full(len(pixels), pixels.shape[1]) if known is None else known.sum(axis=1)
-    ordered = np.sort(pixels if known is None else np.where(known, pixels, np.inf), axis=1)
-    row = np.arange(len(pixels))
+    number, row = known.sum(axis=1), np.arange(len(pixels))
+    ordered = np.sort(np.where(known, pixels, np.inf), axis=1)
     return (ordered[row, (number - 1) // 2] + ordered[row, number // 2]) / 2.0
 
 
 def _level(cube, good, detector, layout):
     """Return the median outside the beams, the variance of a pixel, and their number."""
-    clear = _outside(layout.internal_apertures, cube.shape[1:])
+    *centres, width, height, angle = layout.internal_apertures
+    clear = np.ones(cube.shape[1:], dtype=bool)
+    for centre in centres:
+        along, across = turned(clear.shape, centre, angle)
+        # the wings of the beams reach farther than the rectangles
+        clear &= (np.abs(along) > width / 2 + _CLEAR) | (np.abs(across) > height / 2 + _CLEAR)
     pixels = np.array(cube[:, clear], dtype=float)
     # cubes hold exact zeros where the detector has no lenslets
-    unknown = pixels == 0.0
-    if good is not None:
-        unknown |= ~good[:, clear]
-    pixels[unknown] = np.nan
-    number = (~unknown).sum(axis=1)
-    pixels[number == 0] = 0.0
+    known = good[:, clear] & (pixels != 0.0)
+    pixels[~known] = np.nan
+    pixels[~known.any(axis=1)] = 0.0
     # a median, which stray light of the beams hardly moves
     level = np.nanmedian(pixels, axis=1)
     # never below the detector's own noise, as a slice of constants would have
     spread = (MAD_TO_SIGMA * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)) ** 2
-    return level, np.maximum(spread, detector.variance(level)), np.maximum(number, 1)
+    return level, np.maximum(spread, detector.variance(level)), np.maximum(known.sum(axis=1), 1)

@@ -28,8 +28,6 @@ from astropolcal.words import check_choice
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
-# stages whose angles have sequences that are known
-_HALF_WAVE = {"hwp", "derotator"}
 # below this number of files a process, its start costs more than it saves
 _FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
@@ -260,13 +258,16 @@ def reduce_run(
     """
     files = [str(path) for path in files]
     instrument = _instrument(instrument, files)
-    photometry = _photometry(source, instrument)
+    # an instrument of somebody else need not list its sources
+    if known := getattr(instrument, "sources", ()):
+        allowed = dict.fromkeys(("internal", "star", *known))
+        check_choice("source", source, allowed, ParameterError)
+    photometry = "star" if is_star(source) else "internal"
     if not files:
         raise ObservationError("no files to reduce")
     # before the work is done: the table would be refused
     stated_date(meta or {}, "reduced")
-    n_files = len(files)
-    files, layout, lost = sort_beams(files, instrument.files)
+    cubes, layout, lost = sort_beams(files, instrument.files)
     masters = Masters(*(None if path is None else str(path) for path in (dark, flat)))
     # a dark that does not fit is no fault of the frames
     masters.check(layout)
@@ -277,21 +278,27 @@ def reduce_run(
         "raw": None if raw is None else raw_frames(raw, layout),
         "options": options,
     }
-    frames = _measure_all(files, task, workers, cluster, resume, progress)
+    frames = _measure_all(cubes, task, workers, cluster, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    known = {"options": options, "masters": task["masters"]}
-    reduction = Reduction(instrument, photometry, problems=lost, **known)
+    reduction = Reduction(
+        instrument, photometry, problems=lost, options=options, masters=task["masters"]
+    )
     # copies before sequences: a copy would look like an angle too often
-    frames = _with_state(set_aside(frames, reduction), reduction)
+    frames = set_aside(frames, reduction)
+    if any(frame.values.get("flc_state") for frame in frames):
+        keyword = layout.keywords.get("flc_state", "flc_state")
+        why = f"no state of the modulator, A or B, in its header ({keyword}), which others have"
+        frames = _kept(frames, reduction, lambda f: [] if "flc_state" in f.values else [why])
     replace_angles(frames, hwp_sequence)
-    check = hwp_sequence is None and _HALF_WAVE <= {*layout.stages}
-    frames = consistent(frames, reduction, layout, check)
-    if photometry == "internal" and not keep_repeats and _HALF_WAVE <= {*layout.stages}:
+    staged = {"hwp", "derotator"} <= {*layout.stages}
+    if staged and hwp_sequence is None:
+        frames = consistent(frames, reduction, layout)
+    if staged and photometry == "internal" and not keep_repeats:
         frames = without_repeats(frames, reduction)
     if not frames:
-        raise ObservationError(_nothing(n_files, reduction.problems) + _hint(task, reduction))
+        raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
     for frame in frames:
         if frame.values.get("light") == "uneven":
@@ -321,15 +328,6 @@ def _instrument(instrument, files=()):
     return instrument
 
 
-def _with_state(frames, reduction):
-    """Leave out frames without the state of a modulator that others have."""
-    if not any(frame.values.get("flc_state") for frame in frames):
-        return frames
-    keyword = reduction.instrument.files.keywords.get("flc_state", "flc_state")
-    why = f"no state of the modulator, A or B, in its header ({keyword}), which others have"
-    return _kept(frames, reduction, lambda f: [] if "flc_state" in f.values else [why])
-
-
 def _kept(frames, reduction, why):
     """Return the frames of which ``why`` knows no reasons to leave them out; note the others."""
     found = [(frame, why(frame)) for frame in frames]
@@ -337,30 +335,17 @@ def _kept(frames, reduction, why):
     return [frame for frame, reasons in found if not reasons]
 
 
-def _photometry(source, instrument):
-    known = getattr(instrument, "sources", ())
-    allowed = dict.fromkeys(("internal", "star", *known))
-    # an instrument of somebody else need not list its sources
-    if known:
-        check_choice("source", source, allowed, ParameterError)
-    return "star" if is_star(source) else "internal"
-
-
-def _nothing(count, problems):
+def _nothing(count, task, problems):
+    """Return why none of the files can be used, and where else to look for keywords."""
     first, *rest = (f"{path}: {'; '.join(why)}" for path, why in problems.items())
     more = f" (and {len(rest)} more)" if rest else ""
     none = "the file cannot be used" if count == 1 else f"none of the {count} files can be used"
-    return f"{none}: {first}{more}"
-
-
-def _hint(task, reduction):
-    """Return where to look for keywords that cubes do not have, if nobody has looked there."""
     known = map(task["layout"].keywords.get, task["layout"].raw_columns)
     lacking = tuple(f"no keyword {keyword} " for keyword in known if keyword)
-    every = (why for reasons in reduction.problems.values() for why in reasons)
-    if task["raw"] is not None or not any(why.startswith(lacking) for why in every):
-        return ""
-    return "; give the folder of the raw frames, which may have them (raw, --raw DIR)"
+    every = (why for reasons in problems.values() for why in reasons)
+    if task["raw"] is None and any(why.startswith(lacking) for why in every):
+        more += "; give the folder of the raw frames, which may have them (raw, --raw DIR)"
+    return f"{none}: {first}{more}"
 
 
 # --- all files -------------------------------------------------------------------
@@ -376,21 +361,17 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     found = {path: frame for path, frame in found.items() if frame is not None}
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
-    results = _results(todo, task, _count(workers, len(todo)), cluster)
+    if workers is None:
+        workers = max(1, min(os.cpu_count() or 1, len(todo) // _FILES_A_WORKER))
+    if not (isinstance(workers, int) and workers >= 1):
+        raise ParameterError(f"workers = {workers!r}; a whole number above zero is needed")
+    results = _results(todo, task, min(workers, max(len(todo), 1)), cluster)
     with shown(progress):
         for frame in steps(results, "cubes", len(set(files)), len(found)):
             found[frame.path] = frame
             # at once: a run that is killed keeps what is done
             journal.add(frame)
     return [found[path] for path in dict.fromkeys(files)]
-
-
-def _count(workers, n_files):
-    if workers is None:
-        return max(1, min(os.cpu_count() or 1, n_files // _FILES_A_WORKER))
-    if not (isinstance(workers, int) and workers >= 1):
-        raise ParameterError(f"workers = {workers!r}; a whole number above zero is needed")
-    return min(workers, max(n_files, 1))
 
 
 def _results(files, task, workers, cluster):
@@ -541,10 +522,8 @@ def replace_angles(frames, sequence):
             frame.doubts.append(words)
 
 
-def consistent(frames, reduction, layout, check):
+def consistent(frames, reduction, layout):
     """Leave out frames whose commanded angle does not fit the sequence of the run."""
-    if not check or not frames:
-        return frames
     angles = ([frame.values[name] for frame in frames] for name in ("hwp", "derotator"))
     wrong = {frames[i].path: [why] for i, why in check_sequence(*angles, layout).items()}
     return _kept(frames, reduction, lambda frame: wrong.get(frame.path))
@@ -555,19 +534,17 @@ def without_repeats(frames, reduction):
     seen = []
 
     def why(frame):
-        twin = next((other for other in seen if _repeats(frame, other)), None)
-        if twin is None:
-            seen.append(frame)
-            return []
-        return [f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"]
+        for twin in seen:
+            hwp, derotator = (abs(frame.values[k] - twin.values[k]) for k in ("hwp", "derotator"))
+            # a half-wave plate at 90 deg has the Mueller matrix of one at 0
+            if abs(hwp - 90.0) < 0.3 and derotator < 0.5:
+                return [
+                    f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
+                ]
+        seen.append(frame)
+        return []
 
     return _kept(frames, reduction, why)
-
-
-def _repeats(frame, other):
-    hwp, derotator = (frame.values[k] - other.values[k] for k in ("hwp", "derotator"))
-    # a half-wave plate at 90 deg has the Mueller matrix of one at 0
-    return abs(abs(hwp) - 90.0) < 0.3 and abs(derotator) < 0.5
 
 
 # ---- journal -------------------------------------------------------------------------------------
@@ -601,7 +578,6 @@ class Journal:
         self.path = None if path is None else Path(path)
         text = json.dumps(settings, sort_keys=True, default=repr)
         self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._is_cut = False
         self._known = {} if self.path is None else self._read()
 
     def _read(self):
@@ -610,7 +586,6 @@ class Journal:
         with understood(self.path, ObservationError, "cannot be read as a journal"):
             text = self.path.read_text(encoding="utf-8")
         lines, known = text.splitlines(), {}
-        self._is_cut = not text.endswith("\n") and bool(text)
         for line in lines:
             # a line may have been cut off when a run was stopped
             with suppress(*_DAMAGE):
@@ -636,7 +611,5 @@ class Journal:
         key = self._key(frame.path)
         if self.path is None or key is None:
             return
-        # a line that was cut off ends here
-        start, self._is_cut = "\n" if self._is_cut else "", False
         line = json.dumps({"key": key, "frame": frame.to_dict()})
-        append_line(self.path, start + line, ObservationError)
+        append_line(self.path, line, ObservationError)

@@ -127,7 +127,21 @@ def table_from_spectra(spectra):
             f"spectra: missing {', '.join(missing) or 'none'}, unknown "
             f"{', '.join(unknown) or 'none'}; needed are I, q, u, and v if measured"
         )
-    table = QTable({"wavelength": _common_axis(spectra)})
+    axes = {}
+    for key, spectrum in spectra.items():
+        if np.ndim(spectrum.flux) != 1:
+            raise ObservationError(f"spectrum {key}: {np.ndim(spectrum.flux)} axes; 1 is needed")
+        axis = u.Quantity(spectrum.spectral_axis)
+        # frequencies and energies run the other way; the table is sorted later
+        if not axis.unit.is_equivalent(u.um):
+            axis = axis.to(u.um, u.spectral())
+        axes[key] = axis
+    first = axes["I"]
+    for key, axis in axes.items():
+        # without an absolute tolerance, which would be 10 nm for an axis in metres
+        if axis.shape != first.shape or not u.allclose(axis, first, rtol=1e-5):
+            raise ObservationError(f"spectrum {key}: is on another spectral axis than I")
+    table = QTable({"wavelength": first})
     table["mask"] = np.zeros(len(table), dtype=bool)
     for key in (key for key in _NAMES if key in spectra):
         spectrum, name = spectra[key], _NAMES[key]
@@ -210,7 +224,18 @@ def read_spectra(path):
 
 def _checked(table):
     """Return the table in the order of the wavelengths, and its mask, or refuse it."""
-    table = _in_our_names(QTable(table, copy=True))
+    table = QTable(table, copy=True)
+    if "I" in table.colnames and "intensity" not in table.colnames:
+        # the table of a correction
+        names = {"I": "intensity", f"{_COVARIANCE}_statistical": _COVARIANCE}
+        for key, name in _NAMES.items():
+            names |= {f"{key}_statistical": f"{name}_err"}
+            names |= {f"{key}_{_SYSTEMATIC}": f"{name}_{_SYSTEMATIC}"}
+        for old in {*names} & {*table.colnames}:
+            if old != names[old]:
+                table.rename_column(old, names[old])
+        if "determined" in table.colnames and "mask" not in table.colnames:
+            table["mask"] = ~np.asarray(table["determined"], dtype=bool)
     names = [_NAMES[key] for key in _REQUIRED] + ["v"] * ("v" in table.colnames)
     needed = ["wavelength", *names, *(f"{name}_err" for name in names)]
     missing = [name for name in needed if name not in table.colnames]
@@ -218,9 +243,15 @@ def _checked(table):
         raise ObservationError(f"target: missing columns {', '.join(missing)}")
     if not len(table):
         raise ObservationError("target: no rows")
-    table["wavelength"] = _with_unit(table, "wavelength", u.um)
+    table["wavelength"] = wavelength = _with_unit(table, "wavelength", u.um)
+    if not np.all(np.isfinite(wavelength) & (wavelength > 0)):
+        raise ObservationError("target: a wavelength is not positive")
     table.sort("wavelength")
-    _check_wavelength(table["wavelength"])
+    wavelength = table["wavelength"]
+    # sorted already: equal ones are neighbours
+    twice = wavelength[1:][np.diff(wavelength) == 0]
+    if twice.size:
+        raise ObservationError(f"target: wavelength {twice[0]} is given twice")
     mask = np.zeros(len(table), dtype=bool)
     if "mask" in table.colnames:
         try:
@@ -231,27 +262,20 @@ def _checked(table):
     for name in names:
         unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
         units |= dict.fromkeys([name, f"{name}_err", f"{name}_{_SYSTEMATIC}"], unit)
-    for column, unit in units.items():
-        if column in table.colnames:
-            table[column] = _with_unit(table, column, unit)
-            _check_values(table, column, mask)
+    for column in [column for column in units if column in table.colnames]:
+        table[column] = _with_unit(table, column, units[column])
+        values, error = table[column].value, column.endswith(("_err", f"_{_SYSTEMATIC}"))
+        # what a calibration leaves open has an infinite systematic error
+        known = ~np.isnan(values) if column.endswith(_SYSTEMATIC) else np.isfinite(values)
+        bad = (~known | (values < 0 if error else False)) & ~mask
+        if bad.any():
+            row = np.flatnonzero(bad)[0]
+            raise ObservationError(
+                f"target: {column} = {values[row]} at {wavelength[row]}; "
+                f"{'a number not negative' if error else 'a finite number'} "
+                "is needed where the row is not masked"
+            )
     return table, mask
-
-
-def _in_our_names(table):
-    """Return the table of a correction with our names of its columns."""
-    if "I" not in table.colnames or "intensity" in table.colnames:
-        return table
-    names = {"I": "intensity", f"{_COVARIANCE}_statistical": _COVARIANCE}
-    for key, name in _NAMES.items():
-        names |= {f"{key}_statistical": f"{name}_err"}
-        names |= {f"{key}_{_SYSTEMATIC}": f"{name}_{_SYSTEMATIC}"}
-    for old, new in names.items():
-        if old in table.colnames and old != new:
-            table.rename_column(old, new)
-    if "determined" in table.colnames and "mask" not in table.colnames:
-        table["mask"] = ~np.asarray(table["determined"], dtype=bool)
-    return table
 
 
 def _with_unit(table, column, unit):
@@ -272,49 +296,6 @@ def _with_unit(table, column, unit):
             f"target: column {column} must be numbers with a unit such as {unit or '1'}"
         ) from None
     return values
-
-
-def _check_wavelength(wavelength):
-    if not np.all(np.isfinite(wavelength) & (wavelength > 0)):
-        raise ObservationError("target: a wavelength is not positive")
-    # sorted already: equal ones are neighbours
-    twice = wavelength[1:][np.diff(wavelength) == 0]
-    if twice.size:
-        raise ObservationError(f"target: wavelength {twice[0]} is given twice")
-
-
-def _check_values(table, column, mask):
-    values = table[column].value
-    error = column.endswith(("_err", f"_{_SYSTEMATIC}"))
-    # what a calibration leaves open has an infinite systematic error
-    known = ~np.isnan(values) if column.endswith(_SYSTEMATIC) else np.isfinite(values)
-    bad = (~known | (values < 0 if error else False)) & ~mask
-    if bad.any():
-        row = np.flatnonzero(bad)[0]
-        raise ObservationError(
-            f"target: {column} = {values[row]} at {table['wavelength'][row]}; "
-            f"{'a number not negative' if error else 'a finite number'} "
-            "is needed where the row is not masked"
-        )
-
-
-def _common_axis(spectra):
-    """Return the wavelengths of all spectra."""
-    axes = {}
-    for key, spectrum in spectra.items():
-        if np.ndim(spectrum.flux) != 1:
-            raise ObservationError(f"spectrum {key}: {np.ndim(spectrum.flux)} axes; 1 is needed")
-        axis = u.Quantity(spectrum.spectral_axis)
-        # frequencies and energies run the other way; the table is sorted later
-        if not axis.unit.is_equivalent(u.um):
-            axis = axis.to(u.um, u.spectral())
-        axes[key] = axis
-    first = axes["I"]
-    for key, axis in axes.items():
-        # without an absolute tolerance, which would be 10 nm for an axis in metres
-        if axis.shape != first.shape or not u.allclose(axis, first, rtol=1e-5):
-            raise ObservationError(f"spectrum {key}: is on another spectral axis than I")
-    return first
 
 
 def _take(table, column, spectrum, key, name, unit):

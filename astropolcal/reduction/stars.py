@@ -105,7 +105,7 @@ def measure_stars(
         if found is None:
             result.flag(True, "no aperture correction")
         else:
-            _correct(result, found.values, found.covariance, usable)
+            _correct(result, *found, usable)
     return result
 
 

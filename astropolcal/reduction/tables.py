@@ -171,16 +171,23 @@ def read_pypolcal(files, meta=None, *, name=None):
     >>> observations
     <Observations 'run': SCExAO/CHARIS, polarized, 2 frames x 1 bin, 0 cells masked>
     """
-    paths = _paths(files)
-    rows = [(path, i, row) for path in paths for i, row in enumerate(_rows(path), start=2)]
-    if not rows:
-        raise ObservationError(f"{paths[0]}: no rows")
+    rows = _rows(files)
+    paths = list(dict.fromkeys(path for path, _, _ in rows))
     wavelength = _numbers(rows, "wavelength_bin")
     # wavelengths that differ by less than 0.1 pm are one, spelled by two programs; what is too
     # large to be rounded is refused with the other lengths that cannot be
     with np.errstate(over="ignore"):
         _, bins = np.unique(wavelength.round(4), return_inverse=True)
-    frames = _frame_numbers(rows, bins)
+    # cubes are numbered in the order in which the first file lists them
+    cubes, seen = [row["filepath"].strip() for _, _, row in rows], {}
+    for (path, i, _), *cell in zip(rows, cubes, bins.tolist(), strict=True):
+        if tuple(cell) in seen:
+            raise ObservationError(
+                f"{path}, line {i}: {one_line(cell[0], 80)} is given already in {seen[*cell]}"
+            )
+        seen[*cell] = f"{path}, line {i}"
+    numbers = {cube: number for number, cube in enumerate(dict.fromkeys(cubes))}
+    frames = [numbers[cube] for cube in cubes]
     table = QTable({"file": [Path(row["filepath"]).name for _, _, row in rows]})
     table["frame"], table["bin"], table["wavelength"] = frames, bins, wavelength * u.nm
     for column, ours in _PYPOLCAL_ANGLES.items():
@@ -198,7 +205,8 @@ def read_pypolcal(files, meta=None, *, name=None):
     )
 
 
-def _paths(files):
+def _rows(files):
+    """Return path, line and content of all rows."""
     if isinstance(files, str | Path):
         folder = Path(files)
         files = sorted(folder.glob("*.csv")) if os.path.isdir(folder) else [folder]
@@ -206,21 +214,23 @@ def _paths(files):
             raise ObservationError(f"{folder}: no CSV file in this folder")
     if not len(files):
         raise ObservationError("no files to read")
-    return [Path(path) for path in files]
-
-
-def _rows(path):
-    with (
-        understood(path, ObservationError, "cannot be read as CSV"),
-        open(path, encoding="utf-8", newline="") as stream,
-    ):
-        reader = csv.DictReader(stream, skipinitialspace=True)
-        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ObservationError(
-                f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
-            )
-        return [row for row in reader if any(row.values())]
+    rows = []
+    for path in map(Path, files):
+        with (
+            understood(path, ObservationError, "cannot be read as CSV"),
+            open(path, encoding="utf-8", newline="") as stream,
+        ):
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ObservationError(
+                    f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+                )
+            known = [row for row in reader if any(row.values())]
+        rows += [(path, i, row) for i, row in enumerate(known, start=2)]
+    if not rows:
+        raise ObservationError(f"{files[0]}: no rows")
+    return rows
 
 
 def _numbers(rows, column):
@@ -233,16 +243,3 @@ def _numbers(rows, column):
                 f"{path}, line {i}: {column} = {one_line(row[column], 40)!r}, a number is needed"
             ) from None
     return values
-
-
-def _frame_numbers(rows, bins):
-    """Number the cubes in the order in which the first file lists them."""
-    cubes, seen = [row["filepath"].strip() for _, _, row in rows], {}
-    for (path, i, _), cube, b in zip(rows, cubes, bins.tolist(), strict=True):
-        if (cube, b) in seen:
-            raise ObservationError(
-                f"{path}, line {i}: {one_line(cube, 80)} is given already in {seen[cube, b]}"
-            )
-        seen[cube, b] = f"{path}, line {i}"
-    numbers = {cube: number for number, cube in enumerate(dict.fromkeys(cubes))}
-    return np.array([numbers[cube] for cube in cubes])

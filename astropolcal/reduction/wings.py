@@ -41,18 +41,9 @@ _SCALE = np.array([0.05, 0.05, 0.2, 0.05])
 _STEP = 1e-4
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Part of a star's light that its apertures have, at each wavelength."""
-
-    # measured flux of both beams over all of the light, (K,), and covariance, (K, K)
-    values: np.ndarray
-    covariance: np.ndarray
-
-
 def wing_shares(cube, good, photometry, level_variance, detector, layout, *, reach=45.0):
     """
-    Return which part of a star's light the apertures of both beams have.
+    Return which part of a star's light the apertures of both beams have, (K,), and its covariance.
 
     None if too little of the wings is seen. Rings up to 1.5 times ``reach`` are used.
     ``level_variance`` (2, W) is what the noise of the background adds to the variance of a flux.
@@ -107,10 +98,14 @@ class _Profile:
     def in_rings(self, p):
         """Return the light in the rings, of both beams, that one unit of each number gives."""
         radius, halo_radius = self._radii(p)
-        core, halo = 0.0, 0.0
-        for flux, r in self._seen():
-            core = core + flux[:, None] * _core(r, radius[:, None], p[1]).mean(axis=0)
-            halo = halo + flux[:, None] * _halo(r, halo_radius).mean(axis=0)
+        flux, core, halo = self.star.flux, 0.0, 0.0
+        seen = [(flux, self.rings.own)]
+        # without a stop there is light of the other image
+        seen += [] if self.rings.other is None else [(flux[::-1], self.rings.other)]
+        for light, r in seen:
+            light = light[:, :, None]
+            core = core + (light * _core(r, radius[:, None], p[1]).mean(axis=0)).sum(axis=0)
+            halo = halo + (light * _halo(r, halo_radius).mean(axis=0)).sum(axis=0)
         return self._columns(core, halo)
 
     def lacking(self, p):
@@ -125,7 +120,7 @@ class _Profile:
             # the light of the other image in the aperture, nearly constant over it
             core = core - total * self.area * _core(apart, radius, p[1])
             halo = halo - total * self.area * _halo(apart, halo_radius)
-        for beam, k, r, weights, _ in self.star.unlit:
+        for beam, k, r, weights, _ in star.unlit:
             core[k] += star.flux[beam, k] * weights @ _core(r, radius[k], p[1])
             halo[k] += star.flux[beam, k] * weights @ _halo(r, halo_radius)
         return self._columns(core, halo)
@@ -244,7 +239,7 @@ def _shares(profile, found, covariance):
     slopes = np.concatenate([_slopes(profile.lacking, found), aperture])
     noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
     relative = measured / total**2
-    return Shares(measured / total, noise * np.outer(relative, relative))
+    return measured / total, noise * np.outer(relative, relative)
 
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
@@ -275,8 +270,20 @@ class Star:
     def of(cls, cube, good, photometry, level_variance, layout):
         """Return the slices that have not failed."""
         usable = np.flatnonzero(~photometry.failed)
-        # one map for all slices; without a stop, by the mean place of each image
-        lit, stopped = _lit(photometry, layout, cube.shape[1:], usable)
+        shape, stopped = cube.shape[1:], len(layout.internal_apertures) == 5
+        # one map for all slices
+        if stopped:
+            lit = np.zeros((2, *shape), dtype=bool)
+            beams = rectangles(layout.internal_apertures, shape)
+            for own, (rows, columns, weights) in zip(lit, beams, strict=True):
+                # pixels wholly inside; those on the edge are dark in part
+                own[rows, columns] = weights > 0.999
+        else:
+            rows, columns = np.ogrid[: shape[0], : shape[1]]
+            middle = [a[:, usable].mean(axis=1) for a in (photometry.x, photometry.y)]
+            # without a stop a pixel belongs to the image whose mean place is nearer
+            right, left = (np.hypot(columns - x, rows - y) for x, y in zip(*middle, strict=True))
+            lit = np.stack([right < left, left < right])
         return cls(cube, good, photometry, level_variance[:, usable], usable, lit, stopped)
 
     @cached_property
@@ -314,51 +321,37 @@ class Star:
 
         A list of beam, slice, distances, weights, and the light that was measured.
         """
-        return list(_unlit(self))
+        from photutils.aperture import CircularAperture
+
+        found = []
+        for beam, lit in enumerate(self.lit):
+            for k, (place, radius) in enumerate(zip(self.places[beam].T, self.radius, strict=True)):
+                aperture = CircularAperture(place, radius)
+                # quick look first: few apertures reach out of the field
+                mask = aperture.to_mask(method="center")
+                if lit[mask.get_overlap_slices(lit.shape)[0]].all():
+                    continue
+                mask = aperture.to_mask(method="exact")
+                inside, part = mask.get_overlap_slices(lit.shape)
+                dark = ~lit[inside] & (mask.data[part] > 0)
+                if not dark.any():
+                    continue
+                rows, columns = np.nonzero(dark)
+                r = np.hypot(
+                    columns + inside[1].start - place[0], rows + inside[0].start - place[1]
+                )
+                # (pixels in the dark part,) of the slice
+                values, known = (a[self.usable[k]][inside][dark] for a in (self.cube, self.good))
+                weights = mask.data[part][dark]
+                light = float(weights @ np.where(known, values, 0.0))
+                found.append((beam, k, r, weights, light))
+        return found
 
     @property
     def unlit_part(self):
         """Largest part of an aperture that is not lit."""
         parts = [w.sum() / (np.pi * self.radius[k] ** 2) for _, k, _, w, _ in self.unlit]
         return max(parts, default=0.0)
-
-
-def _lit(photometry, layout, shape, usable):
-    if len(layout.internal_apertures) == 5:
-        maps = np.zeros((2, *shape), dtype=bool)
-        beams = rectangles(layout.internal_apertures, shape)
-        for lit, (rows, columns, weights) in zip(maps, beams, strict=True):
-            # pixels wholly inside; those on the edge are dark in part
-            lit[rows, columns] = weights > 0.999
-        return maps, True
-    rows, columns = np.ogrid[: shape[0], : shape[1]]
-    middle = [(photometry.x[b, usable].mean(), photometry.y[b, usable].mean()) for b in range(2)]
-    # without a stop a pixel belongs to the nearer image
-    right, left = (np.hypot(columns - x, rows - y) for x, y in middle)
-    return np.stack([right < left, left < right]), False
-
-
-def _unlit(star):
-    from photutils.aperture import CircularAperture
-
-    for beam, lit in enumerate(star.lit):
-        for k, (place, radius) in enumerate(zip(star.places[beam].T, star.radius, strict=True)):
-            aperture = CircularAperture(place, radius)
-            # quick look first: few apertures reach out of the field
-            mask = aperture.to_mask(method="center")
-            if lit[mask.get_overlap_slices(lit.shape)[0]].all():
-                continue
-            mask = aperture.to_mask(method="exact")
-            inside, part = mask.get_overlap_slices(lit.shape)
-            dark = ~lit[inside] & (mask.data[part] > 0)
-            if not dark.any():
-                continue
-            rows, columns = np.nonzero(dark)
-            r = np.hypot(columns + inside[1].start - place[0], rows + inside[0].start - place[1])
-            # (pixels in the dark part,) of the slice
-            values, known = (a[star.usable[k]][inside][dark] for a in (star.cube, star.good))
-            weights = mask.data[part][dark]
-            yield beam, k, r, weights, float(weights @ np.where(known, values, 0.0))
 
 
 @dataclass(frozen=True)
@@ -389,8 +382,12 @@ class Rings:
             return None
         # (quantity, beam, slice, ring)
         counts, values, *moments = found[..., full]
-        other = None if star.stopped else _interval(*moments[2:])
-        return cls(values, counts, _interval(*moments[:2]), other)
+        points = []
+        for mean, square in zip(moments[::2], moments[1::2], strict=True):
+            # rounding may leave a variance below zero
+            spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+            points.append(np.stack([mean - spread, mean + spread]))
+        return cls(values, counts, points[0], None if star.stopped else points[1])
 
 
 def _means(star, beam, edges):
@@ -411,9 +408,3 @@ def _means(star, beam, edges):
         sums = [np.bincount(ring, m, len(edges) - 1) for m in moments]
         found.append([number, *(total / np.maximum(number, 1) for total in sums)])
     return found
-
-
-def _interval(mean, square):
-    # rounding may leave a variance below zero
-    spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-    return np.stack([mean - spread, mean + spread])

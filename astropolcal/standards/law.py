@@ -162,7 +162,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     def evaluate(self, x, p_max, lambda_max, K, theta, rotation):
         """Return the degree of polarization; astropy calls it."""
-        log = _log_ratio(_in_range(x, self.valid_range), lambda_max)
+        log = np.log(u.Quantity(lambda_max, u.um).value / _in_range(x, self.valid_range))
         degree = p_max * np.exp(-u.Quantity(K).value * log**2)
         # a model with units must not mix plain numbers with quantities
         return degree << u.dimensionless_unscaled if hasattr(x, "unit") else degree
@@ -178,7 +178,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     @staticmethod
     def _columns(x, p_max, lambda_max, K, theta, rotation):
-        log = _log_ratio(np.asarray(x, dtype=float), lambda_max)
+        log = np.log(lambda_max / np.asarray(x, dtype=float))
         shape = np.exp(-K * log**2)
         degree = p_max * shape
         none = np.zeros_like(shape)
@@ -282,7 +282,20 @@ class SerkowskiLaw(Fittable1DModel):
     def _canonical_covariance(self, covariance):
         """Return the covariance of all five parameters in canonical units."""
         if hasattr(covariance, "keys"):
-            return np.diag([v**2 for v in self._canonical_errors(covariance)])
+            unknown = sorted(set(covariance) - set(self.param_names))
+            if unknown:
+                raise ParameterError(
+                    f"the law has no parameter {unknown[0]!r}; it has {', '.join(self.param_names)}"
+                )
+            errors = [
+                to_unit(covariance.get(n, 0 * _CANONICAL[n]), _CANONICAL[n], f"error of {n}")
+                for n in self.param_names
+            ]
+            if not np.all(np.isfinite(errors)) or np.min(errors) < 0:
+                raise ParameterError(
+                    f"errors = {dict(covariance)!r} must be finite and not negative"
+                )
+            return np.diag(np.square(errors))
         matrix = np.asarray(covariance, dtype=float)
         free = [n for n in self.param_names if not (self.fixed[n] or self.tied[n])]
         square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
@@ -294,43 +307,16 @@ class SerkowskiLaw(Fittable1DModel):
                 f"the covariance has {len(matrix)} rows; it must have {len(self.param_names)} "
                 f"({', '.join(self.param_names)}) or {len(free)} (free: {', '.join(free)})"
             )
-        scale = [self._scale(name) for name in names]
+        scale = [(getattr(self, n).unit or u.one).to(_CANONICAL[n]) for n in names]
         place = [self.param_names.index(name) for name in names]
         full = np.zeros((len(self.param_names),) * 2)
         full[np.ix_(place, place)] = matrix * np.outer(scale, scale)
-        return self._spread_tie(full) if "K" not in names else full
-
-    def _spread_tie(self, full):
-        """Give a K that is tied to lambda_max its part of the covariance."""
-        if self.tied["K"] is not whittet_width:
-            return full
-        spread = np.eye(len(full))
-        spread[self.param_names.index("K"), self.param_names.index("lambda_max")] = _SLOPE
-        return spread @ full @ spread.T
-
-    def _scale(self, name):
-        unit = getattr(self, name).unit
-        return (unit or u.dimensionless_unscaled).to(_CANONICAL[name])
-
-    def _canonical_errors(self, errors):
-        unknown = sorted(set(errors) - set(self.param_names))
-        if unknown:
-            raise ParameterError(
-                f"the law has no parameter {unknown[0]!r}; it has {', '.join(self.param_names)}"
-            )
-        values = [
-            to_unit(errors.get(n, 0 * _CANONICAL[n]), _CANONICAL[n], f"error of {n}")
-            for n in self.param_names
-        ]
-        if not np.all(np.isfinite(values)) or np.min(values) < 0:
-            raise ParameterError(f"errors = {dict(errors)!r} must be finite and not negative")
-        return values
-
-
-def _log_ratio(x, lambda_max):
-    """Return ln(lambda_max / x), both in micrometre, with or without units."""
-    value = [v.to_value(u.um) if hasattr(v, "unit") and v.unit else v for v in (lambda_max, x)]
-    return np.log(np.asarray(value[0], dtype=float) / np.asarray(value[1], dtype=float))
+        if "K" not in names and self.tied["K"] is whittet_width:
+            # a K that is tied to lambda_max has its part of the covariance
+            spread = np.eye(len(full))
+            spread[self.param_names.index("K"), self.param_names.index("lambda_max")] = _SLOPE
+            full = spread @ full @ spread.T
+        return full
 
 
 def _in_range(x, valid):

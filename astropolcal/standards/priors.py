@@ -19,7 +19,7 @@ from astropy.table import QTable
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
 from astropolcal.units import length_to_um
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["StandardStar", "catalogue", "get", "names"]
 
@@ -73,92 +73,12 @@ class Interstellar(NamedTuple):
     assumed: tuple
 
 
-# --- unpolarized -------------------------------------------------------------------------
-
-
-def unpolarized_error(star):
-    """Return how far the q and u of an unpolarized star may be from zero."""
-    if star.kind != "unpolarized":
-        raise ParameterError(f"{star.name} is {star.kind}; ask for interstellar() instead")
-    table = star.polarization
-    degree = table["p"].to_value(u.dimensionless_unscaled)
-    error = table["p_err"].to_value(u.dimensionless_unscaled)
-    stated = np.isfinite(error)
-    if np.any(stated):
-        table, degree, error = table[stated], degree[stated], error[stated]
-    else:
-        error = np.full_like(degree, _UNSTATED)
-    # E[p^2] = P^2 + 2 sigma^2, and P has any direction: q and u have the variance
-    # P^2 / 2 each; that of its estimate p^2 / 2 - sigma^2 is sigma^4 for a small P
-    square = np.average(degree**2 / 2 - error**2, weights=error**-4)
-    value = np.sqrt(np.min(error) ** 2 + max(square, 0.0))
-    rows = zip(table["reference"], degree, error, table["wavelength"].to_value(u.um), strict=True)
-    spread = " +- {2:.3g}" if np.any(stated) else ""
-    form = f"{{0}}: {{1:.3g}}{spread} % at {{3:.3g}} um"
-    words = "; ".join(form.format(name, 100 * p, 100 * e, at) for name, p, e, at in rows)
-    if not np.any(stated):
-        words += f"; no error is stated, {100 * _UNSTATED:g} % is assumed"
-    if "emission-line" in star.note:
-        words += "; it is an emission-line star, which may vary"
-    return UnpolarizedError(round(max(float(value), _LEAST), 7), words)
-
-
 # --- polarized ---------------------------------------------------------------------------
-
-
-def interstellar(star):
-    """Return the Serkowski law of a polarized star, with an error of every parameter."""
-    from scipy.linalg import block_diag
-
-    if star.kind != "polarized":
-        raise ParameterError(f"{star.name} is {star.kind}; ask for unpolarized_error() instead")
-    if star.law is None and not np.any(np.isfinite(star.polarization["theta"])):
-        raise ParameterError(f"{star.name} has neither a law nor a measurement with an angle")
-    complete = set(_PARAMETERS) <= set(star.law_errors)
-    shape, within, words = (_published if complete else _fitted)(star)
-    angle, turned, angle_words = _turned(star, shape[1], complete)
-    words = [*words, *angle_words, f"theta: +- {_ZERO_POINT:g} deg for its zero"]
-    covariance = block_diag(within, turned)
-    words += _vary(star, covariance)
-    law = SerkowskiLaw(
-        shape[0], shape[1] * u.um, shape[2], angle[0] * u.deg, angle[1] * u.deg / u.um
-    )
-    errors = dict(zip(_PARAMETERS, map(float, np.sqrt(np.diag(covariance))), strict=True))
-    errors = {name: _quantity(error, name) for name, error in errors.items()}
-    return Interstellar(law, errors, covariance, _source(star), tuple(words))
 
 
 def _plain(error, name):
     """Return an error as a number in the units of this module."""
     return float(u.Quantity(error).to_value(_UNITS.get(name, u.dimensionless_unscaled)))
-
-
-def _quantity(value, name):
-    """Return a number of this module as users see it."""
-    if name == "p_max":
-        return 100 * value * u.percent
-    return value * _UNITS[name] if name in _UNITS else value
-
-
-def _source(star):
-    """Return the publications that the law of a star is from."""
-    parts = [star.law_reference] if star.law_reference else []
-    if not set(_PARAMETERS) <= set(star.law_errors):
-        table = star.polarization
-        for reference in dict.fromkeys(map(str, table["reference"])):
-            bands = dict.fromkeys(map(str, table["band"][table["reference"] == reference]))
-            parts.append(f"{reference} ({', '.join(bands)})")
-    return "; ".join(parts)
-
-
-def _vary(star, covariance):
-    """Add how much a star varies to the covariance; return the sentence."""
-    if not star.variability:
-        return []
-    degree, angle = (_plain(star.variability[key], key) for key in ("p", "theta"))
-    covariance[0, 0] += degree**2
-    covariance[3, 3] += angle**2
-    return [f"it varies, by about {100 * degree:.2g} % and {angle:.2g} deg; the errors include it"]
 
 
 # --- the degree --------------------------------------------------------------------------
@@ -311,31 +231,26 @@ def turning(x, theta, error, lambda_max):
     # is averaged on the circle
     mean = np.angle(np.sum(double / error**2))
     mean, offset = np.rad2deg(mean) / 2, np.rad2deg(np.angle(double * np.exp(-1j * mean))) / 2
-    line, words = _line(x - lambda_max, offset, error), []
-    if line is None:
+    words = []
+    if np.unique(x).size > 2:
+        design = np.stack([np.ones_like(x), x - lambda_max], axis=-1) / error[:, None]
+        inverse = np.linalg.inv(design.T @ design)
+        theta, turn = inverse @ design.T @ (offset / error)
+        residuals = offset / error - design @ [theta, turn]
+        # bands and sources may disagree by more than their errors
+        inverse *= max(np.sum(residuals**2) / (x.size - 2), 1.0)
+    # else the slope is not measured
+    if np.unique(x).size < 3 or inverse[1, 1] >= _ROTATION_SCATTER**2:
         weight = error**-2.0
         scatter = np.sum(weight * offset**2) / np.sum(weight) / max(x.size - 1, 1)
         # from where it was measured to lambda_max it may have turned, too
         away = np.array([lambda_max - np.average(x, weights=weight), 1.0])
         inverse = np.outer(away, away) * _ROTATION_SCATTER**2
         inverse[0, 0] += max(scatter, 1 / np.sum(weight))
-        line = np.zeros(2), inverse
+        theta, turn = 0.0, 0.0
         words = [f"rotation: 0 +- {_ROTATION_SCATTER:g} deg/um, the scatter of other stars"]
-    (theta, turn), inverse = line
     inverse[0, 0] += _ZERO_POINT**2
     return (float(np.mod(mean + theta, 180)), float(turn)), inverse, words
-
-
-def _line(x, offset, error):
-    """Return a straight line's values and covariance, None if its slope is not measured."""
-    if np.unique(x).size < 3:
-        return None
-    design = np.stack([np.ones_like(x), x], axis=-1) / error[:, None]
-    inverse = np.linalg.inv(design.T @ design)
-    values = inverse @ design.T @ (offset / error)
-    # bands and sources may disagree by more than their errors
-    inverse *= max(np.sum((offset / error - design @ values) ** 2) / (x.size - 2), 1.0)
-    return (values, inverse) if inverse[1, 1] < _ROTATION_SCATTER**2 else None
 
 
 # ---- what a calibration assumes -------------------------------------------------------------
@@ -539,7 +454,37 @@ class StandardStar:
 
     @cached_property
     def _interstellar(self):
-        return interstellar(self)
+        from scipy.linalg import block_diag
+
+        if self.kind != "polarized":
+            raise ParameterError(f"{self.name} is {self.kind}; ask for unpolarized_error() instead")
+        if self.law is None and not np.any(np.isfinite(self.polarization["theta"])):
+            raise ParameterError(f"{self.name} has neither a law nor a measurement with an angle")
+        complete = set(_PARAMETERS) <= set(self.law_errors)
+        shape, within, words = (_published if complete else _fitted)(self)
+        angle, turned, angle_words = _turned(self, shape[1], complete)
+        words = [*words, *angle_words, f"theta: +- {_ZERO_POINT:g} deg for its zero"]
+        covariance = block_diag(within, turned)
+        if self.variability:
+            degree, turn = (_plain(self.variability[key], key) for key in ("p", "theta"))
+            covariance[0, 0] += degree**2
+            covariance[3, 3] += turn**2
+            varies = f"it varies, by about {100 * degree:.2g} % and {turn:.2g} deg"
+            words.append(f"{varies}; the errors include it")
+        law = SerkowskiLaw(
+            shape[0], shape[1] * u.um, shape[2], angle[0] * u.deg, angle[1] * u.deg / u.um
+        )
+        errors = dict(zip(_PARAMETERS, map(float, np.sqrt(np.diag(covariance))), strict=True))
+        errors |= {name: errors[name] * unit for name, unit in _UNITS.items()}
+        errors["p_max"] = 100 * errors["p_max"] * u.percent
+        # the publications that the law is from
+        parts = [self.law_reference] if self.law_reference else []
+        if not complete:
+            table = self.polarization
+            for reference in dict.fromkeys(map(str, table["reference"])):
+                bands = dict.fromkeys(map(str, table["band"][table["reference"] == reference]))
+                parts.append(f"{reference} ({', '.join(bands)})")
+        return Interstellar(law, errors, covariance, "; ".join(parts), tuple(words))
 
     def unpolarized_error(self):
         r"""
@@ -551,7 +496,31 @@ class StandardStar:
         give P. It is at least 0.01 %, and 0.1 % where no source states an error. Interstellar
         polarization is smaller in the near infrared; that of a circumstellar disk need not be.
         """
-        return unpolarized_error(self)
+        if self.kind != "unpolarized":
+            raise ParameterError(f"{self.name} is {self.kind}; ask for interstellar() instead")
+        table = self.polarization
+        degree = table["p"].to_value(u.dimensionless_unscaled)
+        error = table["p_err"].to_value(u.dimensionless_unscaled)
+        stated = np.isfinite(error)
+        if np.any(stated):
+            table, degree, error = table[stated], degree[stated], error[stated]
+        else:
+            error = np.full_like(degree, _UNSTATED)
+        # E[p^2] = P^2 + 2 sigma^2, and P has any direction: q and u have the variance
+        # P^2 / 2 each; that of its estimate p^2 / 2 - sigma^2 is sigma^4 for a small P
+        square = np.average(degree**2 / 2 - error**2, weights=error**-4)
+        value = np.sqrt(np.min(error) ** 2 + max(square, 0.0))
+        rows = zip(
+            table["reference"], degree, error, table["wavelength"].to_value(u.um), strict=True
+        )
+        spread = " +- {2:.3g}" if np.any(stated) else ""
+        form = f"{{0}}: {{1:.3g}}{spread} % at {{3:.3g}} um"
+        words = "; ".join(form.format(name, 100 * p, 100 * e, at) for name, p, e, at in rows)
+        if not np.any(stated):
+            words += f"; no error is stated, {100 * _UNSTATED:g} % is assumed"
+        if "emission-line" in self.note:
+            words += "; it is an emission-line star, which may vary"
+        return UnpolarizedError(round(max(float(value), _LEAST), 7), words)
 
 
 def names(kind=None):
@@ -584,8 +553,8 @@ def names(kind=None):
 
 def check_kind(kind):
     """Raise if there is no such kind of standard star."""
-    if kind not in (None, *KINDS):
-        raise ParameterError(f"kind = {kind!r} must be {KINDS[0]!r} or {KINDS[1]!r}")
+    if kind is not None:
+        check_choice("kind", kind, KINDS, ParameterError)
 
 
 def get(name):

@@ -399,7 +399,11 @@ def observability(
     """
     place = location(site)
     limit, dark, step = checked(min_altitude, twilight, step)
-    name, coord = _target(star)
+    if isinstance(star, SkyCoord):
+        name, coord = star.to_string("hmsdms", precision=0), star
+    else:
+        star = star if isinstance(star, StandardStar) else get(star)
+        name, coord = star.name, star.coord
     times = night_times(place, night, twilight=dark, step=step)
     table = night_table(times, *pointing(coord, times, place), limit)
     if not np.any(table["observable"]):
@@ -408,13 +412,6 @@ def observability(
             f"{night!s}; it gets to {table['altitude'].max().to_value(u.deg):.1f} deg"
         )
     return Observability(name, place, date_of(night), limit, table)
-
-
-def _target(star):
-    if isinstance(star, SkyCoord):
-        return star.to_string("hmsdms", precision=0), star
-    star = star if isinstance(star, StandardStar) else get(star)
-    return star.name, star.coord
 
 
 def _range(values):
@@ -514,12 +511,41 @@ def search(
         raise ParameterError("center and radius go together")
     if band is not None:
         check_choice("band", band, _BANDS, ParameterError)
-    stars = [s for s in map(get, names(kind)) if _in_band(s, band) and _bright(s, band, magnitude)]
+    stars = [star for star in map(get, names(kind)) if _in_band(star, band)]
+    if magnitude is not None:
+        try:
+            low, high = (float(limit) for limit in magnitude)
+        except (TypeError, ValueError):
+            raise ParameterError(f"magnitude = {magnitude!r} must be two numbers") from None
+        if not low <= high:
+            raise ParameterError(
+                f"magnitude = {magnitude!r} must be the brightest and the faintest"
+            )
+        stars = [star for star in stars if low <= star.brightness(band)[0] <= high]
+    bright = [s.brightness(band) for s in stars]
+    degree = u.Quantity([_degree(s, band) for s in stars] or np.zeros((0, 2)), u.percent)
+    ra, dec = ([getattr(s.coord, key).deg for s in stars] * u.deg for key in ("ra", "dec"))
+    table = QTable(
+        {
+            "name": np.array([s.name for s in stars], dtype=str),
+            "kind": np.array([s.kind for s in stars], dtype=str),
+            "ra": ra,
+            "dec": dec,
+            "magnitude": np.array([m for m, _ in bright], dtype=float) * u.mag,
+            "magnitude_band": np.array([b for _, b in bright], dtype=str),
+            "p": degree[:, 0],
+            "p_err": degree[:, 1],
+        }
+    )
     if center is not None:
-        stars = _around(stars, center, radius)
-    table = _describe(stars, band)
-    if center is not None:
-        table["separation"] = _places(stars).separation(center).to(u.deg)
+        if not isinstance(center, SkyCoord) or not center.isscalar:
+            raise ParameterError(f"center = {center!r} must be a SkyCoord of one position")
+        radius = float(angle_to_rad(radius, "radius"))
+        if not 0 < radius <= np.pi:
+            raise ParameterError(f"radius = {np.rad2deg(radius):g} deg must be from 0 to 180 deg")
+        apart = SkyCoord(table["ra"], table["dec"]).separation(center)
+        table["separation"] = apart.to(u.deg)
+        table = table[apart.rad <= radius]
         table.sort("separation")
     return table if night is None else _observable(table, site, night, min_altitude)
 
@@ -527,54 +553,6 @@ def search(
 def _in_band(star, band):
     known = band is None or star.kind == "unpolarized" or star.law is not None
     return known or band in star.polarization["band"]
-
-
-def _bright(star, band, limits):
-    if limits is None:
-        return True
-    try:
-        low, high = (float(limit) for limit in limits)
-    except (TypeError, ValueError):
-        raise ParameterError(f"magnitude = {limits!r} must be two numbers") from None
-    if not low <= high:
-        raise ParameterError(f"magnitude = {limits!r} must be the brightest and the faintest")
-    return low <= star.brightness(band)[0] <= high
-
-
-def _around(stars, center, radius):
-    if not isinstance(center, SkyCoord) or not center.isscalar:
-        raise ParameterError(f"center = {center!r} must be a SkyCoord of one position")
-    radius = float(angle_to_rad(radius, "radius"))
-    if not 0 < radius <= np.pi:
-        raise ParameterError(f"radius = {np.rad2deg(radius):g} deg must be from 0 to 180 deg")
-    # separation of no coordinates is an error in astropy
-    near = _places(stars).separation(center).rad <= radius if stars else []
-    return [star for star, inside in zip(stars, near, strict=True) if inside]
-
-
-def _places(stars):
-    return SkyCoord(
-        [s.coord.ra.deg for s in stars] * u.deg, [s.coord.dec.deg for s in stars] * u.deg
-    )
-
-
-def _describe(stars, band):
-    """Return the table that does not depend on the night."""
-    bright = [s.brightness(band) for s in stars]
-    degree = u.Quantity([_degree(s, band) for s in stars] or np.zeros((0, 2)), u.percent)
-    place = _places(stars)
-    return QTable(
-        {
-            "name": np.array([s.name for s in stars], dtype=str),
-            "kind": np.array([s.kind for s in stars], dtype=str),
-            "ra": place.ra.to(u.deg),
-            "dec": place.dec.to(u.deg),
-            "magnitude": np.array([m for m, _ in bright], dtype=float) * u.mag,
-            "magnitude_band": np.array([b for _, b in bright], dtype=str),
-            "p": degree[:, 0],
-            "p_err": degree[:, 1],
-        }
-    )
 
 
 def _degree(star, band):

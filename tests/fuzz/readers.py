@@ -691,14 +691,22 @@ class Header(Reader):
     def read(self, path):
         from astropolcal.fitscheck import primary_header
         from astropolcal.pipeline.headers import FrameAngles, describe
-        from astropolcal.reduction.headers import observation_time, pointing, read_header
+        from astropolcal.reduction.headers import (
+            FrameHeader,
+            add_pointing,
+            observation_time,
+            read_header,
+        )
 
         header, charis = primary_header(path), instruments.get("charis")
         # the header of a raw frame, on which that of its cube falls back, is read alike
         raw = read_header("CRSA00000001_cube.fits", small_layout(), header={}, raw={1: path})
         frame = read_header(path, small_layout(), header=header)
         assert set(raw.values) <= set(frame.values)
-        for ask in (observation_time, lambda v: pointing(v, small_layout().site)):
+        for ask in (
+            observation_time,
+            lambda v: add_pointing([FrameHeader("x", values=dict(v))], small_layout()),
+        ):
             try:
                 ask(frame.values)
             except AstropolcalError:

@@ -57,7 +57,7 @@ def test_no_such_file(tmp_path):
 
 
 def test_a_folder(tmp_path):
-    with pytest.raises(ObservationError, match="is a folder, an ECSV file is needed"):
+    with pytest.raises(ObservationError, match="is a folder, not a file"):
         Observations.read(tmp_path)
 
 

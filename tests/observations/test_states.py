@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations, example_table
-from astropolcal.observations.observables import pair_states, quadruples
+from astropolcal.observations.observables import pair_states
 
 AB = [0, 1]
 
@@ -91,26 +91,9 @@ def test_pairs_do_not_depend_on_the_order_of_the_rows(order):
 # ---- both states at both plate angles ------------------------------------------------
 
 
-def test_quadruple_has_states_at_plus_then_minus():
-    pairs = np.array([[1, 0], [2, 3], [5, 4], [6, 7]])
-    hwp = np.repeat([0, 22.5, 45, 67.5], 2) * u.deg
-    found = quadruples(pairs, hwp, [90] * 8 * u.deg)
-    assert found.tolist() == [[1, 0, 5, 4], [2, 3, 6, 7]]
-
-
-def test_quadruple_by_time():
-    pairs = np.array([[0, 1], [2, 3], [4, 5]])
-    hwp = np.repeat([0, 45, 45], 2) * u.deg
-    with pytest.warns(AstropolcalWarning, match="frame 2 "):
-        found = quadruples(pairs, hwp, [90] * 6 * u.deg, time=[0, 0, 9, 9, 1, 1])
-    assert found.tolist() == [[0, 1, 4, 5]]
-
-
 def test_plate_without_partner_is_named_by_its_row():
-    pairs = np.array([[0, 1], [2, 3]])
-    hwp = np.repeat([0, 22.5], 2) * u.deg
-    with pytest.raises(ObservationError, match="night, row 11: hwp = 0 deg has no partner"):
-        quadruples(pairs, hwp, [90] * 4 * u.deg, rows=[11, 12, 13, 14], name="night")
+    with pytest.raises(ObservationError, match="row 1: hwp = 0 deg has no partner"):
+        modulated((0, 0, 22.5, 22.5), "ABAB").groups(4)
 
 
 # ---- groups of a table ---------------------------------------------------------------

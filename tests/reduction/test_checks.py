@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.reduction.images import choice, number, per_wavelength, pixels
+from astropolcal.reduction.images import number, per_wavelength, pixels
 
 # CHARIS: 16.15 milliarcsecond a pixel
 LAYOUT = SimpleNamespace(pixel_scale=16.15)
-
-
-def test_choice_names_what_is_allowed():
-    choice("psf", "moffat", ("moffat", "gaussian"))
-    with pytest.raises(ParameterError, match="psf = 'airy'; allowed are moffat, gaussian"):
-        choice("psf", "airy", ("moffat", "gaussian"))
 
 
 def test_number_out_of_bounds_is_refused():

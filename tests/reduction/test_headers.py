@@ -17,9 +17,10 @@ from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import CHARIS
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction.headers import (
+    FrameHeader,
+    add_pointing,
     check_sequence,
     frame_number,
-    pointing,
     raw_frames,
     read_header,
     tracking_error,
@@ -134,6 +135,15 @@ def test_raw_frame_of_the_same_number_gives_what_the_cube_lacks(tmp_path):
 def test_raw_folder_without_frames(tmp_path):
     with pytest.raises(ObservationError, match="no FITS file with a frame number"):
         raw_frames(tmp_path, LAYOUT)
+
+
+def pointing(values, site):
+    """Return altitude and parallactic angle of a frame whose header has neither."""
+    frame = FrameHeader("cube.fits", values=dict(values))
+    add_pointing([frame], replace(LAYOUT, site=site))
+    if frame.errors:
+        raise ObservationError(frame.errors[0])
+    return frame.values["altitude"], frame.values["parallactic"]
 
 
 def test_pointing_agrees_with_astropy():

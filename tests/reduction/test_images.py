@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.reduction.cubes import ImageModel, simulate_cubes
-from astropolcal.reduction.images import Detector, Scene, gaussian, moffat, rectangle
+from astropolcal.reduction.images import Scene, expose, gaussian, moffat, rectangle
 from astropolcal.simulation import half_wave_plate_cycles
 
 # two upright rectangles of 20 x 16 pixels, side by side
@@ -97,18 +97,18 @@ def test_aperture_that_leaves_the_image_is_named():
                 (20.0, 7.4),
                 (60.0, 19.5),
                 0.0,
-                r"the left beam at \(20, 7.4\) leaves the image of 80 x",
+                r"the rectangle at \(20, 7.4\) leaves the image of 80 x",
             ),
             (
                 (20.0, 19.5),
                 (70.0, 19.5),
                 0.0,
-                r"the right beam at \(70, 19.5\) leaves .* 80 x 40 pix",
+                r"the rectangle at \(70, 19.5\) leaves .* 80 x 40 pix",
             ),
-            ((20.0, 32.0), (60.0, 19.5), 0.0, "the left beam"),
-            ((9.4, 19.5), (60.0, 19.5), 0.0, "the left beam"),
+            ((20.0, 32.0), (60.0, 19.5), 0.0, "the rectangle at"),
+            ((9.4, 19.5), (60.0, 19.5), 0.0, "the rectangle at"),
             # upright it fits; turned by a quarter it needs the height of its width
-            ((20.0, 8.0), (60.0, 19.5), np.pi / 2, "the left beam"),
+            ((20.0, 8.0), (60.0, 19.5), np.pi / 2, "the rectangle at"),
         ]:
             layout = replace(LAYOUT, internal_apertures=(left, right, 20.0, 16.0, angle))
             with pytest.raises(InstrumentError, match=words):
@@ -159,15 +159,15 @@ def test_star_beside_the_image_leaves_no_files(tmp_path):
 
 
 def detector(**options):
-    how = {"gain": 2.0, "read_noise": 6.0, "background": 5.0, "saturation": np.inf}
-    return Detector(**how | {"noise": True} | options)
+    return ReadOut(**{"gain": 2.0, "read_noise": 6.0} | options)
 
 
 def test_noise_has_the_variance_that_the_weights_state():
     for excess in [1.0, np.sqrt(2)]:
-        light = np.full((4, 200, 200), 40.0)
-        image, weight = detector(excess_noise=excess).expose(light, 1.0, np.random.default_rng(3))
-        # F^2 (light + background) / gain + (read noise / gain)^2
+        light = np.full((4, 200, 200), 45.0)
+        how = detector(excess_noise=excess)
+        image, weight = expose(light, how, 1.0, np.random.default_rng(3))
+        # F^2 light / gain + (read noise / gain)^2
         expected = excess**2 * 45.0 / 2.0 + 9.0
         assert 1 / weight.mean() == pytest.approx(expected, rel=1e-5), excess
         assert image.var() == pytest.approx(expected, rel=0.02), excess
@@ -175,8 +175,8 @@ def test_noise_has_the_variance_that_the_weights_state():
 
 
 def test_without_noise_the_image_is_the_light_and_saturation_cuts_it():
-    light = np.array([[[0.0, 10.0, 100.0]]])
-    image, weight = detector(noise=False, saturation=50.0).expose(light, 1.0, None)
+    light = np.array([[[5.0, 15.0, 105.0]]])
+    image, weight = expose(light, detector(saturation=50.0), 1.0, None)
     assert image.tolist() == [[[5.0, 15.0, 50.0]]]
     assert (weight > 0).all()
     assert image.dtype == weight.dtype == np.float32
@@ -184,8 +184,7 @@ def test_without_noise_the_image_is_the_light_and_saturation_cuts_it():
 
 def test_pixels_differ_by_their_response():
     response = np.array([[[0.5, 1.0, 0.0]]])
-    how = detector(noise=False, read_noise=0.0, background=0.0)
-    image, weight = how.expose(np.full((1, 1, 3), 10.0), response, None)
+    image, weight = expose(np.full((1, 1, 3), 10.0), detector(read_noise=0.0), response, None)
     assert image.tolist() == [[[5.0, 10.0, 0.0]]]
     # no light and no read noise: nothing is known of the variance
     assert weight[0, 0, 2] == 0.0

@@ -11,8 +11,10 @@ from reduction_lab import Small, expose, pair, star_image
 from scipy.integrate import quad
 
 from astropolcal.instruments import CHARIS
+from astropolcal.instruments.layout import ReadOut
+from astropolcal.reduction import images
 from astropolcal.reduction import wings as module
-from astropolcal.reduction.images import Detector, Scene
+from astropolcal.reduction.images import Scene
 from astropolcal.reduction.photometry import Photometry, detector_of
 from astropolcal.reduction.stars import measure_stars
 from astropolcal.reduction.wings import wing_shares
@@ -44,12 +46,11 @@ def scene(psf, fwhm, beta, halo, *, layout=LAYOUT):
 def exposure(stage, seed, *, noise=True, flux=5e5, background=5.0):
     """A cube of the star at another place and seeing in each, and its true fluxes."""
     rng, n = np.random.default_rng(seed), stage.shape[0]
-    detector = Detector(LAYOUT.gain, LAYOUT.read_noise, np.full((n, 1, 1), background),
-                        saturation=np.inf, noise=noise)  # fmt: skip
+    detector = ReadOut(LAYOUT.gain, LAYOUT.read_noise)
     true = flux / 2 * np.linspace(1.2, 0.8, n) * np.array([[1.01], [0.99]])
     place = stage.centre + rng.standard_normal(2)
     light = stage.light(true, place, np.exp(0.05 * rng.standard_normal()))
-    return detector.expose(light, 1.0, rng)[0], true
+    return images.expose(light + background, detector, 1.0, rng if noise else None)[0], true
 
 
 def pulls_of(profile, seeds, **options):
