@@ -90,19 +90,20 @@ def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
     """
     with understood(path, error, "not a readable FITS file"), open(path, "rb") as file:
         size, packing = os.path.getsize(path), _packing(file)
-        if packing is None:
-            _check_begin(file, path, error)
-            _walk(file, path, error, count, whole, end=size)
-            return
+        limits = {"most": max(_MOST_UNPACKED, _UNPACKED_SHARE * size)} if packing else {"end": size}
         if packing in _NEEDS_MEMORY:
             # how much its unpacking takes is the choice of who packed it
             lzma.LZMADecompressor(memlimit=_MOST_UNPACKED).decompress(file.read(_CHUNK), 1)
             file.seek(0)
-        with _PACKINGS[packing](file) as stream:
-            _check_begin(stream, path, error)
-            _walk(
-                stream, path, error, count, whole, most=max(_MOST_UNPACKED, _UNPACKED_SHARE * size)
-            )
+        with _PACKINGS[packing](file) if packing else file as stream:
+            # of a file of another kind astropy would have its user try options
+            start = stream.read(6)
+            if not start:
+                raise ValueError("Empty or corrupt FITS file")
+            if start != b"SIMPLE":
+                raise error(f"{path}: is not a FITS file")
+            stream.seek(0)
+            _walk(stream, path, error, count, whole, **limits)
 
 
 def _packing(file):
@@ -113,16 +114,6 @@ def _packing(file):
         # astropy would unpack it to the disk, whatever its size
         raise ValueError("a zip archive: unpack it first")
     return next((mark for mark in _PACKINGS if start.startswith(mark)), None)
-
-
-def _check_begin(stream, path, error):
-    """Say of a file of another kind what it is not; astropy would have its user try options."""
-    start = stream.read(6)
-    if not start:
-        raise ValueError("Empty or corrupt FITS file")
-    if start != b"SIMPLE":
-        raise error(f"{path}: is not a FITS file")
-    stream.seek(0)
 
 
 def _walk(stream, path, error, count, whole, **limits):

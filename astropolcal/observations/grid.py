@@ -93,20 +93,7 @@ def build_grid(table, label):
     table = check_table(table, label, (*REQUIRED, "flux") if single else (*REQUIRED, *BEAMS))
     frame = _integers(table, "frame", label)
     bins = _integers(table, "bin", label)
-    micrometres, (low, high) = numeric_column(table, "wavelength", label, u.um), _WAVELENGTHS
-    wrong = ~((micrometres >= low) & (micrometres <= high))
-    # in the unit of the limits, whatever that of the table
-    shown, allowed = np.char.mod("%.9g um", micrometres), f"({low:g} to {high:g} um)"
-    first_bad_row(wrong, "wavelength", shown, label, f"lengths above zero {allowed}")
-    wavelength, angles = numeric_column(table, "wavelength", label), {}
-    for name in (name for name in _ANGLES if name in table.colnames):
-        degrees = numeric_column(table, name, label, u.deg)
-        allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
-        # written so that NaN, which compares as false, is bad
-        first_bad_row(~(np.abs(degrees) <= _MAX_ANGLE), name, degrees, label, allowed)
-        if name == "altitude":
-            first_bad_row(np.abs(degrees) > 90, name, degrees, label, "-90 to 90 deg")
-        angles[name] = numeric_column(table, name, label) * table[name].unit
+    wavelength, angles = _positions(table, label)
 
     # first: row in which a frame appears first, for its own columns and for messages
     frame_numbers, first, frame_index = np.unique(frame, return_index=True, return_inverse=True)
@@ -193,6 +180,25 @@ def beams_as_frames(table, label):
             part["group"] = part["group"] if "group" in part.colnames else frame
         parts.append(part)
     return vstack(parts, metadata_conflicts="silent")
+
+
+def _positions(table, label):
+    """Return the wavelength of each row, and its angles by name, or refuse what cannot be."""
+    micrometres, (low, high) = numeric_column(table, "wavelength", label, u.um), _WAVELENGTHS
+    wrong = ~((micrometres >= low) & (micrometres <= high))
+    # in the unit of the limits, whatever that of the table
+    shown, allowed = np.char.mod("%.9g um", micrometres), f"({low:g} to {high:g} um)"
+    first_bad_row(wrong, "wavelength", shown, label, f"lengths above zero {allowed}")
+    wavelength, angles = numeric_column(table, "wavelength", label), {}
+    for name in (name for name in _ANGLES if name in table.colnames):
+        degrees = numeric_column(table, name, label, u.deg)
+        allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
+        # written so that NaN, which compares as false, is bad
+        first_bad_row(~(np.abs(degrees) <= _MAX_ANGLE), name, degrees, label, allowed)
+        if name == "altitude":
+            first_bad_row(np.abs(degrees) > 90, name, degrees, label, "-90 to 90 deg")
+        angles[name] = numeric_column(table, name, label) * table[name].unit
+    return wavelength, angles
 
 
 def _integers(table, name, label):

@@ -21,7 +21,7 @@ from astropy.io import ascii
 from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import check_yaml, one_line, understood
+from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
 from astropolcal.units import iso_date, plain_number
 
 __all__ = []
@@ -35,7 +35,7 @@ _SINGLE = ("single_difference", "single_sum")
 
 def read_ecsv(path):
     """Read an ECSV file into a table without trusting it."""
-    with understood(path, ObservationError, "cannot be read as text, an ECSV table is needed"):
+    with understood(path, ObservationError, "cannot be read: not a text file of ECSV"):
         # read once: what is checked is what is loaded, even if the file changes meanwhile
         text = Path(path).read_bytes().decode("utf-8")
     # astropy would guess another format, and make one column of it
@@ -89,6 +89,17 @@ def _check_numbers(path, text):
                     f"{path}, row {row + 1}: {column.name} = {one_line(cell, 40)}, "
                     "allowed are numbers such as 1000 or 1e3"
                 ) from None
+
+
+def write_table(table, path, overwrite=False):
+    """Write a table as ECSV, completely or not at all."""
+    path = check_new(path, overwrite, ObservationError)
+    # its meta may hold what YAML cannot represent
+    with (
+        understood(path, ObservationError, "cannot be written", reads=False),
+        atomic_path(path, ObservationError) as temporary,
+    ):
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
 def check_table(table, label, required):

@@ -11,7 +11,7 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.files import atomic_path, check_new, one_line
+from astropolcal.files import one_line
 from astropolcal.observations.grid import beam_variances, build_grid
 from astropolcal.observations.observables import PAIRINGS, frame_groups
 from astropolcal.observations.pointings import frame_coordinate
@@ -20,6 +20,7 @@ from astropolcal.observations.reading import (
     numeric_column,
     read_ecsv,
     stated_date,
+    write_table,
 )
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
@@ -658,17 +659,8 @@ class Observations:
         >>> again.content_hash == obs.content_hash
         True
         """
-        path = check_new(path, overwrite, ObservationError)
-        try:
-            with atomic_path(path, ObservationError) as temporary:
-                # a plain Table gives a header that people can read, unlike a QTable
-                Table(self.to_table()).write(temporary, format="ascii.ecsv", overwrite=True)
-        except ObservationError:
-            raise
-        except Exception as error:  # meta may hold what YAML cannot represent
-            raise ObservationError(
-                f"{path}: cannot be written: {' '.join(str(error).split())}"
-            ) from error
+        # a plain Table gives a header that people can read, unlike a QTable
+        write_table(Table(self.to_table()), path, overwrite)
 
 
 def _span(angles):

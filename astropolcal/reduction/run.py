@@ -18,12 +18,12 @@ from astropolcal.exceptions import InstrumentError, ObservationError, ParameterE
 from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
 from astropolcal.observations.grid import is_star
-from astropolcal.observations.reading import stated_date
+from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
-from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
+from astropolcal.reduction.tables import photometry_table, reduced_table
 from astropolcal.words import check_choice
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -259,7 +259,7 @@ def reduce_run(
     files = [str(path) for path in files]
     instrument = _instrument(instrument, files)
     # an instrument of somebody else need not list its sources
-    if known := getattr(instrument, "sources", ()):
+    if known := instrument.sources:
         allowed = dict.fromkeys(("internal", "star", *known))
         check_choice("source", source, allowed, ParameterError)
     photometry = "star" if is_star(source) else "internal"

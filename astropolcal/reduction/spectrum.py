@@ -14,9 +14,8 @@ import numpy as np
 from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
-from astropolcal.observations.reading import read_ecsv
-from astropolcal.reduction.tables import write_table
+from astropolcal.exceptions import ObservationError
+from astropolcal.observations.reading import read_ecsv, write_table
 
 __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
 
@@ -50,8 +49,6 @@ def spectra_from_table(table):
     ObservationError
         If a column is missing or has the wrong unit, a value that is not masked is
         not finite, an error is negative, or a wavelength is given twice.
-    AstropolcalError
-        If specutils is not installed.
 
     Examples
     --------
@@ -65,12 +62,8 @@ def spectra_from_table(table):
     >>> print(spectra["q"].flux, spectra["q"].spectral_axis)
     [0.01  0.008] [1.2 1.6] um
     """
-    try:
-        from specutils import Spectrum
-    except ImportError as error:
-        raise AstropolcalError(
-            "spectra of a target need the package specutils (2.0 or later): pip install specutils"
-        ) from error
+    from specutils import Spectrum
+
     table, mask = _checked(table)
     spectra = {}
     for key, name in _NAMES.items():

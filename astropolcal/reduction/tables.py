@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import MaskedColumn, QTable, Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path, check_new, one_line, understood
+from astropolcal.files import one_line, understood
 from astropolcal.observations import Observations
 from astropolcal.units import plain_number
 
@@ -82,16 +82,14 @@ def _frame_columns(frames, instrument):
     layout = instrument.files
     own = [name for name in layout.stages if name not in layout.texts]
     units = dict.fromkeys((*_ANGLES, *own), u.deg) | {"exposure_time": u.s, "mjd": u.day}
+    # states have none
+    units |= dict.fromkeys(("flc_state", *layout.texts))
     for name, unit in units.items():
         values = [frame.values.get(name) for frame in frames]
         # a column is there for all frames or not at all
         if frames and None not in values:
-            column = "time" if name == "mjd" else name
-            table[column] = np.repeat(np.array(values, dtype=float), n) * unit
-    for name in ("flc_state", *layout.texts):
-        states = [frame.values.get(name) for frame in frames]
-        if frames and None not in states:
-            table[name] = np.repeat(states, n)
+            column = np.repeat(values, n) if unit is None else np.repeat(values, n) * unit
+            table["time" if name == "mjd" else name] = column
     return table
 
 
@@ -112,13 +110,6 @@ def photometry_table(frames, instrument):
     for name in ("scale", "scale_err"):
         table[name] = _column(_stack(frames, name), failed, u.one)
     return table
-
-
-def write_table(table, path, overwrite=False):
-    """Write a table as ECSV, completely or not at all."""
-    path = check_new(path, overwrite, ObservationError)
-    with atomic_path(path, ObservationError) as temporary:
-        table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
 # ---- tables of pyPolCal --------------------------------------------------------------------------

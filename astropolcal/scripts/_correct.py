@@ -191,7 +191,7 @@ def work(arguments):
         result = result.without_star(**arguments.subtract_star)
     result.write(arguments.output, overwrite=True)
     if arguments.spectrum:
-        from astropolcal.reduction.tables import write_table
+        from astropolcal.observations.reading import write_table
 
         write_table(star.table(), arguments.spectrum, overwrite=True)
     if arguments.plot:

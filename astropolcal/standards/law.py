@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The wavelength dependence of interstellar polarization."""
 
+from functools import partial
 from typing import NamedTuple
 
 import astropy.units as u
@@ -170,28 +171,24 @@ class SerkowskiLaw(Fittable1DModel):
     @property
     def fit_deriv(self):
         """Derivatives by the parameters, or None if a tie of the user's makes them wrong."""
-        # astropy drops the columns of tied parameters, so theirs must be in that of their source
         ties = {name: tie for name, tie in self.tied.items() if tie}
         if not ties:
             return self._columns
-        return self._tied_columns if ties == {"K": whittet_width} else None
+        # astropy drops the columns of tied parameters, so theirs must be in that of their source:
+        # the chain rule through K = intercept + slope * lambda_max
+        return partial(self._columns, slope=_SLOPE) if ties == {"K": whittet_width} else None
 
     @staticmethod
-    def _columns(x, p_max, lambda_max, K, theta, rotation):
+    def _columns(x, p_max, lambda_max, K, theta, rotation, slope=0.0):
         log = np.log(lambda_max / np.asarray(x, dtype=float))
         shape = np.exp(-K * log**2)
         degree = p_max * shape
         none = np.zeros_like(shape)
         # d/dp_max, d/dlambda_max, d/dK of p_max exp(-K ln^2(lambda_max /
         # lambda)); the degree does not depend on the angle
-        return [shape, -2 * K * log / lambda_max * degree, -(log**2) * degree, none, none]
-
-    @classmethod
-    def _tied_columns(cls, x, *parameters):
-        columns = cls._columns(x, *parameters)
-        # chain rule through K = intercept + slope * lambda_max
-        columns[1] = columns[1] + _SLOPE * columns[2]
-        return columns
+        by_width = -(log**2) * degree
+        by_maximum = -2 * K * log / lambda_max * degree + slope * by_width
+        return [shape, by_maximum, by_width, none, none]
 
     def angle(self, wavelength):
         """Return the angle of polarization in degree, from north through east, in [0, 180)."""

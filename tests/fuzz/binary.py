@@ -154,7 +154,7 @@ def _remade(rng, content):
     """Change the arrays as a program would: other shapes, types and compressions."""
     try:
         # what was spoiled before may keep astropy busy for ever
-        _walk(io.BytesIO(content), MOST_HDUS, False, end=len(content))
+        _walk(io.BytesIO(content), "made up", ValueError, MOST_HDUS, False, end=len(content))
         with fits.open(io.BytesIO(content), memmap=False) as hdus:
             hdus = [hdu.copy() for hdu in hdus]
     except Exception:

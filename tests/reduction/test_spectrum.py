@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Spectra of a reduced target: there, back, and what cannot be one."""
 
-import sys
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from astropy.utils.masked import Masked
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import ObservationError
 from astropolcal.reduction.spectrum import (
     read_spectra,
     spectra_from_table,
@@ -217,9 +215,3 @@ def test_a_bad_file_is_named(tmp_path):
     _without("q").write(path, format="ascii.ecsv")
     with pytest.raises(ObservationError, match=r"bad\.ecsv: target: missing columns q"):
         read_spectra(path)
-
-
-def test_without_specutils_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "specutils", None)
-    with pytest.raises(AstropolcalError, match="pip install specutils"):
-        spectra_from_table(target())

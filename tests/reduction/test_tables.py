@@ -8,9 +8,10 @@ from astropy.table import Table
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.observations import Observations
+from astropolcal.observations.reading import write_table
 from astropolcal.reduction.frames import Frame
 from astropolcal.reduction.photometry import Photometry
-from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
+from astropolcal.reduction.tables import photometry_table, reduced_table
 
 N = 4
 
