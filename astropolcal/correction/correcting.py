@@ -11,7 +11,7 @@ import numpy as np
 from astropolcal.correction.frames import ScienceFrames
 from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain
-from astropolcal.correction.solve import covariance_index, estimator
+from astropolcal.correction.solve import Channels, covariance_index, estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
     AstropolcalError,
@@ -38,6 +38,11 @@ _WAYS = {
     "date": "ScienceFrames(..., date=) states it, any_date=True takes any",
     "mode": "ScienceFrames(..., mode={})",
 }
+_OPEN = (
+    "the calibration does not determine how Q and U turn: their systematic errors are infinite. "
+    "Ways out: a calibration with priors on what is open (calibrate --prior), or open_directions "
+    "(--open-directions) 'ignore' or a standard deviation"
+)
 
 
 def correct(
@@ -165,7 +170,10 @@ def correct(
     >>> float(star.q[0].round(9)), float(star.u[0].round(9))
     (0.02, -0.01)
     """
-    by_variance = _check_choices(mode, weights)
+    check_choice("mode", mode, MODES, ParameterError)
+    by_variance = isinstance(weights, str)
+    if by_variance and weights != "variance":
+        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
     wanted = "ScienceFrames are needed, after the calibration"
     check_type("frames", frames, ScienceFrames, wanted, ParameterError)
     if hasattr(calibration, "datasets"):
@@ -188,47 +196,36 @@ def correct(
     estimator(rows, scale=frames.scale, **how)
     frames, unmeasured = _with_brightness(frames, rows, brightness, how)
     solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
-    for words in (*doubts, *unmeasured, *_weak(solution, frames.wavelength)):
+    weak = [w for w, words in enumerate(solution.weak) if words]
+    if weak:
+        unmeasured += [
+            f"poorly determined at {len(weak)} of {len(solution.weak)} wavelengths, left out "
+            f"there: at {frames.wavelength[weak[0]]:.6g} {solution.weak[weak[0]]} (condition "
+            f"{solution.condition[weak[0]]:.3g}, allowed is {max_condition:g})"
+        ]
+    for words in doubts + unmeasured:
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
-    systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
+    systematic = None
+    if model.calibration is not None and n_samples:
+        systematic = sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
+    elif model.calibration is not None:
+        systematic = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
+    if systematic is not None and systematic.is_open:
+        warnings.warn(_OPEN, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
-    stokes, covariance = _stokes(frames.source, solution, by_variance, **division)
+    found = corrected_planes(frames.source, solution, by_variance, **division)
+    n = len(components)
     known = {key: getattr(solution, key) for key in _OF_SOLUTION}
     known |= {key: getattr(frames, key) for key in _OF_FRAMES}
     return Corrected(
-        stokes=stokes,
-        covariance=covariance,
+        stokes=found[:n],
+        covariance=found[n:] if len(found) > n else None,
         systematic=systematic,
         mode=mode,
         observable=observable,
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
-
-
-def _stokes(source, solution, by_variance, **division):
-    """Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
-
-    Both have the shape (n, n_wavelengths, *image_shape).
-    """
-    n = len(solution.components)
-    # first the components, then their covariances as the engine lays them out
-    planes = n + (len(covariance_index(n)) if source.has_variances else 0)
-    out = run_blocks(
-        partial(correct_block, source, solution, by_variance=by_variance),
-        (planes, source.n_wavelengths, *source.image_shape),
-        **division,
-    )
-    return out[:n], out[n:] if planes > n else None
-
-
-def _check_choices(mode, weights):
-    """Return whether the variances of the fluxes weight them; refuse what is not known."""
-    check_choice("mode", mode, MODES, ParameterError)
-    by_variance = isinstance(weights, str)
-    if by_variance and weights != "variance":
-        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
-    return by_variance
 
 
 def _observable(calibration, frames, observable):
@@ -244,8 +241,7 @@ def _observable(calibration, frames, observable):
                 "the calibration fitted pairs of frames, and these frames have none (half-wave "
                 "plate angles 45 deg apart, hwp=): their intensities are fitted, so that unequal "
                 "gains of the beams, and what the optics downstream of the half-wave plate "
-                "polarize "
-                "unknown to the calibration, do not cancel"
+                "polarize unknown to the calibration, do not cancel"
             ]
     # of a chain that nobody fitted: what cancels most
     observable = observable or ("intensity" if frames.pairs is None else "double")
@@ -273,45 +269,10 @@ def _with_brightness(frames, rows, brightness, how):
 def _rows(model, rows, frames, mode):
     if mode == "stokes":
         return rows
-    ideal = RowModel(
-        ideal_chain(model.chain, frames.wavelength),
-        frames.positions,
-        frames.wavelength,
-        chain=ideal_chain(model.chain, frames.wavelength),
-    )
+    ideal = ideal_chain(model.chain, frames.wavelength)
+    ideal_rows = RowModel(ideal, frames.positions, frames.wavelength, chain=ideal).rows()
     # what I adds to each flux is that of the real instrument: the instrumental polarization
-    return np.concatenate([rows[..., :1], ideal.rows()[..., 1:]], axis=-1)
-
-
-def _weak(solution, wavelength):
-    """Return in words what is poorly determined, if anything is."""
-    flags = solution.flags()
-    if not flags:
-        return []
-    first = next(iter(flags))
-    return [
-        f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
-        f"at {wavelength[first]:.6g} {flags[first]} (condition "
-        f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})"
-    ]
-
-
-def _systematic(model, solution, mode, open_directions, n_samples, seed):
-    if model.calibration is None:
-        return None
-    if n_samples:
-        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
-    found = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
-    if found.is_open:
-        warnings.warn(
-            "the calibration does not determine how Q and U turn: "
-            "their systematic errors are infinite. "
-            "Ways out: a calibration with priors on what is open (calibrate --prior), or "
-            "open_directions (--open-directions) 'ignore' or a standard deviation",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
-    return found
+    return np.concatenate([rows[..., :1], ideal_rows[..., 1:]], axis=-1)
 
 
 def _provenance(calibration, frames, systematic, given):
@@ -341,22 +302,58 @@ def _provenance(calibration, frames, systematic, given):
 _TOGETHER = 8
 
 
-def correct_block(source, solution, start, stop, by_variance=False, in_order=map):
+def corrected_planes(
+    source, solution, by_variance, *, chunk=None, workers=None, cluster=None, progress=False
+):
     """
-    Return the Stokes parameters at wavelengths start to stop, (n, stop - start, ...).
+    Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
 
-    The components, then, if the fluxes have variances, their covariances in the order of
-    `covariance_index`. ``by_variance`` weights each pixel by its own variances. ``in_order`` calls
-    a function with parts of the frames, and gives the results in the order of the parts.
+    Their shape is (n, n_wavelengths, *image_shape), covariances in the order of
+    `covariance_index`. ``by_variance`` weights each pixel by its own variances. ``workers`` threads
+    divide the ranges of ``chunk`` wavelengths. With ``cluster``, the address of a scheduler, its
+    processes divide the frames, and the range by default is that of all wavelengths.
     """
+    for name, value in (("chunk", chunk), ("workers", workers)):
+        if value is not None and not value >= 1:
+            raise ParameterError(f"{name} = {value}; it must be at least 1")
     if by_variance and not source.has_variances:
         raise ParameterError("weights by variance need variances of the fluxes, and there are none")
-    n, wavelengths = len(solution.components), slice(start, stop)
-    index = covariance_index(n) if source.has_variances else []
-    shape = (n + len(index), stop - start, int(np.prod(source.image_shape, dtype=int)))
-    out = np.full(shape, np.nan if by_variance else 0.0)
+    size, n, in_order = source.n_wavelengths, len(solution.components), map
+    chunk = chunk or (1 if cluster is None else size)
+    if cluster is not None:
+        in_order, workers = partial(_on_cluster, cluster), 1
+    n_planes = n + (len(covariance_index(n)) if source.has_variances else 0)
+    out = np.empty((n_planes, size, *source.image_shape))
+    with (
+        shown(progress),
+        counting(0 if cluster else size, "wavelengths") as add,
+        ThreadPoolExecutor(workers or 1) as pool,
+    ):
+
+        def work(start):
+            wavelengths = slice(start, min(start + chunk, size))
+            part = out[:, wavelengths]
+            part[:] = _block(source, solution, wavelengths, by_variance, in_order, part.shape)
+            add(part.shape[1])
+
+        # an error comes out here, and ends what has not begun
+        list(pool.map(work, range(0, size, chunk)))
+    return out
+
+
+def _block(source, solution, wavelengths, by_variance, in_order, shape):
+    """
+    Return components and covariances at some wavelengths, of the ``shape`` of their images.
+
+    ``in_order`` calls a function with parts of the frames, and gives the results in the order of
+    the parts.
+    """
+    n = len(solution.components)
+    index = covariance_index(n)[: shape[0] - n]
+    flat = (*shape[:2], int(np.prod(shape[2:], dtype=int)))
+    out = np.full(flat, np.nan if by_variance else 0.0)
     if not by_variance:
-        linear = partial(_linear, source, solution, wavelengths, shape)
+        linear = partial(_linear, source, solution, wavelengths, flat)
         for part in in_order(linear, _together(source.batches())):
             out += part
     known = solution.determined[wavelengths]
@@ -368,12 +365,13 @@ def correct_block(source, solution, start, stop, by_variance=False, in_order=map
         for i in np.flatnonzero(bad.any(axis=1)):
             # as for all other pixels: where V is not determined it is taken as zero
             solved = 3 if n == 4 and not known[i, 3] else n
-            found = _solved(sums[:, np.nonzero(bad)[0] == i], n, solved, solution.max_condition)
+            limit = solution.settings["max_condition"]
+            found = _solved(sums[:, np.nonzero(bad)[0] == i], n, solved, limit)
             out[:, i, bad[i]] = found[: len(out)]
     # the components, then their covariances
     for kept, column in enumerate([*((c,) for c in range(n)), *index]):
         out[kept, ~known[:, list(column)].all(axis=1)] = np.nan
-    return out.reshape(*shape[:2], *source.image_shape)
+    return out.reshape(shape)
 
 
 def _together(parts):
@@ -417,8 +415,17 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
     index = covariance_index(n)
     normal, spread = np.zeros((2, len(index), of.size))
     right = np.zeros((n, of.size))
+
+    def channels_of(read, frames, power=1):
+        cells = [slice(f, f + 1) for f in frames]
+        found = [[read(beam, cell, wavelengths)[0] for cell in cells] for beam in (0, 1)]
+        fluxes = np.reshape(found, (2, len(cells), *pixels.shape))[..., pixels]
+        alone = Channels(solution.channels.observable, len(cells), [range(len(cells))])
+        return alone.combine(fluxes, power)[:, 0]
+
     for unit, frames in units:
-        data, variance = _unit(source, solution.channels, frames, wavelengths, pixels)
+        data = channels_of(source.fluxes, frames)
+        variance = channels_of(source.variances, frames, 2) if source.has_variances else None
         for channel in (0, 1):
             row = solution.channel_rows[channel, wavelengths, unit, :n][of].T
             weight = solution.weights[channel, wavelengths, unit][of]
@@ -437,19 +444,6 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
                 # A^T W V W A: with W = 1 / V it is the normal matrix itself
                 spread += products * (weight**2 * np.where(good, variance[channel], 0.0))
     return np.concatenate([normal, spread, right])
-
-
-def _unit(source, channels, frames, wavelengths, pixels):
-    """Return the channels of one unit and their variances, of some pixels."""
-
-    def read(method):
-        cells = [slice(f, f + 1) for f in frames]
-        found = [[method(b, cell, wavelengths)[0] for cell in cells] for b in (0, 1)]
-        return np.reshape(found, (2, len(cells), *pixels.shape))[..., pixels]
-
-    data = channels.one(read(source.fluxes))
-    variance = channels.one(read(source.variances), True) if source.has_variances else None
-    return data, variance
 
 
 def _solved(sums, n, solved, max_condition):
@@ -478,41 +472,6 @@ def _full(planes, n):
     for plane, (i, j) in zip(planes, covariance_index(n), strict=True):
         matrix[:, i, j] = matrix[:, j, i] = plane
     return matrix
-
-
-# ---- dividing the work -----------------------------------------------------------------------
-
-
-def run_blocks(block, shape, *, chunk=None, workers=None, cluster=None, progress=False):
-    """
-    Call a function with start and stop of ranges of ``chunk`` wavelengths.
-
-    Return its results, (n, stop - start, ...), put together in ``shape``. With ``workers`` threads
-    divide the ranges. With ``cluster``, the address of a scheduler, its processes divide what the
-    function calls ``in_order``, and the range by default is that of all wavelengths.
-    """
-    for name, value in (("chunk", chunk), ("workers", workers)):
-        if value is not None and not value >= 1:
-            raise ParameterError(f"{name} = {value}; it must be at least 1")
-    out = np.empty(shape)
-    if cluster is not None:
-        block, workers = partial(block, in_order=partial(_on_cluster, cluster)), None
-        chunk = chunk or shape[1]
-    ranges = [(i, min(i + (chunk or 1), shape[1])) for i in range(0, shape[1], chunk or 1)]
-    with shown(progress), counting(0 if cluster else shape[1], "wavelengths") as add:
-
-        def work(limits):
-            out[:, limits[0] : limits[1]] = block(*limits)
-            add(limits[1] - limits[0])
-
-        if workers is None:
-            for limits in ranges:
-                work(limits)
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                # an error comes out here, and ends what has not begun
-                list(pool.map(work, ranges))
-    return out
 
 
 def _on_cluster(address, function, parts):

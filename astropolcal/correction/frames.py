@@ -286,7 +286,6 @@ class ScienceFrames:
         size=51,
         position_angle=None,
         mirrored=False,
-        order=3,
         left_scale=1.0,
         detectors=None,
         **settings,
@@ -315,7 +314,7 @@ class ScienceFrames:
             default in the middle of the field.
         size : int
             Rows and columns that are cut out about it.
-        position_angle, mirrored, order
+        position_angle, mirrored
             As for `from_arrays`.
         left_scale : array_like
             By what the left beam is multiplied, one number or one per frame.
@@ -344,7 +343,6 @@ class ScienceFrames:
             position_angle=position_angle,
             extension=layout.cube_extension,
             mirrored=mirrored,
-            order=order,
             left_files=left,
             left_scale=left_scale,
             weights=layout.weights,

@@ -7,6 +7,7 @@ two). The wavelengths, which need not be evenly spaced, stand in the table ``WAV
 """
 
 import warnings
+from itertools import combinations_with_replacement
 
 import astropy.units as u
 import numpy as np
@@ -40,16 +41,15 @@ _KEYWORDS = {
 }
 
 
-def write_product(corrected, path, *, overwrite=False, maps=True):
+def write_product(corrected, path, *, overwrite=False):
     """Write a `Corrected` to a FITS file, which appears complete or not at all."""
-    path = check_new(path, overwrite, ObservationError, corrected.provenance.get("frames", []))
+    frames = corrected.provenance.get("frames", [])
+    path = check_new(path, overwrite, ObservationError, frames)
     hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
-    hdus += _errors(corrected)
-    if maps:
-        hdus += _maps(corrected)
+    hdus += [*_errors(corrected), *_maps(corrected)]
     if corrected.star is not None:
         hdus.append(fits.BinTableHDU(corrected.star, name="STAR"))
-    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
+    names = [_printable(name) for name in frames] or ["unknown"]
     hdus.append(fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES"))
     with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
         fits.HDUList(hdus).writeto(stream, checksum=True)
@@ -118,12 +118,10 @@ def _axes(header, corrected):
 
 def _wavelengths(corrected):
     table = QTable({"wavelength": corrected.wavelength.to(u.um)})
-    table["condition"] = corrected.condition
-    table["determined"] = corrected.determined
-    table["leakage"] = corrected.leakage
-    table["weak"] = np.array(corrected.weak, dtype=str)
+    for name in ("condition", "determined", "leakage"):
+        table[name] = getattr(corrected, name)
     # FITS has no columns of width zero
-    table["weak"] = np.where(table["weak"] == "", " ", table["weak"])
+    table["weak"] = np.array([words or " " for words in corrected.weak], dtype=str)
     return fits.BinTableHDU(table, name="WAVELENGTH")
 
 
@@ -135,12 +133,10 @@ def _image(name, values, *lines):
 
 
 def _errors(corrected):
-    n, names = len(corrected.components), corrected.components
-    pairs = [f"{names[i]}{names[j]}" for i, j in covariance_index(n)]
-    hdus = []
+    names = list(map("".join, combinations_with_replacement(corrected.components, 2)))
+    hdus, systematic = [], corrected.systematic
     if corrected.covariance is not None:
-        hdus.append(_image("COVSTAT", corrected.covariance, *pairs))
-    systematic = corrected.systematic
+        hdus.append(_image("COVSTAT", corrected.covariance, *names))
     if systematic is not None:
         factor = systematic.factor
         # an array of no directions cannot be stored
@@ -149,25 +145,21 @@ def _errors(corrected):
         hdu.header["COMMENT"] = "Change of the Stokes vector (axis 2) for one sigma along each"
         hdu.header["COMMENT"] = "direction (axis 4), per unit of the true one (axis 1)."
         hdu.header["SYSMETH"] = systematic.method
+        known = corrected.covariances("systematic")
+        planes = np.stack([known[pair] for pair in covariance_index(len(known))])
         hdus += [hdu, _image("SYSOPEN", systematic.open.astype(np.uint8))]
+        hdus.append(_image("COVSYST", planes, *names))
     return hdus
 
 
 def _maps(corrected):
     """Return what follows from the rest, for those who read FITS only."""
-    hdus, n = [], len(corrected.components)
-    names = [f"{corrected.components[i]}{corrected.components[j]}" for i, j in covariance_index(n)]
-    if corrected.systematic is not None:
-        known = corrected.covariances("systematic")
-        planes = np.stack([known[i, j] for i, j in covariance_index(n)])
-        hdus.append(_image("COVSYST", planes, *names))
     found = corrected.polarization()
     order = ("dolp", "dolp_debiased", "s_p_statistical", "s_p_systematic")
-    hdus.append(_image("DOLP", np.stack([found[name] for name in order]), *order))
+    hdus = [_image("DOLP", np.stack([found[name] for name in order]), *order)]
     order = ("aolp", "s_chi_statistical", "s_chi_systematic")
-    hdu = _image("AOLP", np.stack([found[name] for name in order]), *order)
-    hdu.header["BUNIT"] = "deg"
-    hdus.append(hdu)
+    hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order))
+    hdus[-1].header["BUNIT"] = "deg"
     if corrected.stokes.ndim == 4:
         found = corrected.azimuthal()
         hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
@@ -183,29 +175,31 @@ def read_product(path):
     ):
         warnings.simplefilter("error", AstropyUserWarning)
         with fits.open(stream, memmap=False) as hdus:
-            return _read(path, hdus)
+            return _read(hdus)
 
 
-def _read(path, hdus):
+def _read(hdus):
     header = hdus[0].header
-    if header.get("CONTENT") != PRODUCT or header.get("CONTVERS") != _VERSION:
-        raise ObservationError(
-            f"{path}: CONTENT = {header.get('CONTENT')!r}, version {header.get('CONTVERS')}; "
-            f"needed is {PRODUCT!r}, version {_VERSION}"
-        )
-    if header.get("POLCONV") != "IAU":
-        raise ObservationError(f"{path}: POLCONV = {header.get('POLCONV')!r}; allowed is 'IAU'")
+    for key, needed in {"CONTENT": PRODUCT, "CONTVERS": _VERSION, "POLCONV": "IAU"}.items():
+        if header.get(key) != needed:
+            raise ValueError(f"{key} = {header.get(key)!r}; needed is {needed!r}")
     # FITS holds big-endian numbers
     stokes = _native(hdus[0].data)
     n = stokes.ndim
     codes = header[f"CRVAL{n}"] + header[f"CDELT{n}"] * np.arange(len(stokes))
-    table = _table(path, hdus["WAVELENGTH"])
+    table = _table(hdus["WAVELENGTH"])
     provenance = {
         key: header[keyword] for key, (keyword, _) in _KEYWORDS.items() if keyword in header
     }
-    place = ("STARX", "STARY")
-    provenance["frames"] = [str(name) for name in _table(path, hdus["FRAMES"])["frame"]]
-    _check(path, hdus, stokes, codes, table)
+    provenance["frames"] = [str(name) for name in _table(hdus["FRAMES"])["frame"]]
+    _check(hdus, stokes, codes, table)
+    unit = u.Unit(header["BUNIT"])
+    # a number alone is a unit too to astropy, and FITS cannot hold all of them
+    if getattr(unit, "scale", 1.0) != 1.0:
+        raise ValueError(f"BUNIT = {header['BUNIT']!r}; a unit without a factor is needed")
+    place = None
+    if "STARX" in header:
+        place = tuple(_stated(header, key, float) for key in ("STARX", "STARY"))
     return {
         "components": "".join(StokesCoord(codes).symbol),
         "wavelength": np.asarray(table["wavelength"], dtype=float) * table["wavelength"].unit,
@@ -216,53 +210,43 @@ def _read(path, hdus):
         "determined": np.asarray(table["determined"], dtype=bool),
         "leakage": _native(table["leakage"]),
         "weak": [str(words).strip() for words in table["weak"]],
-        "mode": _stated(path, header, "CORRMODE", str),
-        "observable": _stated(path, header, "OBSERVBL", str),
-        "unit": _unit(path, header["BUNIT"]),
-        "north_up": _stated(path, header, "NORTHUP", bool),
-        "centre": tuple(_stated(path, header, key, float) for key in place)
-        if "STARX" in header
-        else None,
-        "pixel_scale": _stated(path, header, "PIXSCALE", float) if "PIXSCALE" in header else None,
+        "mode": _stated(header, "CORRMODE", str),
+        "observable": _stated(header, "OBSERVBL", str),
+        "unit": unit,
+        "north_up": _stated(header, "NORTHUP", bool),
+        "centre": place,
+        "pixel_scale": _stated(header, "PIXSCALE", float) if "PIXSCALE" in header else None,
         "provenance": provenance,
-        "star": _star(path, hdus),
+        "star": _star(hdus),
     }
 
 
-def _star(path, hdus):
+def _star(hdus):
     """Return the polarization of the star that was subtracted, or None."""
     if "STARSUB" not in hdus[0].header:
         return None
-    table = QTable(_table(path, hdus["STAR"]))
+    table = QTable(_table(hdus["STAR"]))
     if len(table) != len(hdus["WAVELENGTH"].data) or not set(COLUMNS) <= set(table.colnames):
-        raise ObservationError(f"{path}: not a readable product: STAR has not what is subtracted")
-    table.meta = {"star": _stated(path, hdus[0].header, "STARSUB", str)}
+        raise ValueError("STAR has not what is subtracted")
+    table.meta = {"star": _stated(hdus[0].header, "STARSUB", str)}
     return table
 
 
-def _table(path, hdu):
+def _table(hdu):
     """Return a table; one of this package has no arrays in a heap, which may claim any length."""
     heap = [form for form in hdu.columns.formats if "P" in form or "Q" in form]
     if heap:
-        raise ObservationError(f"{path}: not a readable product: a column of {heap[0]!r}")
+        raise ValueError(f"a column of {heap[0]!r}")
     table = Table.read(hdu)
     for name in table.colnames:
         if table[name].dtype.kind == "c":
-            raise ObservationError(f"{path}: not a readable product: {name} is complex")
+            raise ValueError(f"{name} is complex")
         if table[name].dtype.kind in "US" and not all(str(text).isascii() for text in table[name]):
-            raise ObservationError(f"{path}: not a readable product: text in {name} is not ASCII")
+            raise ValueError(f"text in {name} is not ASCII")
     return table
 
 
-def _unit(path, text):
-    unit = u.Unit(text)
-    # a number alone is a unit too to astropy, and FITS cannot hold all of them
-    if getattr(unit, "scale", 1.0) != 1.0:
-        raise ObservationError(f"{path}: BUNIT = {text!r}; a unit without a factor is needed")
-    return unit
-
-
-def _stated(path, header, keyword, kind):
+def _stated(header, keyword, kind):
     """Return the value of a keyword, which must be of a kind; floats may be whole numbers."""
     value = header[keyword]
     # True is an int to Python
@@ -270,32 +254,29 @@ def _stated(path, header, keyword, kind):
         value = float(value)
     if type(value) is not kind or (kind is float and not np.isfinite(value)):
         words = {str: "a text", bool: "T or F", float: "a finite number"}[kind]
-        raise ObservationError(f"{path}: {keyword} = {value!r}, {words} is needed")
+        raise ValueError(f"{keyword} = {value!r}, {words} is needed")
     return value
 
 
-def _check(path, hdus, stokes, codes, table):
+def _check(hdus, stokes, codes, table):
     """Refuse parts that do not belong together."""
     n, w = stokes.shape[:2] if stokes.ndim in (2, 4) else (0, 0)
-    pairs = n * (n + 1) // 2
-    needed = {"COVSTAT": (pairs, *stokes.shape[1:]), "SYSOPEN": (w, n, n)}
+    index = covariance_index(n)
+    needed = {"COVSTAT": (len(index), *stokes.shape[1:]), "SYSOPEN": (w, n, n)}
     if "SYSFACT" in hdus:
         needed["SYSFACT"] = (len(hdus["SYSFACT"].data), w, n, n)
     wrong = [name for name, shape in needed.items() if name in hdus and hdus[name].shape != shape]
     if tuple(codes) not in ((1, 2, 3), (1, 2, 3, 4)) or len(table) != w or wrong:
-        raise ObservationError(
-            f"{path}: not a readable product: Stokes parameters of shape {stokes.shape} do not fit "
+        raise ValueError(
+            f"Stokes parameters of shape {stokes.shape} do not fit "
             f"{', '.join(wrong) or f'{len(table)} wavelengths and the codes {codes.tolist()}'}"
         )
-    values = np.asarray(table["wavelength"], dtype=float)
-    if not np.all(np.isfinite(values) & (values > 0)) or not u.Unit(
-        table["wavelength"].unit
-    ).is_equivalent(u.um):
-        raise ObservationError(f"{path}: not a readable product: its wavelengths are not lengths")
-    if "COVSTAT" in hdus and n:
-        diagonal = [i for i, (a, b) in enumerate(covariance_index(n)) if a == b]
-        if np.any(hdus["COVSTAT"].data[diagonal] < 0):
-            raise ObservationError(f"{path}: not a readable product: negative variances")
+    values, unit = np.asarray(table["wavelength"], dtype=float), u.Unit(table["wavelength"].unit)
+    if not np.all(np.isfinite(values) & (values > 0)) or not unit.is_equivalent(u.um):
+        raise ValueError("its wavelengths are not lengths")
+    diagonal = [i for i, (a, b) in enumerate(index) if a == b]
+    if "COVSTAT" in hdus and np.any(hdus["COVSTAT"].data[diagonal] < 0):
+        raise ValueError("negative variances")
 
 
 def _native(values):
@@ -305,11 +286,8 @@ def _native(values):
 def _systematic(hdus):
     if "SYSFACT" not in hdus:
         return None
-    held = [
-        line.rpartition(": ")[2]
-        for line in hdus[0].header.get("HISTORY", [])
-        if line.startswith("not free")
-    ]
+    lines = hdus[0].header.get("HISTORY", [])
+    held = [line.rpartition(": ")[2] for line in lines if line.startswith("not free")]
     found = hdus["SYSFACT"]
     is_open = np.asarray(hdus["SYSOPEN"].data, dtype=bool)
     return Systematic(_native(found.data), is_open, found.header["SYSMETH"], held)

@@ -364,9 +364,12 @@ class Corrected:
 
     # ---- files -------------------------------------------------------------------
 
-    def write(self, path, overwrite=False, maps=True):
+    def write(self, path, overwrite=False):
         """
         Write a FITS product, atomically.
+
+        Maps that follow from the others are written too: the systematic covariances, degree and
+        angle of polarization, Q_phi and U_phi.
 
         Parameters
         ----------
@@ -374,16 +377,13 @@ class Corrected:
             The file.
         overwrite : bool
             Whether an existing file may be replaced.
-        maps : bool
-            Whether maps that follow from the others are written too: the systematic
-            covariances, degree and angle of polarization, Q_phi and U_phi.
 
         Raises
         ------
         ObservationError
             If the file exists or cannot be written.
         """
-        write_product(self, path, overwrite=overwrite, maps=maps)
+        write_product(self, path, overwrite=overwrite)
 
     @classmethod
     def read(cls, path):

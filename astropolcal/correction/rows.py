@@ -7,21 +7,17 @@ first row of the system Mueller matrix of that beam, frame and wavelength.
 """
 
 import warnings
+from functools import partial
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
-from astropolcal.calibration.system import Rows, between, free_of
+from astropolcal.calibration.system import Rows, free_of, match_wavelengths
 from astropolcal.chain import join, leaves, stages, warn_beyond
-from astropolcal.exceptions import (
-    AstropolcalWarning,
-    ChainError,
-    WavelengthRangeError,
-)
+from astropolcal.exceptions import AstropolcalWarning, ChainError
 from astropolcal.observations.pointings import plain_states
-from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
@@ -67,37 +63,29 @@ class RowModel(Rows):
         chain = sky_chain(calibration) if chain is None else chain
         self.wavelength = np.atleast_1d(u.Quantity(wavelength))
         self.calibration = calibration if hasattr(calibration, "covariance") else None
-        lam, free = length_to_um(self.wavelength), None
-        if self.calibration is not None:
-            free = free_of(calibration)
-        mix = self._mixing(chain, lam, interpolate)
-        placed, nodes = _placed(positions, stages(chain))
-        warn_beyond(chain, placed)
-        super().__init__(chain, lam, placed, free, mix, nodes)
-        self.n_frames = self._shape[1]
-
-    def _mixing(self, chain, lam, interpolate):
-        """Return weights of the calibrated wavelengths, (n_wavelengths, n_grid), or None."""
         names = [
             f"{leaf.name}.{key}"
             for leaf in leaves(chain)
             for key, value in zip(leaf.param_names, leaf.canonical_values(), strict=True)
             if value.size > 1
         ]
-        if not names or self.calibration is None:
-            return None
-        grid = np.atleast_1d(self.calibration.wavelength.to_value(u.um))
-        nearest, off = nearest_bins(lam, grid)
-        if not off.any():
-            return np.eye(len(grid))[nearest]
-        if not interpolate:
-            raise WavelengthRangeError(_not_calibrated(self.wavelength, off, grid, names))
-        return _between(lam, self.wavelength, grid, names)
-
-    @property
-    def start(self):
-        """Values of the calibration's free parameters, canonical; shape (n_free,)."""
-        return self.free.start()
+        free = mix = None
+        if self.calibration is not None:
+            free = free_of(calibration)
+        if self.calibration is not None and names:
+            grid = calibration.wavelength
+            _, mix = match_wavelengths(grid, chain, self.wavelength, interpolate)
+            if not np.isin(mix, (0.0, 1.0)).all():
+                warnings.warn(
+                    f"interpolated linearly between the {grid.size} calibrated wavelengths: "
+                    f"{', '.join(names)}",
+                    AstropolcalWarning,
+                    stacklevel=3,
+                )
+        placed, nodes = _placed(positions, stages(chain))
+        warn_beyond(chain, placed)
+        super().__init__(chain, length_to_um(self.wavelength), placed, free, mix, nodes)
+        self.n_frames = self._shape[1]
 
     @property
     def held(self):
@@ -142,30 +130,6 @@ def measurement_rows(calibration, positions, wavelength, *, chain=None, interpol
     """
     model = RowModel(calibration, positions, wavelength, chain=chain, interpolate=interpolate)
     return model.rows()
-
-
-def _not_calibrated(wavelength, off, grid, names):
-    return (
-        f"wavelength = {wavelength[off][0]:.7g} is none of the {len(grid)} calibrated from "
-        f"{grid.min():.6g} to {grid.max():.6g} um, and {names[0]} is known at these only; "
-        "interpolate=True interpolates it linearly"
-    )
-
-
-def _between(lam, wavelength, grid, names):
-    """Return the weights of linear interpolation, and say that there is one."""
-    beyond = (lam < grid.min() * (1 - SAME_WAVELENGTH)) | (lam > grid.max() * (1 + SAME_WAVELENGTH))
-    if beyond.any():
-        raise WavelengthRangeError(
-            f"wavelength = {wavelength[beyond][0]:.7g} is outside the calibrated range of "
-            f"{names[0]}, {grid.min():.6g} to {grid.max():.6g} um"
-        )
-    warnings.warn(
-        f"interpolated linearly between the {len(grid)} calibrated wavelengths: {', '.join(names)}",
-        AstropolcalWarning,
-        stacklevel=4,
-    )
-    return between(lam, grid)
 
 
 def _placed(positions, wanted):
@@ -238,31 +202,23 @@ def ideal_chain(chain, wavelength):
 
 
 def _ideal(leaf, wavelength):
-    name, theta = leaf.name, leaf.theta.quantity
+    plate = partial(optics.LinearRetarder, retardance=180 * u.deg, name=leaf.name)
+    theta = leaf.theta.quantity
     if leaf.rotates_frame:
         return leaf
     if leaf.splits_light:
-        return optics.WollastonPrism(name=name, mount=leaf.mount, theta=theta)
+        return optics.WollastonPrism(name=leaf.name, mount=leaf.mount, theta=theta)
     # drifts, stray light and gains of the beams are faults
     if leaf.stage in COORDINATES or leaf.depends_on_beam:
         return None
     if leaf.stage:
-        return _half_wave(name, leaf.mount, theta)
+        return plate(mount=leaf.mount, theta=theta)
+    # its matrices in its own axes, without its losses
+    own = leaf.canonical_values()[1 : len(type(leaf).param_names)]
+    matrix = np.reshape(leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *own), (-1, 4, 4))
     # the mean over wavelengths: which of the three is nearest must not change along a spectrum
-    matrix = np.mean(np.atleast_3d(_normalized(leaf, wavelength)), axis=0)
+    matrix = np.mean(matrix / matrix[:, :1, :1], axis=0)
     nearest = min((_IDENTITY, _HALF_WAVE, _FLIP), key=lambda m: np.abs(m - matrix).max())
     if nearest is _IDENTITY:
         return None
-    return _half_wave(name, None, theta + (0 if nearest is _HALF_WAVE else 45) * u.deg)
-
-
-def _normalized(leaf, wavelength):
-    """Return the matrices of an optic in its own axes, without its losses."""
-    own = leaf.canonical_values()[1 : len(type(leaf).param_names)]
-    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *own)
-    matrix = np.reshape(matrix, (-1, 4, 4))
-    return matrix / matrix[:, :1, :1]
-
-
-def _half_wave(name, mount, theta):
-    return optics.LinearRetarder(retardance=180 * u.deg, name=name, mount=mount, theta=theta)
+    return plate(mount=None, theta=theta + (0 if nearest is _HALF_WAVE else 45) * u.deg)

@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.system import inverse_rows
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, counted
 
 __all__ = []
 
@@ -24,8 +24,14 @@ COMPONENTS = ("IQU", "IQUV")
 
 # ---- what is fitted: linear in the beams, so that a solution for channels is one for beams -------
 
-#: What a solution may be made of.
-CHANNELS = ("intensity", "single", "double")
+#: What a solution may be made of: two channels of one or two frames, each by what it takes of both
+#: beams of these, (2 channels, 2 beams, n frames).
+CHANNELS = {
+    "intensity": np.eye(2)[:, :, None],
+    "single": np.array([[[1.0], [-1.0]], [[1.0], [1.0]]]),
+    # (X+ - X-) / 2 and (I+ + I-) / 2, the half differences and sums of the paper
+    "double": np.array([[[0.5, -0.5], [-0.5, 0.5]], [[0.5, 0.5], [0.5, 0.5]]]),
+}
 
 
 class Channels:
@@ -39,71 +45,37 @@ class Channels:
     def __init__(self, observable, n_frames, pairs=None):
         check_choice("observable", observable, CHANNELS, ParameterError)
         self.observable, self.n_frames = observable, n_frames
-        self.pairs = None
+        #: Frames of which each pair of channels is made, (n_units, 1 or 2).
+        self.units = np.arange(n_frames)[:, None]
         if observable == "double":
-            self.pairs = _checked(pairs, n_frames)
+            self.units = np.asarray([] if pairs is None else pairs, dtype=int).reshape(-1, 2)
+            if not len(self.units):
+                raise ObservationError("double differences need pairs of frames, and there is none")
+            first, last = self.units.min(), self.units.max()
+            if first < 0 or last >= n_frames:
+                raise ObservationError(
+                    f"pairs name frames {first} to {last}; there are 0 to {n_frames - 1}"
+                )
 
-    @property
-    def units(self):
-        """Frames of which each pair of channels is made, a list of tuples."""
-        if self.pairs is None:
-            return [(frame,) for frame in range(self.n_frames)]
-        return [tuple(pair) for pair in self.pairs.tolist()]
+    def combine(self, fluxes, power=1):
+        """
+        Return channels, (2, n_units, ...), of fluxes of shape (2, n_frames, ...).
 
-    def combine(self, fluxes):
-        """Return channels of fluxes of shape (2, n_frames, ...): shape (2, n_units, ...)."""
+        With a ``power`` of two, of variances, without their correlations.
+        """
         if self.observable == "intensity":
             return fluxes
-        both = np.stack([fluxes[0] - fluxes[1], fluxes[0] + fluxes[1]])
-        if self.pairs is None:
-            return both
-        plus, minus = both[:, self.pairs[:, 0]], both[:, self.pairs[:, 1]]
-        # (X+ - X-) / 2 and (I+ + I-) / 2, the half differences and sums of the paper
-        return np.stack([plus[0] - minus[0], plus[1] + minus[1]]) / 2
-
-    def one(self, fluxes, variance=False):
-        """Return the channels, or their variances, of one unit from its frames, (2, k, ...)."""
-        alone = Channels(self.observable, fluxes.shape[1], [(0, 1)])
-        return (alone.variances if variance else alone.combine)(fluxes)[:, 0]
-
-    def variances(self, variances):
-        """Return variances of channels, without their correlations; shapes as in `combine`."""
-        if self.observable == "intensity":
-            return variances
-        # var(r - l) = var(r + l) = var(r) + var(l); halving the pair divides it by four
-        total = variances.sum(axis=0)
-        if self.pairs is not None:
-            total = (total[self.pairs[:, 0]] + total[self.pairs[:, 1]]) / 4
-        return np.stack([total, total])
+        # c: channels, b: beams, u: units, k: frames of a unit
+        shares = CHANNELS[self.observable] ** power
+        return np.einsum("cbk,buk...->cu...", shares, fluxes[:, self.units])
 
     def to_beams(self, gain):
-        """
-        Return gains of the beams, (..., 2, n_frames), from those of channels, (..., 2, n_units).
-        """
-        if self.observable == "intensity":
-            return gain
-        difference, total = gain[..., 0, :], gain[..., 1, :]
-        if self.pairs is not None:
-            shape = (*difference.shape[:-1], self.n_frames)
-            spread = np.zeros((2, *shape))
-            for side, sign in ((0, 1.0), (1, -1.0)):
-                # a frame may belong to several pairs
-                np.add.at(spread[0], (..., self.pairs[:, side]), sign * difference / 2)
-                np.add.at(spread[1], (..., self.pairs[:, side]), total / 2)
-            difference, total = spread
-        # of right - left and right + left: both gains act on each beam, the first with its sign
-        return np.stack([total + difference, total - difference], axis=-2)
-
-
-def _checked(pairs, n_frames):
-    pairs = np.asarray([] if pairs is None else pairs, dtype=int).reshape(-1, 2)
-    if not len(pairs):
-        raise ObservationError("double differences need pairs of frames, and there is none")
-    if pairs.min() < 0 or pairs.max() >= n_frames:
-        raise ObservationError(
-            f"pairs name frames {pairs.min()} to {pairs.max()}; there are 0 to {n_frames - 1}"
-        )
-    return pairs
+        """Return gains of beams, (..., 2, n_frames), from those of channels, (..., 2, n_units)."""
+        spread = np.einsum("...cu,cbk->...buk", gain, CHANNELS[self.observable])
+        found = np.zeros((*gain.shape[:-1], self.n_frames))
+        # a frame may belong to several pairs
+        np.add.at(found, (..., self.units), spread)
+        return found
 
 
 # ---- the solution --------------------------------------------------------------------------------
@@ -140,10 +112,10 @@ class Estimator:
     leakage: np.ndarray
     # the poorly determined combinations in words, one per wavelength; else ""
     weak: list
-    max_condition: float = _MAX_CONDITION
-    # of the frames, (n_wavelengths, n_frames), and of the fluxes, (2, n_wavelengths, n_frames)
-    scale: np.ndarray | None = None
-    beam_weights: np.ndarray | None = None
+    # of the frames, (n_wavelengths, n_frames)
+    scale: np.ndarray
+    # what else `estimator` was called with
+    settings: dict
 
     def apply(self, fluxes):
         """
@@ -152,10 +124,6 @@ class Estimator:
         These have shape (2, n_frames, n_wavelengths, ...), the right beam first.
         """
         return np.einsum("wkbf,bfw...->kw...", self.gain, np.asarray(fluxes, dtype=float))
-
-    def flags(self):
-        """Return what is poorly determined, in words, by the index of the wavelength."""
-        return {i: words for i, words in enumerate(self.weak) if words}
 
 
 def estimator(
@@ -179,50 +147,53 @@ def estimator(
     frames, (n_frames,) or (n_wavelengths, n_frames). A combination is poorly determined if its
     singular value is smaller than the largest by more than ``max_condition``.
     """
-    # rows are (2 beams, n_wavelengths, n_frames, 4)
+    settings = {
+        "components": components,
+        "observable": observable,
+        "pairs": pairs,
+        "weights": weights,
+        "max_condition": max_condition,
+    }
     rows = np.asarray(rows, dtype=float)
     check_choice("components", components, COMPONENTS, ParameterError)
     if not max_condition > 1:
         raise ParameterError(f"max_condition = {max_condition}; it must be above 1")
     shape = rows.shape[1:3]
     channels = Channels(observable, shape[1], pairs)
-    if weights is None:
-        weights = np.ones((2, *shape))
-    else:
-        weights = np.broadcast_to(_positive("weights", weights, shape, beams=True), (2, *shape))
-    if scale is not None:
-        scale = _positive("scale", scale, shape)
-        rows = rows * scale[None, :, :, None]
-    combined = channels.combine(np.moveaxis(rows, 1, 2))
-    combined = np.moveaxis(combined, 2, 1)
+    weights = 1.0 if weights is None else _positive("weights", weights, shape, beams=True)
+    weights = np.broadcast_to(weights, (2, *shape))
+    scale = np.ones(shape) if scale is None else _positive("scale", scale, shape)
+    rows = rows * scale[..., None]
+    combined = np.moveaxis(channels.combine(np.moveaxis(rows, 1, 2)), 2, 1)
     with np.errstate(divide="ignore"):
         # a weight of zero is an infinite variance, and stays a weight of zero in its pair
-        variances = channels.variances(np.moveaxis(1 / weights, 1, 2))
-        inverse = np.moveaxis(1 / variances, 2, 1)
+        inverse = np.moveaxis(1 / channels.combine(np.moveaxis(1 / weights, 1, 2), 2), 2, 1)
     solved = [
         _solve(combined[:, w].reshape(-1, 4), inverse[:, w].ravel(), components, max_condition)
         for w in range(shape[0])
     ]
-    gains, condition, determined, weak = zip(*solved, strict=True)
-    gain = np.stack(gains).reshape(shape[0], len(components), 2, -1)
-    gain = channels.to_beams(gain)
-    found = Estimator(
+    gain, condition, determined, weak = map(np.array, zip(*solved, strict=True))
+    gain = channels.to_beams(gain.reshape(shape[0], len(components), 2, -1))
+    if not determined[:, 1:3].all(axis=1).any():
+        raise ObservationError(_undetermined(channels, labels, weak[0]))
+    leakage = np.einsum("wkbf,bwf->wk", gain, rows[..., 3])
+    if "V" in components:
+        # where V was solved for, nothing leaks; where it was given up, it does as without it
+        leakage[determined[:, 3]] = 0.0
+    return Estimator(
         components,
         gain,
         rows,
         channels,
         combined,
         inverse,
-        np.array(condition),
-        np.array(determined),
-        _leakage(gain, rows, components),
-        list(weak),
-        max_condition,
+        condition,
+        determined,
+        leakage,
+        weak.tolist(),
         scale,
-        weights,
+        settings,
     )
-    _refuse_undetermined(found, labels)
-    return found
 
 
 def _solve(rows, weights, components, max_condition):
@@ -230,50 +201,33 @@ def _solve(rows, weights, components, max_condition):
     n = len(components)
     gain, values, right, good = inverse_rows(rows[:, :n], weights, max_condition)
     condition, weak = values[0] / values[-1] if values[-1] > 0 else np.inf, right[~good]
-    words = "; ".join(_in_words(direction, components) for direction in _led(weak))
-    determined = _determined(weak, n)
+    determined = _determined(weak)
     if len(weak) and n == 4 and not determined[3]:
         # V is what most often is open: the others are solved as without it
         gain = np.zeros((n, len(rows)))
         gain[:3], _, right, good = inverse_rows(rows[:, :3], weights, max_condition)
-        determined = np.append(_determined(right[~good], 3), False)
+        determined = np.append(_determined(right[~good]), False)
     gain[~determined] = np.nan
-    return gain, condition, determined, words
+    return gain, condition, determined, _in_words(weak, components)
 
 
-def _determined(weak, n):
+def _determined(weak):
     # a component that leans on an open direction is open itself
-    return np.abs(weak).max(axis=0, initial=0.0) < _SHARE if len(weak) else np.ones(n, dtype=bool)
+    return np.abs(weak).max(axis=0, initial=0.0) < _SHARE
 
 
-def _led(weak):
-    """Return a basis of the same directions in which one component after the other leads."""
+def _in_words(weak, components):
+    """Return the same directions in words, in each of which another component leads."""
     # singular vectors of equal values are any basis, and each has any sign: their projector is one
-    projector, basis = weak.T @ weak, []
+    projector, words = weak.T @ weak, []
     for _ in weak:
         lead = ranked(np.diag(projector))[0]
-        basis.append(projector[lead] / np.sqrt(projector[lead, lead]))
-        projector = projector - np.outer(basis[-1], basis[-1])
-    return basis
-
-
-def _in_words(direction, components):
-    parts = [
-        f"{value:+.2f} {name}"
-        for name, value in zip(components, direction, strict=True)
-        if abs(value) >= 0.005
-    ]
-    return " ".join(parts).removeprefix("+")
-
-
-def _leakage(gain, rows, components):
-    if "V" in components:
-        leakage = np.zeros(gain.shape[:2])
-        # where V was solved for, nothing leaks; where it was given up, it does as without it
-        assumed = np.isnan(gain).any(axis=(2, 3))[:, 3]
-        leakage[assumed] = np.einsum("wkbf,bwf->wk", gain, rows[..., 3])[assumed]
-        return leakage
-    return np.einsum("wkbf,bwf->wk", gain, rows[..., 3])
+        direction = projector[lead] / np.sqrt(projector[lead, lead])
+        projector = projector - np.outer(direction, direction)
+        named = zip(components, direction, strict=True)
+        parts = [f"{value:+.2f} {name}" for name, value in named if abs(value) >= 0.005]
+        words.append(" ".join(parts).removeprefix("+"))
+    return "; ".join(words)
 
 
 def _positive(name, value, shape, beams=False):
@@ -289,21 +243,18 @@ def _positive(name, value, shape, beams=False):
     return np.broadcast_to(value, shape if value.ndim < 3 else value.shape)
 
 
-def _refuse_undetermined(found, labels):
-    linear = found.determined[:, 1:3]
-    if linear.all(axis=1).any():
-        return
-    count = found.rows.shape[2]
-    words = f"{count} frame{'s' if count > 1 else ''}"
+def _undetermined(channels, labels, weak):
+    """Return in words that the frames do not determine Q and U."""
+    count = channels.n_frames
+    words = counted(count, "frame")
     if labels is not None:
         shown = ", ".join(map(str, list(labels)[:_MAX_NAMED]))
         words += f" ({shown}{', ...' if count > _MAX_NAMED else ''})"
-    if found.channels.pairs is not None:
-        words += f" in {len(found.channels.pairs)} pairs"
-    raise ObservationError(
-        f"Q and U are not determined at any wavelength by {words}: poorly determined is "
-        f"{found.weak[0]}; frames at half-wave-plate angles such as 0, 22.5, 45 and 67.5 deg are "
-        "needed"
+    if channels.observable == "double":
+        words += f" in {len(channels.units)} pairs"
+    return (
+        f"Q and U are not determined at any wavelength by {words}: poorly determined is {weak}; "
+        "frames at half-wave-plate angles such as 0, 22.5, 45 and 67.5 deg are needed"
     )
 
 

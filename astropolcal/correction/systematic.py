@@ -120,12 +120,17 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
 
     For ``open_directions`` see `correct`.
     """
-    _choice(open_directions)
+    known = open_directions in ("infinite", "ignore")
+    if not known and (isinstance(open_directions, str) or not 0 <= open_directions < np.inf):
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
+            "from zero"
+        )
     n = len(solution.components)
     gain = np.nan_to_num(solution.gain)
     shape = (len(gain), n, n)
     light = _light(mode, n)
-    changes = model.changes(gain, n, _brightness(solution)) * light[:, None]
+    changes = model.changes(gain, n, solution.scale[..., None]) * light[:, None]
     flat = changes.reshape(-1, model.free.size)
     covariance = full_covariance(model.calibration)
     spread = covariance._spread(flat)
@@ -141,11 +146,10 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
             steps = steps.reshape(-1, flat.shape[1])
             along = float(open_directions) * (flat * axes.steps) @ steps.T
             moved = np.concatenate([moved, along], axis=1)
-    factor = np.concatenate([moved.T.reshape(-1, *shape), _model_error(model, n) * light])
-    return Systematic(factor, is_open, "linear", model.held)
+    return _with_model_error(moved.T.reshape(-1, *shape), is_open, "linear", model, light)
 
 
-def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stokes"):
+def sampled_systematic(model, solution, *, n_samples, seed=None, mode="stokes"):
     """
     Return the systematic errors by solving again for samples of the parameters.
 
@@ -157,24 +161,17 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
     rng = np.random.default_rng(check_seed(seed))
     n = len(solution.components)
-    settings = {
-        "components": solution.components,
-        "observable": solution.channels.observable,
-        "pairs": solution.channels.pairs,
-        "max_condition": solution.max_condition,
-    }
-    bright = _brightness(solution)
     found = np.empty((n_samples, len(solution.gain), n, n))
     for i, vector in enumerate(_draws(model, n_samples, rng)):
-        rows = model.rows(vector) * bright
+        rows = model.rows(vector) * solution.scale[..., None]
         if mode == "ip":
             rows = np.concatenate([rows[..., :1], solution.rows[..., 1:]], axis=-1)
-        gain = estimator(rows, weights=solution.beam_weights, **settings).gain
+        gain = estimator(rows, **solution.settings).gain
         found[i] = np.einsum("wkbf,bwfs->wks", np.nan_to_num(gain), solution.rows[..., :n])
     # so that the sum over samples of the products is the unbiased covariance
     factor = (found - found.mean(axis=0)) / np.sqrt(n_samples - 1)
-    factor = np.concatenate([factor, _model_error(model, n) * _light(mode, n)])
-    return Systematic(factor, np.zeros(found.shape[1:], dtype=bool), "sampled", model.held)
+    is_open = np.zeros(found.shape[1:], dtype=bool)
+    return _with_model_error(factor, is_open, "sampled", model, _light(mode, n))
 
 
 def _light(mode, n):
@@ -182,18 +179,14 @@ def _light(mode, n):
     return (np.arange(n) < (1 if mode == "ip" else n)).astype(float)
 
 
-def _model_error(model, n):
-    return model_error(model.calibration.fit, model.wavelength.to_value(u.um), n)
-
-
-def _brightness(solution):
-    """Return what the rows of the solution were scaled with, (1, n_wavelengths, n_frames, 1)."""
-    return 1.0 if solution.scale is None else solution.scale[None, :, :, None]
+def _with_model_error(factor, is_open, method, model, light):
+    lacking = model_error(model.calibration.fit, model.wavelength.to_value(u.um), len(light))
+    return Systematic(np.concatenate([factor, lacking * light]), is_open, method, model.held)
 
 
 def _draws(model, count, rng):
     """Yield values of all free parameters in canonical units."""
-    start, factors = model.start, model.free.factors()
+    start, factors = model.free.start(), model.free.factors()
     posterior = model.calibration.posterior
     if posterior is not None and set(model.free.names) <= set(posterior.names):
         samples = posterior.samples()
@@ -201,21 +194,8 @@ def _draws(model, count, rng):
         for row in samples[rng.integers(len(samples), size=count)]:
             yield row[columns] * factors
         return
-    covariance = full_covariance(model.calibration)
-    axes = covariance._axes()
+    axes = full_covariance(model.calibration)._axes()
     # one row a direction of the covariance, one sigma long, in declared units
     known = axes.known * axes.sigmas[:, None] * axes.steps
     for _ in range(count):
         yield start + rng.standard_normal(len(known)) @ known * factors
-
-
-def _choice(open_directions):
-    if isinstance(open_directions, str):
-        good = open_directions in ("infinite", "ignore")
-    else:
-        good = np.isfinite(open_directions) and open_directions >= 0
-    if not good:
-        raise ParameterError(
-            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
-            "from zero"
-        )

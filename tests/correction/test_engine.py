@@ -10,7 +10,6 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from astropolcal.correction import ScienceFrames, correct
-from astropolcal.correction.correcting import run_blocks
 from astropolcal.correction.frames import frame_positions
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
@@ -68,13 +67,16 @@ def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
         correct(sky, frames, cluster="tcp://127.0.0.1:1")
 
 
-def test_an_error_in_a_block_comes_out():
-    def fail(start, stop):
-        raise ObservationError(f"slice {start}")
+def test_an_error_in_a_block_comes_out(star, sky, charis):
+    class Broken(ArraySource):
+        def fluxes(self, beam, frames, wavelengths):
+            raise ObservationError(f"slice {wavelengths.start}")
 
+    source = Broken(star.right, star.left)
+    frames = ScienceFrames(source, charis.wavelength, star.positions)
     for workers in (None, 2):
         with pytest.raises(ObservationError, match="slice"):
-            run_blocks(fail, (1, 4), workers=workers)
+            correct(sky, frames, brightness="given", workers=workers)
 
 
 @pytest.mark.slow

@@ -162,9 +162,9 @@ def test_centres_may_move_from_frame_to_frame(cameras):
 def test_files_are_turned_about_their_centre(cameras):
     values, _, (right, _) = cameras
     angles = [20, 90] * u.deg
-    source = CubeFiles(right, [(7, 6), (6, 5)], 5, extension=0, position_angle=angles, order=1)
+    source = CubeFiles(right, [(7, 6), (6, 5)], 5, extension=0, position_angle=angles)
     for i in range(2):
-        expected = derotate(values[0, i], angles[i], centre=(7, 6), size=5, order=1)
+        expected = derotate(values[0, i], angles[i], centre=(7, 6), size=5)
         np.testing.assert_array_equal(source.fluxes(0, slice(i, i + 1), ALL)[0], expected)
 
 

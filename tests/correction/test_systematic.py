@@ -47,7 +47,7 @@ def test_derivatives_of_the_solution_are_exact(model, solution, linear):
     flux = np.einsum("bwfs,s->bfw", model.rows()[..., :3], STOKES)
     for r in (0, len(axes.known) // 2):
         step = axes.known[r] * axes.sigmas[r] * axes.steps * model.free.factors() * 1e-2
-        ends = [estimator(model.rows(model.start + s * step)).apply(flux) for s in (1, -1)]
+        ends = [estimator(model.rows(model.free.start() + s * step)).apply(flux) for s in (1, -1)]
         numeric = (ends[0] - ends[1]) / 2e-2
         predicted = np.einsum("wac,c->aw", linear.factor[r], STOKES)
         np.testing.assert_allclose(predicted, numeric, atol=1e-6 * np.abs(predicted).max() + 1e-12)

@@ -206,7 +206,7 @@ def _digest(cal):
 def _content(node):
     """Return what the node of a calibration says, whatever type its numbers have."""
     from astropolcal.converters.calibration import _DERIVED
-    from astropolcal.converters.nodes import _spelled, node_from_optic
+    from astropolcal.converters.nodes import _spelled
 
     def plain(value):
         if isinstance(value, dict) and set(value) == {"float"}:
@@ -217,7 +217,7 @@ def _content(node):
             return float(value) if abs(value) < 2**1000 and float(value) == value else value
         return [plain(item) for item in value] if isinstance(value, list) else value
 
-    found = plain(_spelled({k: v for k, v in node.items() if k not in _DERIVED}, node_from_optic))
+    found = plain(_spelled({k: v for k, v in node.items() if k not in _DERIVED}))
     # nothing in a list is as good as no list
     found = {k: v for k, v in found.items() if k != "priors" or v}
     for key in ("near_null", "branches"):
@@ -782,8 +782,7 @@ class Product(Reader):
             warnings.simplefilter("ignore")
             _check_product(found)
             copy = path.with_name("copy.fits")
-            # what the maps hold has been asked for already
-            found.write(copy, overwrite=True, maps=False)
+            found.write(copy, overwrite=True)
             again = self.read(copy)
             copy.unlink()
         np.testing.assert_array_equal(again.stokes, found.stokes)
