@@ -9,6 +9,7 @@ errors are not independent. `restart` refits what changed since a calibration, a
 
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -24,7 +25,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
-from astropolcal.pipeline.library import Entry, Library
+from astropolcal.pipeline.library import Library
 from astropolcal.words import p_words
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
@@ -33,10 +34,12 @@ __all__ = ["Change", "changes", "parameter_history", "restart"]
 _RANK = 1e-12
 # degrees by which a retardance, or an orientation, is the same again
 _PERIODS = {"retardance": 360.0, "theta": 180.0}
+# of a history
+_COLUMNS = ("date", "calibration", "parameter", "wavelength", "value", "std", "unit", "fixed")
 
 
 def named_by_date(calibrations):
-    """Return (name, calibration) by start of validity."""
+    """Return (name, calibration) by start of validity; of such pairs the names stay."""
     if isinstance(calibrations, Library):
         if calibrations.problems:
             path, reason = next(iter(calibrations.problems.items()))
@@ -44,17 +47,13 @@ def named_by_date(calibrations):
         calibrations = calibrations.entries
     named = []
     for i, item in enumerate(calibrations):
-        inside = getattr(item, "calibration", item)
-        name = item.name if isinstance(item, Entry) else _label(item, inside, i)
-        named.append((name, inside))
+        if isinstance(item, tuple):
+            named.append(item)
+            continue
+        inside, path = getattr(item, "calibration", item), getattr(item, "path", None)
+        name = ", ".join(r.name for r in inside.datasets) or f"calibration {i}"
+        named.append((name if path is None else Path(path).name, inside))
     return sorted(named, key=lambda pair: validity_of(pair[1]).valid_from or "")
-
-
-def _label(item, calibration, number):
-    path = getattr(item, "path", None)
-    if path is not None:
-        return path.name
-    return ", ".join(r.name for r in calibration.datasets) or f"calibration {number}"
 
 
 def parameter_history(calibrations, parameters=None):
@@ -96,23 +95,34 @@ def parameter_history(calibrations, parameters=None):
     >>> table["date"].iso[0][:10], len(table)
     ('2025-03-01', 2)
     """
-    named = named_by_date(calibrations)
     rows = []
-    for name, calibration in named:
+    for name, calibration in named_by_date(calibrations):
+        date = validity_of(calibration).valid_from
         for key, entry in calibration.parameter_values().items():
-            if _wanted(key, entry, parameters):
-                rows += _rows(name, calibration, key, entry)
-    found = {row["parameter"] for row in rows}
+            held = entry["tied"] is not None
+            if held if parameters is None else not _belongs(key, parameters):
+                continue
+            grid = calibration.wavelength.to_value("nm") if entry["value"].ndim else [np.nan]
+            unit, fixed = str(entry["unit"] or ""), entry["fixed"] or held
+            numbers = zip(grid, *(np.ravel(entry[k]) for k in ("value", "std")), strict=True)
+            rows += [(date, name, key, *number, unit, fixed) for number in numbers]
+    found = {row[2] for row in rows}
     for key in parameters or ():
         if not any(_belongs(name, [key]) for name in found):
             raise ParameterError(f"no calibration has a parameter {key!r}")
     if parameters is None:
-        free = {row["parameter"] for row in rows if not row["fixed"]}
-        rows = [row for row in rows if row["parameter"] in free]
-    table, first = _as_table(rows), {}
+        free = {row[2] for row in rows if not row[-1]}
+        rows = [row for row in rows if row[2] in free]
+    dates, *others = list(zip(*rows, strict=True)) or [[]] * len(_COLUMNS)
+    unknown = np.array([date is None for date in dates], dtype=bool)
+    time = Time([date or "2000-01-01" for date in dates], scale="utc") if rows else []
+    if unknown.any():
+        time[unknown] = np.ma.masked
+    table, first = QTable([time, *map(list, others)], names=_COLUMNS), {}
     for row in table:
-        key = row["parameter"], str(row["wavelength"].value)
+        key = row["parameter"], str(row["wavelength"])
         row["value"] = _in_turn(row["value"], first.setdefault(key, row["value"]), key[0])
+    table["wavelength"] = np.asarray(table["wavelength"], dtype=float) * u.nm
     return table
 
 
@@ -120,41 +130,6 @@ def _in_turn(value, first, name):
     """Return an angle in degree in the turn that is nearest to a first one, anything else as is."""
     period = _PERIODS.get(name.partition("[")[0].rpartition(".")[2])
     return value if period is None else value - period * np.round((value - first) / period)
-
-
-def _wanted(key, entry, parameters):
-    if parameters is None:
-        return entry["tied"] is None
-    return _belongs(key, parameters)
-
-
-def _rows(name, calibration, key, entry):
-    several = entry["value"].ndim > 0
-    grid = calibration.wavelength.to_value("nm") if several else [np.nan]
-    common = {
-        "date": validity_of(calibration).valid_from,
-        "calibration": name,
-        "parameter": key,
-        "unit": str(entry["unit"] or ""),
-        "fixed": entry["fixed"] or entry["tied"] is not None,
-    }
-    columns = zip(grid, *(np.ravel(entry[k]) for k in ("value", "std")), strict=True)
-    return [common | {"wavelength": w, "value": v, "std": s} for w, v, s in columns]
-
-
-def _as_table(rows):
-    columns = {key: [row[key] for row in rows] for key in rows[0]} if rows else {}
-    table = QTable()
-    dates = columns.pop("date", [])
-    time = Time([text or "2000-01-01" for text in dates], scale="utc") if dates else []
-    unknown = np.array([text is None for text in dates], dtype=bool)
-    if unknown.any():
-        time[unknown] = np.ma.masked
-    table["date"] = time
-    for key in ("calibration", "parameter", "wavelength", "value", "std", "unit", "fixed"):
-        table[key] = columns.get(key, [])
-    table["wavelength"] = np.asarray(table["wavelength"], dtype=float) * u.nm
-    return table
 
 
 # ---- has something changed? --------------------------------------------------------------
@@ -244,7 +219,7 @@ def significance(calibrations, parameters=None):
     if len(named) < 2:
         raise FitError(f"{len(named)} calibration: at least two are needed to compare")
     found = compared(named, parameters)
-    chi2, rank = _chi_square(found.values, found.covariances)
+    chi2, rank = found.chi2, found.deviations.shape[1]
     dof = rank * (len(named) - 1)
     p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
     labels = [name for name, _ in named]
@@ -257,26 +232,40 @@ class Compared:
 
     names: list
     left_out: list
-    #: Orthonormal directions, shape (n, n_names), of parameters in units of ``steps``.
-    basis: np.ndarray
-    steps: np.ndarray
-    #: Of each calibration, along these directions.
-    values: list
-    covariances: list
+    #: Number of directions that are open in one of the calibrations.
+    n_open: int
+    #: What the directions take of each parameter in its unit, (n_directions, n_names).
+    slopes: np.ndarray
+    #: Of each calibration from the common value, (n, n_directions), and their information.
+    deviations: np.ndarray
+    weights: np.ndarray
 
     @property
-    def n_open(self):
-        """Number of directions that are open in one of the calibrations."""
-        return len(self.names) - len(self.basis)
+    def chi2(self):
+        """Of one common value for all."""
+        return float(np.einsum("ni,nij,nj->", self.deviations, self.weights, self.deviations))
 
 
 def compared(named, parameters=None):
     """Return what calibrations of independent data say of the same parameters, `Compared`."""
-    _check_independent(named)
+    seen = {}
+    for i, (name, calibration) in enumerate(named):
+        for record in calibration.datasets:
+            other = seen.setdefault(record.content_hash, i)
+            if other != i:
+                raise FitError(
+                    f"{named[other][0]} and {name} were both made from {record.name}: their "
+                    "errors are not independent, so that a change cannot be judged"
+                )
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]
-    names, left_out = _with_errors(named, spaces, axes, names)
+    # what has no error in one of them
+    stuck = {name for _, calibration in named for name in calibration.at_bound}
+    for space, own in zip(spaces, axes, strict=True):
+        stuck |= {space.names[i] for i in np.flatnonzero(np.abs(own.blind).any(axis=0))}
+    left_out = [name for name in names if name in stuck]
+    names = [name for name in names if name not in stuck]
     places = [[space.names.index(name) for name in names] for space in spaces]
     # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
     # open in any of them
@@ -291,26 +280,27 @@ def compared(named, parameters=None):
     known = [
         (a.known * a.sigmas[:, None])[:, p] @ basis.T for a, p in zip(axes, places, strict=True)
     ]
-    return Compared(names, left_out, basis, steps, values, [k.T @ k for k in known])
+    kept, deviations, weights = about_the_mean(values, [k.T @ k for k in known])
+    slopes = kept.T @ basis / steps
+    return Compared(names, left_out, len(names) - len(basis), slopes, deviations, weights)
 
 
-def _check_independent(named):
-    seen = {}
-    for i, (name, calibration) in enumerate(named):
-        for record in calibration.datasets:
-            other = seen.setdefault(record.content_hash, i)
-            if other != i:
-                raise FitError(
-                    f"{named[other][0]} and {name} were both made from {record.name}: their "
-                    "errors are not independent, so that a change cannot be judged"
-                )
+def about_the_mean(values, covariances):
+    """Return the directions that have an error, (n_values, k), deviations in them, and weights.
+
+    The deviations are those from the common value that fits all of them best.
+    """
+    variance, vectors = np.linalg.eigh(sum(covariances))
+    kept = vectors[:, variance > _RANK * variance.max(initial=0.0)]
+    # each calibration's own covariance, in the directions that are kept
+    weights = np.array([np.linalg.inv(kept.T @ c @ kept) for c in covariances])
+    points = np.array([kept.T @ v for v in values])
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
+    return kept, points - mean, weights
 
 
 def _common(named, spaces, parameters):
     """Return the elements to compare, in the order of the first calibration."""
-    grids = [calibration.wavelength.to_value("nm") for _, calibration in named]
-    first = grids[0]
-    same = all(g.shape == first.shape and np.allclose(g, first, SAME_WAVELENGTH) for g in grids)
     names = [n for n in spaces[0].names if all(n in space.names for space in spaces)]
     if parameters is not None:
         for key in parameters:
@@ -318,6 +308,8 @@ def _common(named, spaces, parameters):
                 if not any(_belongs(n, [key]) for n in space.names):
                     raise ParameterError(f"{name}: no free parameter {key!r}")
         names = [n for n in names if _belongs(n, parameters)]
+    first, *grids = (calibration.wavelength.to_value("nm") for _, calibration in named)
+    same = all(g.shape == first.shape and np.allclose(g, first, SAME_WAVELENGTH) for g in grids)
     if not same and any("[" in n for n in names):
         raise ParameterError(
             f"{named[0][0]} and the others are on different wavelengths; compare parameters "
@@ -329,14 +321,6 @@ def _common(named, spaces, parameters):
 def _belongs(element, parameters):
     stem = element.partition("[")[0]
     return stem in parameters or stem.partition(".")[0] in parameters
-
-
-def _with_errors(named, spaces, axes, names):
-    """Return the elements that have an error in all calibrations, and the others."""
-    stuck = {name for _, calibration in named for name in calibration.at_bound}
-    for space, own in zip(spaces, axes, strict=True):
-        stuck |= {space.names[i] for i in np.flatnonzero(np.abs(own.blind).any(axis=0))}
-    return [n for n in names if n not in stuck], [n for n in names if n in stuck]
 
 
 def _values(calibration, names):
@@ -357,23 +341,6 @@ def _determined(opens, size):
     _, singular, vectors = np.linalg.svd(rows, full_matrices=True)
     rank = int(np.sum(singular > 1e-5 * max(singular.max(initial=0.0), 1.0)))
     return vectors[rank:]
-
-
-def _chi_square(values, covariances):
-    """Return chi-square of one common value, and the number of directions compared."""
-    total = sum(covariances)
-    variance, vectors = np.linalg.eigh(total) if total.size else (np.zeros(0), total)
-    kept = variance > _RANK * variance.max(initial=0.0)
-    vectors = vectors[:, kept]
-    if not kept.any():
-        return 0.0, 0
-    # each calibration's own covariance, in the directions that are kept
-    weights = [np.linalg.inv(vectors.T @ c @ vectors) for c in covariances]
-    points = [vectors.T @ v for v in values]
-    # the common value that fits all of them best; chi-square is what is left about it
-    mean = np.linalg.solve(sum(weights), sum(w @ x for w, x in zip(weights, points, strict=True)))
-    chi2 = sum((x - mean) @ w @ (x - mean) for w, x in zip(weights, points, strict=True))
-    return float(chi2), int(kept.sum())
 
 
 def changes(calibrations, parameters=None):
@@ -416,37 +383,17 @@ def changes(calibrations, parameters=None):
     ['calibration_polarizer', 'hwp', 'derotator', 'wollaston']
     """
     named = named_by_date(calibrations)
+    numbers = ("chi2", "dof", "p_value", "sigma", "n_open")
     rows = []
-    for first, second in pairwise(named):
-        pair = [_Named(*first), _Named(*second)]
-        for what in parameters or optics_of((first, second)):
+    for pair in pairwise(named):
+        for what in parameters or optics_of(pair):
             found = significance(pair, [what])
-            rows.append(
-                {
-                    "before": first[0],
-                    "after": second[0],
-                    "what": what,
-                    **{k: getattr(found, k) for k in ("chi2", "dof", "p_value", "sigma", "n_open")},
-                    "left_out": len(found.left_out),
-                }
-            )
+            row = {"before": pair[0][0], "after": pair[1][0], "what": what}
+            row |= {key: getattr(found, key) for key in numbers}
+            rows.append(row | {"left_out": len(found.left_out)})
     if not rows:
         raise FitError(f"{len(named)} calibration: at least two are needed to compare")
     return Table(rows=rows)
-
-
-@dataclass
-class _Named:
-    """A calibration under the name that it has already."""
-
-    label: str
-    calibration: object
-
-    @property
-    def path(self):
-        from types import SimpleNamespace
-
-        return SimpleNamespace(name=self.label)
 
 
 def optics_of(named):
@@ -459,7 +406,7 @@ def optics_of(named):
 # ---- refit what changed since a calibration, and hold the rest ----
 
 
-def restart(calibration, observations, free, *, chain=None, positions=None, **options):
+def restart(calibration, observations, free, *, chain=None, **options):
     """
     Refit only what changed: everything else keeps the values of a calibration.
 
@@ -476,11 +423,9 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     chain : sequence of chains, optional
         One per dataset, whose optics take the values of those of the same name; by default as the
         instrument makes them, or the first of the calibration.
-    positions : sequence of dict, optional
-        As for ``calibrate``; by default as the instrument reads them.
     **options
-        Passed to ``calibrate``; by default the old observable, and no search of
-        other mirror branches.
+        Passed to ``calibrate``; by default the old observable, positions as the instrument reads
+        them, and no search of other mirror branches.
 
     Returns
     -------
@@ -515,13 +460,20 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     instrument = instrument_of(old)
     chains = _new_chains(old, datasets, instrument, chain)
     _hold(old, chains, free)
-    if positions is None and instrument is not None:
-        positions = [instrument.positions(*pair) for pair in zip(datasets, chains, strict=True)]
     # another mirror branch would look like a change of the instrument
     start = {"observable": old.settings["observable"], "search": False}
-    options = start | {"wavelength": old.wavelength} | options
-    fixed = {"ties": _ties(old, chains), "instrument": old.instrument}
-    new = calibrate(chains, datasets, positions=positions, **(fixed | options))
+    start |= {"wavelength": old.wavelength, "instrument": old.instrument}
+    if instrument is not None:
+        pairs = zip(datasets, chains, strict=True)
+        start["positions"] = [instrument.positions(*pair) for pair in pairs]
+    table = parameter_table(chains)
+    # those of which the leading parameter is free
+    start["ties"] = {
+        name: tie
+        for name, tie in old.ties.items()
+        if name in table and tie.source in table and not table[tie.source][0].fixed
+    }
+    new = calibrate(chains, datasets, **(start | options))
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     return new
 
@@ -531,7 +483,11 @@ def _new_chains(old, datasets, instrument, chain):
     if chain is not None:
         chains = list(chain) if isinstance(chain, (list, tuple)) else [chain]
     elif instrument is not None:
-        chains = [_made(instrument, table, old.wavelength) for table in datasets]
+        chains = []
+        for table in datasets:
+            instrument.check(table)
+            options = {"wavelength": old.wavelength} | instrument.particulars(table)
+            chains.append(instrument.chain(*instrument.setup(table), **options))
     else:
         chains = [old.chains[0]] * len(datasets)
     if len(chains) != len(datasets):
@@ -539,13 +495,6 @@ def _new_chains(old, datasets, instrument, chain):
     # reversed, so that of optics in several chains the first dataset's is taken
     known = {leaf.name: leaf for chain in reversed(old.chains) for leaf in leaves(chain)}
     return [join(known.get(leaf.name, leaf).copy() for leaf in leaves(c)) for c in chains]
-
-
-def _made(instrument, table, wavelength):
-    instrument.check(table)
-    source, optics_in = instrument.setup(table)
-    own = instrument.particulars(table)
-    return instrument.chain(source, optics_in, wavelength=wavelength, **own)
 
 
 def _hold(old, chains, free):
@@ -564,17 +513,7 @@ def _hold(old, chains, free):
         if text not in found:
             names = sorted({leaf.name for chain in chains for leaf in leaves(chain)})
             raise ParameterError(f"free: no {text!r} in the chains; optics are {', '.join(names)}")
-        were_free = [parameter for parameter, fixed in found[text] if not fixed]
-        whole = "." in text or not were_free
-        for parameter, _ in found[text]:
-            parameter.fixed = not (whole or any(parameter is p for p in were_free))
-
-
-def _ties(old, chains):
-    """Return the ties of which the leading parameter is free."""
-    table = parameter_table(chains)
-    return {
-        name: tie
-        for name, tie in old.ties.items()
-        if name in table and tie.source in table and not table[tie.source][0].fixed
-    }
+        # all of an optic of which nothing was free
+        all_fixed = all(fixed for _, fixed in found[text])
+        for parameter, fixed in found[text]:
+            parameter.fixed = fixed and "." not in text and not all_fixed

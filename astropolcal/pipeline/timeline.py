@@ -25,6 +25,7 @@ from astropolcal.calibration.fit.evidence import (
     law_of,
     log_evidence,
 )
+from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.pipeline.history import compared, named_by_date, optics_of
 
@@ -34,8 +35,6 @@ __all__ = ["courses"]
 _PARTITION = 0.7
 # a change between two runs is thought this probable beforehand
 _CHANGE = 0.05
-# a direction less certain than this share of the most certain one tells nothing
-_RANK = 1e-12
 
 
 def courses(calibrations, parameters=None, *, events=()):
@@ -93,17 +92,6 @@ def courses(calibrations, parameters=None, *, events=()):
     named = named_by_date(calibrations)
     if len(named) < 3:
         raise ParameterError(f"{len(named)} calibrations: at least three are needed for a course")
-    dates = _dates(named)
-    priors = chances_of(dates, events, _CHANGE)
-    rows = [_course(named, what, dates, priors) for what in parameters or optics_of(named)]
-    table = Table(rows=[row for row in rows if row is not None])
-    table.meta |= {"calibrations": [name for name, _ in named], "dates": dates.isot.tolist()}
-    return table
-
-
-def _dates(named):
-    from astropolcal.calibration.result.calibration import validity_of
-
     told = [validity_of(calibration).valid_from for _, calibration in named]
     for (name, _), date in zip(named, told, strict=True):
         if date is None:
@@ -111,131 +99,106 @@ def _dates(named):
     for (one, first), (other, second) in pairwise(zip((n for n, _ in named), told, strict=True)):
         if first == second:
             raise ParameterError(f"{one} and {other} are both of {first}: neither comes first")
-    return Time(told, scale="tai")
+    dates = Time(told, scale="tai")
+    priors = chances_of(dates, events, _CHANGE)
+    rows = []
+    for what in parameters or optics_of(named):
+        found = compared(named, [what])
+        if not found.slopes.size:
+            # nothing of it is determined
+            continue
+        evidence, change = _weighed(found, dates.mjd, priors)
+        chance = np.exp(evidence - np.logaddexp.reduce(evidence))
+        row = {"what": what, "course": COURSES[int(np.argmax(chance))]}
+        row |= dict(zip(COURSES, chance, strict=True))
+        rows.append(row | {"change": change, "n_open": found.n_open})
+    table = Table(rows=rows)
+    table.meta |= {"calibrations": [name for name, _ in named], "dates": dates.isot.tolist()}
+    return table
 
 
-def _course(named, what, dates, priors):
-    """Return the row of an optic, None where nothing of it is determined."""
-    found = compared(named, [what])
-    series = Series.of(found, dates.mjd)
-    if series is None:
-        return None
-    evidence, change = series.weigh(priors)
-    chance = np.exp(evidence - np.logaddexp.reduce(evidence))
-    row = {"what": what, "course": COURSES[int(np.argmax(chance))]}
-    row |= dict(zip(COURSES, chance, strict=True))
-    return row | {"change": change, "n_open": found.n_open}
+def _weighed(found, mjd, priors):
+    """Return the log evidence of each course, and the probability of a change in each gap."""
+    laws = []
+    for count in LAWS:
+        # orthonormal, and without what the directions do not know
+        left, size, _ = np.linalg.svd(
+            found.slopes @ law_of(found.names, count), full_matrices=False
+        )
+        laws.append(left[:, size > 1e-6 * size.max(initial=1e-300)])
+    # a law that spans the same as one before is the same
+    laws = {law.shape[1]: law for law in reversed(laws) if law.shape[1]}.values()
+    # date from -1 to 1
+    time = 2 * (mjd - mjd[0]) / np.ptp(mjd) - 1
+    line = np.stack([np.ones(len(mjd)), time], axis=1)
+    parts, changes = [], []
+    for law in laws:
+        gram = law.T @ found.weights @ law
+        target = np.einsum("ik,nij,nj->nk", law, found.weights, found.deviations)
+        # unit information of one run: the g-prior then is a multiple of unity
+        root = np.linalg.inv(np.linalg.cholesky(gram.mean(axis=0)))
+        gram, target = root @ gram @ root.T, target @ root.T
+        k = law.shape[1]
+        # deviations in proportion to functions of the run
+        both = np.einsum("na,nb,nij->aibj", line, line, gram).reshape(2 * k, 2 * k)
+        along = np.einsum("na,ni->ai", line, target).ravel()
+        for size in SIZES:
+            one, change = _partitions(gram, target, size, priors)
+            scatter = log_evidence(gram, target, size).sum()
+            walk = _walk(gram, target, size, mjd)
+            parts.append([*one, log_evidence(both, along, size), walk, scatter])
+            changes.append(change)
+    parts, n = np.array(parts), len(parts)
+    share = np.log([_PARTITION, _PARTITION, *[(1 - _PARTITION) / 3] * 3])
+    evidence = np.logaddexp.reduce(parts, axis=0) - np.log(n) + share
+    # a step is a step only as far as neither a drift nor a walk explains it
+    weight = np.exp(parts[:, 1] - np.log(n) + share[1] - np.logaddexp.reduce(evidence))
+    return evidence, np.asarray(changes).T @ weight
 
 
-class Series:
-    """Deviations of the runs from a common value, and their information, for some laws."""
+def _partitions(gram, target, size, priors):
+    """
+    Return the log evidence of one stretch, and of more, and the chance of a change in each gap.
 
-    def __init__(self, deviations, weights, laws, mjd):
-        self.deviations, self.weights, self.laws = deviations, weights, laws
-        span = np.ptp(mjd)
-        #: Date from -1 to 1, and time since the run before in units of the mean gap.
-        self.time = 2 * (mjd - mjd[0]) / span - 1
-        self.steps = np.diff(mjd, prepend=mjd[0]) * (len(mjd) - 1) / span
-
-    @classmethod
-    def of(cls, found, mjd):
-        """Return the series of what was compared, None where there is nothing."""
-        total = sum(found.covariances)
-        if not total.size:
-            return None
-        variance, vectors = np.linalg.eigh(total)
-        kept = vectors[:, variance > _RANK * variance.max()]
-        if not kept.size:
-            return None
-        weights = np.array([np.linalg.inv(kept.T @ c @ kept) for c in found.covariances])
-        points = np.array([kept.T @ v for v in found.values])
-        middle = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
-        laws = []
-        for count in LAWS:
-            law = kept.T @ found.basis @ (law_of(found.names, count) / found.steps[:, None])
-            # orthonormal, and without what the kept directions do not know
-            left, size, _ = np.linalg.svd(law, full_matrices=False)
-            laws.append(left[:, size > 1e-6 * size.max(initial=1e-300)])
-        # a law that spans the same as one before is the same
-        spans = {law.shape[1]: law for law in reversed(laws) if law.shape[1]}
-        return cls(points - middle, weights, list(spans.values()), mjd)
-
-    def weigh(self, priors):
-        """Return the log evidence of each course, and the probability of a change in each gap."""
-        parts, changes = [], []
-        for law in self.laws:
-            gram = law.T @ self.weights @ law
-            target = np.einsum("ik,nij,nj->nk", law, self.weights, self.deviations)
-            # unit information of one run: the g-prior then is a multiple of unity
-            root = np.linalg.inv(np.linalg.cholesky(gram.mean(axis=0)))
-            gram, target = root @ gram @ root.T, target @ root.T
-            for size in SIZES:
-                one, change = self._partitions(gram, target, size, priors)
-                line = np.stack([np.ones(len(gram)), self.time], axis=1)
-                drift = _regressed(gram, target, line, size)
-                runs = zip(gram, target, strict=True)
-                scatter = sum(log_evidence(*run, size) for run in runs)
-                parts.append([*one, drift, self._walk(gram, target, size), scatter])
-                changes.append(change)
-        parts, n = np.array(parts), len(parts)
-        share = np.log([1.0, 1.0, *[(1 - _PARTITION) / 3] * 3])
-        share[:2] = np.log(_PARTITION)
-        evidence = np.logaddexp.reduce(parts, axis=0) - np.log(n) + share
-        # a step is a step only as far as neither a drift nor a walk explains it
-        weight = np.exp(parts[:, 1] - np.log(n) + share[1] - np.logaddexp.reduce(evidence))
-        return evidence, np.asarray(changes).T @ weight
-
-    def _partitions(self, gram, target, size, priors):
-        """
-        Return the log evidence of one stretch, and of more, and the chance of a change in each gap.
-
-        By dynamic programming over the ends of stretches; the chance is that among partitions of
-        more than one stretch.
-        """
-        n = len(gram)
-        grams, targets = (np.concatenate([0 * x[:1], np.cumsum(x, axis=0)]) for x in (gram, target))
-        stretch = np.full((n + 1, n + 1), -np.inf)
-        for i in range(n):
-            for j in range(i + 1, n + 1):
-                stretch[i, j] = log_evidence(grams[j] - grams[i], targets[j] - targets[i], size)
-        change, stay = np.log(priors), np.log1p(-priors)
-        quiet = np.concatenate([[0.0], np.cumsum(stay)])
-        # within a stretch no gap changes
-        for i in range(n):
-            for j in range(i + 1, n + 1):
-                stretch[i, j] += quiet[j - 1] - quiet[i]
-        ahead, behind = np.full(n + 1, -np.inf), np.full(n + 1, -np.inf)
-        ahead[0] = behind[n] = 0.0
-        for j in range(1, n + 1):
-            before = [ahead[i] + (change[i - 1] if i else 0.0) for i in range(j)]
-            ahead[j] = np.logaddexp.reduce(np.array(before) + stretch[:j, j])
-        for i in range(n - 1, -1, -1):
-            after = [behind[j] + (change[j - 1] if j < n else 0.0) for j in range(i + 1, n + 1)]
-            behind[i] = np.logaddexp.reduce(np.array(after) + stretch[i, i + 1 :])
-        one = stretch[0, n]
-        more = ahead[n] + np.log1p(-min(np.exp(one - ahead[n]), 1 - 1e-15))
-        chance = np.exp(ahead[1:n] + behind[1:n] + change - more)
-        return (one, more), np.clip(chance, 0.0, 1.0)
-
-    def _walk(self, gram, target, size):
-        """Return the log evidence of a random walk, which begins anywhere."""
-        k = gram.shape[1]
-        mean, spread, total = np.zeros(k), size**2 * np.eye(k), 0.0
-        # the walk reaches the size over the whole series
-        pace = size**2 / len(gram)
-        for own, aim, step in zip(gram, target, self.steps, strict=True):
-            spread = spread + pace * step * np.eye(k)
-            # aim is W (x - middle); about the mean that is foreseen
-            surprise = aim - own @ mean
-            gain = np.linalg.inv(np.eye(k) + spread @ own) @ spread
-            total += 0.5 * surprise @ gain @ surprise + mean @ aim - 0.5 * mean @ own @ mean
-            total -= 0.5 * np.linalg.slogdet(np.eye(k) + spread @ own)[1]
-            mean, spread = mean + gain @ surprise, gain
-        return total
+    By dynamic programming over the ends of stretches; the chance is that among partitions of
+    more than one stretch.
+    """
+    n = len(gram)
+    grams, targets = (np.concatenate([0 * x[:1], np.cumsum(x, axis=0)]) for x in (gram, target))
+    change, stay = np.log(priors), np.log1p(-priors)
+    quiet = np.concatenate([[0.0], np.cumsum(stay)])
+    stretch = np.full((n + 1, n + 1), -np.inf)
+    for i in range(n):
+        for j in range(i + 1, n + 1):
+            own = log_evidence(grams[j] - grams[i], targets[j] - targets[i], size)
+            # within a stretch no gap changes
+            stretch[i, j] = own + quiet[j - 1] - quiet[i]
+    # at the first and the last run a stretch begins and ends for certain
+    change = np.concatenate([[0.0], change, [0.0]])
+    ahead, behind = np.full(n + 1, -np.inf), np.full(n + 1, -np.inf)
+    ahead[0] = behind[n] = 0.0
+    for j in range(1, n + 1):
+        ahead[j] = np.logaddexp.reduce(ahead[:j] + change[:j] + stretch[:j, j])
+    for i in range(n - 1, -1, -1):
+        behind[i] = np.logaddexp.reduce(behind[i + 1 :] + change[i + 1 :] + stretch[i, i + 1 :])
+    one = stretch[0, n]
+    more = ahead[n] + np.log1p(-min(np.exp(one - ahead[n]), 1 - 1e-15))
+    chance = np.exp(ahead[1:n] + behind[1:n] + change[1:n] - more)
+    return (one, more), np.clip(chance, 0.0, 1.0)
 
 
-def _regressed(gram, target, waves, size):
-    """Return the log evidence of deviations in proportion to functions of the run, (n, m)."""
-    k = target.shape[1]
-    both = np.einsum("na,nb,nij->aibj", waves, waves, gram).reshape(2 * k, 2 * k)
-    return log_evidence(both, np.einsum("na,ni->ai", waves, target).ravel(), size)
+def _walk(gram, target, size, mjd):
+    """Return the log evidence of a random walk, which begins anywhere."""
+    unit = np.eye(gram.shape[1])
+    mean, spread, total = np.zeros(len(unit)), size**2 * unit, 0.0
+    # the walk reaches the size over the whole series, in proportion to time
+    paces = size**2 * np.diff(mjd, prepend=mjd[0]) * (1 - 1 / len(mjd)) / np.ptp(mjd)
+    for own, aim, pace in zip(gram, target, paces, strict=True):
+        spread = spread + pace * unit
+        # aim is W (x - middle); about the mean that is foreseen
+        surprise = aim - own @ mean
+        gain = np.linalg.inv(unit + spread @ own) @ spread
+        total += 0.5 * surprise @ gain @ surprise + mean @ aim - 0.5 * mean @ own @ mean
+        total -= 0.5 * np.linalg.slogdet(unit + spread @ own)[1]
+        mean, spread = mean + gain @ surprise, gain
+    return total

@@ -17,7 +17,7 @@ from astropolcal import instruments
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
-from astropolcal.pipeline.history import _Named, named_by_date, parameter_history, significance
+from astropolcal.pipeline.history import named_by_date, parameter_history, significance
 from astropolcal.plotting import _style as st
 from astropolcal.words import check_choice, counted
 
@@ -601,10 +601,11 @@ def _mark_changes(ax, calibrations, own, name):
     held = {row["calibration"]: row["date"].mjd for row in own}
     crowded = len(held) > _MOST_MARKS
     for first, second in pairwise(named_by_date(calibrations)):
-        found = None
-        with suppress(ParameterError, FitError):
-            found = significance([_Named(*first), _Named(*second)], [name])
-        if found is None or not found.dof or not {first[0], second[0]} <= set(held):
+        try:
+            found = significance([first, second], [name])
+        except (ParameterError, FitError):
+            continue
+        if not found.dof or not {first[0], second[0]} <= set(held):
             continue
         if crowded and found.p_value >= _SEEN:
             # of many, those that changed

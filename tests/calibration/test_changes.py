@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from astropolcal.pipeline import Change
-from astropolcal.pipeline.history import _belongs, _chi_square, _determined, _log_p
+from astropolcal.pipeline.history import _belongs, _determined, _log_p, about_the_mean
 
 
 def _change(chi2, dof, **options):
@@ -16,6 +16,12 @@ def _change(chi2, dof, **options):
     return Change(
         ["a", "b"], ["m3.diattenuation[0]", "m3.diattenuation[1]"], chi2, dof, p, **options
     )
+
+
+def _chi_square(values, covariances):
+    _, deviations, weights = about_the_mean(values, covariances)
+    chi2 = np.einsum("ni,nij,nj->", deviations, weights, deviations)
+    return chi2, deviations.shape[1]
 
 
 # --- probabilities ------------------------------------------------------------------------------
