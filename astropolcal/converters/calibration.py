@@ -10,6 +10,7 @@ checked against that version and its checksum, and then carried to the newest on
 """
 
 from importlib.metadata import version as installed
+from itertools import zip_longest
 
 import astropy.units as u
 import numpy as np
@@ -23,7 +24,6 @@ from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.converters.nodes import (
     check_posterior,
     checksum,
-    node_from_optic,
     node_from_posterior,
     node_from_priors,
     node_from_table,
@@ -31,7 +31,6 @@ from astropolcal.converters.nodes import (
     plain,
     posterior_from_node,
     restore_priors,
-    spelled_model,
     table_from_node,
     unit_from_text,
     unit_text,
@@ -42,7 +41,6 @@ from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table
 from astropolcal.observations.reading import stated_date
-from astropolcal.optics import Optic
 from astropolcal.version import version
 
 __all__ = []
@@ -61,19 +59,38 @@ def node_from_calibration(calibration):
     """Return the node of a calibration, as the newest schema describes it."""
     check_calibration(calibration)
     chains, posterior = calibration.chains, calibration.posterior
+    covariance = calibration.covariance
     priors = node_from_priors(chains)
     # an optic's node cannot hold priors; copies: to write a calibration must not change it
     chains = [without_priors(chain) for chain in chains] if priors else chains
     node = {
-        "chains": [_chain_node(chain) for chain in chains],
+        "chains": [{"optics": leaves(chain)} for chain in chains],
         "wavelength": node_from_value(calibration.wavelength),
-        "covariance": _covariance_node(calibration.covariance),
+        "covariance": {
+            "names": list(covariance.names),
+            "units": [unit_text(unit) for unit in covariance.units],
+            "matrix": covariance.matrix.copy(),
+        },
         "identifiability": _identifiability_node(calibration.identifiability),
-        "datasets": [_dataset_node(record) for record in calibration.datasets],
+        "datasets": [
+            plain(vars(record) | {"accuracy": None}, record.name)
+            | {"accuracy": node_from_table(record.accuracy)}
+            for record in calibration.datasets
+        ],
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
         **{key: plain(getattr(calibration, key), key) for key in _PLAIN},
     }
+    for chain, entry in zip(chains, node["chains"], strict=True):
+        # a chain of one optic is that optic, which has its own name
+        # astropy counts one submodel in a model that is no compound
+        if chain.n_submodels > 1 and chain.name:
+            entry["name"] = chain.name
+    if covariance.factor is not None and covariance.factor.size:
+        node["covariance"]["factor"] = covariance.factor.copy()
+    if covariance.null is not None:
+        # row by row: some versions of asdf cannot read an empty matrix
+        node["covariance"]["open"] = [row.copy() for row in covariance.null]
     node |= {"priors": priors} if priors else {}
     node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
@@ -83,77 +100,31 @@ def node_from_calibration(calibration):
         "validity": {
             **validity_of(calibration).to_dict(),
             "dates": sorted(dates - {None}),
-            "optics_in_beam": [
-                [leaf.name for leaf in leaves(chain)] for chain in calibration.chains
-            ],
+            "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in chains],
         },
         "written_with": {"astropolcal": version} | versions,
     }
 
 
 def _checksum(node):
-    content = {key: value for key, value in node.items() if key not in _DERIVED}
-    return checksum(content, expand=_expanded)
-
-
-def _expanded(item):
-    """Return what a checksum says of an optic, or of a model that a parameter follows."""
-    return node_from_optic(item) if isinstance(item, Optic) else spelled_model(item)
-
-
-def _chain_node(chain):
-    node = {"optics": leaves(chain)}
-    # a chain of one optic is that optic, which has its own name
-    # astropy counts one submodel in a model that is no compound
-    named = chain.n_submodels > 1 and chain.name
-    return node | {"name": chain.name} if named else node
-
-
-def _covariance_node(covariance):
-    node = {
-        "names": list(covariance.names),
-        "units": [unit_text(unit) for unit in covariance.units],
-        "matrix": covariance.matrix.copy(),
-    }
-    if covariance.factor is not None and covariance.factor.size:
-        node["factor"] = covariance.factor.copy()
-    if covariance.null is not None:
-        # row by row: some versions of asdf cannot read an empty matrix
-        node["open"] = [row.copy() for row in covariance.null]
-    return node
+    return checksum({key: value for key, value in node.items() if key not in _DERIVED})
 
 
 def _identifiability_node(finding):
-    node = plain(vars(finding), "identifiability") | {
-        # row by row: some versions of asdf cannot read an empty matrix
-        "null_vectors": [row.copy() for row in finding.null_vectors],
-        "directions": [_direction_node(direction) for direction in finding.directions],
-        "near_null": [_direction_node(direction) for direction in finding.near_null],
-    }
+    node = plain(vars(finding), "identifiability")
+    # row by row: some versions of asdf cannot read an empty matrix
+    node["null_vectors"] = [row.copy() for row in finding.null_vectors]
+    for direction in (*node["directions"], *node["near_null"]):
+        values = direction["parameters"].items()
+        # a list, as a mapping would lose the order
+        direction["parameters"] = [{"name": name, "value": value} for name, value in values]
     # absent where there are none, as in files of before
     return {key: value for key, value in node.items() if key != "branches" or value}
 
 
-def _direction_node(direction):
-    # a list, as a mapping would lose the order
-    values = plain(direction["parameters"], direction["words"]).items()
-    return plain(direction, "direction") | {
-        "parameters": [{"name": name, "value": value} for name, value in values]
-    }
-
-
-def _dataset_node(record):
-    node = {key: value for key, value in vars(record).items() if key != "accuracy"}
-    return plain(node, record.name) | {"accuracy": node_from_table(record.accuracy)}
-
-
 def _tie_node(name, tie):
-    return {
-        "target": name,
-        "source": tie.source,
-        "factor": float(tie.factor),
-        "offset": node_from_value(tie.offset),
-    }
+    offset = node_from_value(tie.offset)
+    return {"target": name, "source": tie.source, "factor": float(tie.factor), "offset": offset}
 
 
 def _stage_node(stage):
@@ -177,7 +148,10 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
     # after the checksum, which is of the content as it was written
     for step in CALIBRATION_TAGS[CALIBRATION_TAGS.index(tag) : -1]:
         node = MIGRATIONS[step](node)
-    chains = [_chain(entry) for entry in node["chains"]]
+    chains = [join(entry["optics"]) for entry in node["chains"]]
+    for chain, entry in zip(chains, node["chains"], strict=True):
+        if "name" in entry:
+            chain.name = entry["name"]
     # before the calibration is made: its free parameters bind the priors
     restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
@@ -185,8 +159,17 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         wavelength=value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
-        datasets=[_dataset(entry) for entry in node["datasets"]],
-        ties={name: _tie(entry) for name, entry in _by_name(node["ties"], "target").items()},
+        datasets=[
+            DatasetRecord(
+                **entry
+                | {"meta": plain(entry["meta"]), "accuracy": table_from_node(entry["accuracy"])}
+            )
+            for entry in node["datasets"]
+        ],
+        ties={
+            name: Tie(entry["source"], entry["factor"], value_from_node(entry["offset"]))
+            for name, entry in _by_name(node["ties"], "target").items()
+        },
         stages=[_stage(entry) for entry in node["stages"]],
         **{key: plain(node[key]) for key in _PLAIN},
         posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
@@ -204,13 +187,6 @@ def _to_1_1(node):
 
 #: Tag of an older version to the function that carries a node of it to the next one.
 MIGRATIONS = {CALIBRATION_TAGS[0]: _to_1_1}
-
-
-def _chain(node):
-    chain = join(node["optics"])
-    if "name" in node:
-        chain.name = node["name"]
-    return chain
 
 
 def _covariance(node):
@@ -233,8 +209,9 @@ def _covariance(node):
 def _identifiability(node):
     found, vectors = plain(node), node["null_vectors"]
     found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
-    for key in ("directions", "near_null"):
-        found[key] = [_direction(entry) for entry in found.get(key, [])]
+    for direction in (*found.setdefault("directions", []), *found.setdefault("near_null", [])):
+        entries = _by_name(direction["parameters"]).items()
+        direction["parameters"] = {name: entry["value"] for name, entry in entries}
     return Identifiability(**found)
 
 
@@ -246,23 +223,6 @@ def _by_name(entries, key="name"):
         twice = next(name for name in names if names.count(name) > 1)
         raise CalibrationFileError(f"{twice!r} is given twice in a list of parameters")
     return found
-
-
-def _direction(node):
-    values = {name: entry["value"] for name, entry in _by_name(node["parameters"]).items()}
-    return node | {"parameters": values}
-
-
-def _dataset(node):
-    accuracy = table_from_node(node["accuracy"])
-    return DatasetRecord(**(node | {"meta": plain(node["meta"]), "accuracy": accuracy}))
-
-
-def _tie(node):
-    offset = value_from_node(node["offset"])
-    # a number of its own type, as it was given
-    plain_number = "unit" not in node["offset"] and not np.ndim(offset)
-    return Tie(node["source"], node["factor"], offset.item() if plain_number else offset)
 
 
 def _stage(node):
@@ -296,11 +256,13 @@ def check_calibration(calibration):
         free = FreeParameters(calibration.chains, len(wavelength), calibration.ties)
     except AstropolcalError as error:
         raise CalibrationFileError(str(error)) from None
-    # another unit is the schema's to refuse
-    if wavelength.unit.is_equivalent("um"):
-        _check_laws(calibration.chains, wavelength.to_value("um"))
-    _check_values(calibration.chains, free)
-    _check_shared(calibration.chains, free)
+    _check_optics(calibration, free)
+    table = parameter_table(calibration.chains)
+    for name in [*free.by_name, *free.ties]:
+        # bit by bit: they were one number in the fit
+        first, *others = (parameter.value for parameter in table[name])
+        if not all(np.array_equal(first, other) for other in others):
+            raise CalibrationFileError(f"{name} has different values in different datasets")
     _check_names("covariance", calibration.covariance.names, free.names)
     # a parameter with one value per wavelength has as many rows of the covariance
     for name, unit, expected in zip(
@@ -309,7 +271,12 @@ def check_calibration(calibration):
         if unit != expected:
             raise CalibrationFileError(f"covariance of {name} is in {unit}, allowed is {expected}")
     _check_identifiability(calibration.identifiability, free.names)
-    _check_fit(calibration.fit)
+    errors = calibration.fit.get("model_error") or {}
+    lengths = {len(one) for key, one in errors.items() if key in _MODEL_ERROR}
+    if len(lengths) > 1 or not _finite([calibration.fit.get("sky_settings"), errors]):
+        raise CalibrationFileError(
+            "fit.sky_settings and fit.model_error must be finite, the latter of equal length"
+        )
     unknown = sorted(set(calibration.at_bound) - set(free.names))
     if unknown:
         raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is not a free parameter")
@@ -319,18 +286,16 @@ def check_calibration(calibration):
     check_posterior(calibration.posterior, calibration.covariance)
 
 
-def _check_laws(chains, wavelength):
-    """Refuse wavelengths at which an optic has no matrix."""
-    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
-        try:
-            leaf._dispersion(wavelength)
-        except AstropolcalError as error:
-            raise CalibrationFileError(f"{leaf.name}: {error}") from None
-
-
-def _check_values(chains, free):
-    """Refuse values that no fit gives, regardless of the checksum."""
-    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+def _check_optics(calibration, free):
+    """Refuse wavelengths at which an optic has no matrix, and values that no fit gives."""
+    wavelength = calibration.wavelength
+    for leaf in (leaf for chain in calibration.chains for leaf in leaves(chain)):
+        # another unit is the schema's to refuse
+        if wavelength.unit.is_equivalent("um"):
+            try:
+                leaf._dispersion(wavelength.to_value("um"))
+            except AstropolcalError as error:
+                raise CalibrationFileError(f"{leaf.name}: {error}") from None
         for key in leaf.param_names:
             name, parameter = f"{leaf.name}.{key}", getattr(leaf, key)
             bounds = [parameter.bounds]
@@ -349,25 +314,10 @@ def _check_values(chains, free):
                 )
 
 
-def _check_shared(chains, free):
-    """Check that a fitted optic has the same values in all chains."""
-    table = parameter_table(chains)
-    for name in [*free.by_name, *free.ties]:
-        # bit by bit: they were one number in the fit
-        first, *others = (parameter.value for parameter in table[name])
-        if not all(np.array_equal(first, other) for other in others):
-            raise CalibrationFileError(f"{name} has different values in different datasets")
-
-
 def _check_names(what, names, expected):
-    if names == expected:
-        return
-    if len(names) != len(expected):
-        raise CalibrationFileError(
-            f"{what} of {len(names)} parameters, but {len(expected)} are free in the chains"
-        )
-    wrong = next(pair for pair in zip(names, expected, strict=True) if pair[0] != pair[1])
-    raise CalibrationFileError(f"{what} of {wrong[0]!r}, where {wrong[1]!r} is free in the chains")
+    for name, other in zip_longest(names, expected):
+        if name != other:
+            raise CalibrationFileError(f"{what} of {name!r}, where {other!r} is free in the chains")
 
 
 def _check_identifiability(finding, names):
@@ -396,16 +346,6 @@ def _finite(value):
     if isinstance(value, dict | list | tuple):
         return all(map(_finite, value.values() if isinstance(value, dict) else value))
     return value is None or isinstance(value, str) or bool(np.isfinite(value).all())
-
-
-def _check_fit(fit):
-    """Check of the accuracy on sky what its schema does not."""
-    errors = fit.get("model_error") or {}
-    lengths = {len(one) for key, one in errors.items() if key in _MODEL_ERROR}
-    if len(lengths) > 1 or not _finite([fit.get("sky_settings"), errors]):
-        raise CalibrationFileError(
-            "fit.sky_settings and fit.model_error must be finite, the latter of equal length"
-        )
 
 
 def _check_accuracy(table, name):

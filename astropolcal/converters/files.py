@@ -80,18 +80,16 @@ def read_calibration(path):
             raise CalibrationFileError("not an ASDF file")
         if not content.endswith(_END):
             raise CalibrationFileError("truncated: the end of the file is missing")
-        end = re.search(YAML_END_MARKER_REGEX, content)
+        end = re.search(YAML_END_MARKER_REGEX, content).end()
         with _speaking_of("damaged", "its YAML", reads=False):
-            check_yaml(content[: end.end()], CalibrationFileError)
-        _check_blocks(content, end.end())
+            check_yaml(content[:end], CalibrationFileError)
+        _check_blocks(content, end)
         tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
         if not isinstance(tree, dict) or _KEY not in tree:
             raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
         _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
         _check_nodes(tree, len(content))
-        has_units = re.search(
-            rb"[/!](units?|transform)/", content[: re.search(YAML_END_MARKER_REGEX, content).end()]
-        )
+        has_units = re.search(rb"[/!](units?|transform)/", content[:end])
         with (
             _strict_asdf(_ConfigWithUnits if has_units else _Config),
             asdf.open(
@@ -182,24 +180,16 @@ def _check_blocks(content, start):
 def _check_version(tag):
     if tag in CALIBRATION_TAGS:
         return
-    ours = CALIBRATION_TAG.rpartition("-")[0]
     kind, _, version = tag.rpartition("-")
-    if kind != ours:
+    if kind != CALIBRATION_TAG.rpartition("-")[0]:
         raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
     known = [tag.rpartition("-")[2] for tag in CALIBRATION_TAGS]
-    advice = f": update {our_version}, the file is newer" if _newer(version, known[-1]) else ""
+    found, newest = (list(map(int, re.findall(r"\d+", text))) for text in (version, known[-1]))
+    advice = f": update {our_version}, the file is newer" if found > newest else ""
     raise CalibrationFileError(
         f"calibration of version {version}; this astropolcal reads version "
         f"{', '.join(known)}{advice}"
     )
-
-
-def _newer(version, known):
-    numbers = [re.fullmatch(r"(\d+)\.(\d+)\.(\d+)", text) for text in (version, known)]
-    if not all(numbers):
-        return False
-    first, second = (tuple(map(int, match.groups())) for match in numbers)
-    return first > second
 
 
 def _check_nodes(tree, size):
@@ -214,10 +204,11 @@ def _check_nodes(tree, size):
         if tag is not None and not _ALLOWED_TAGS.fullmatch(tag):
             raise CalibrationFileError(f"holds an object of unknown kind or version, {tag}")
         if isinstance(node, dict):
-            if "$ref" in node or ("ndarray" in (tag or "") and isinstance(node.get("source"), str)):
+            is_array = "ndarray" in (tag or "")
+            if "$ref" in node or (is_array and isinstance(node.get("source"), str)):
                 # a file stands for itself, and reading it must not open others
                 raise CalibrationFileError("refers to another file")
-            if "ndarray" in (tag or ""):
+            if is_array:
                 _check_array(node, size)
             waiting.extend(node.values())
         elif isinstance(node, list):

@@ -25,7 +25,7 @@ from astropolcal.calibration.posterior.samples import Posterior
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import Normal, Uniform, parameter_table
-from astropolcal.optics import OPTICS
+from astropolcal.optics import OPTICS, Optic
 from astropolcal.optics.core import with_value
 from astropolcal.optics.laws import law_of
 
@@ -60,12 +60,15 @@ def node_from_value(value):
 
 
 def value_from_node(node):
-    """Return the array or the Quantity of a node that `node_from_value` made."""
+    """Return the number, array or Quantity of a node that `node_from_value` made."""
     unknown = sorted(set(node) - {"name", "unit", "value"})
     if unknown:
         raise CalibrationFileError(f"a value with {unknown[0]!r}, which means nothing here")
     value = np.array(node["value"])
-    return value * unit_from_text(node["unit"]) if "unit" in node else value
+    if "unit" in node:
+        return value * unit_from_text(node["unit"])
+    # a number of its own type, as it was given
+    return value if value.ndim else value.item()
 
 
 def node_from_table(table):
@@ -117,24 +120,24 @@ def plain(value, where="value"):
 # ---- the checksum ------------------------------------------------------------------
 
 
-def checksum(node, expand=None):
+def checksum(node):
     """Return the SHA-256 of the content of a node, however a file spells it.
 
     Equal for equal bits, regardless of the order of the keys and whether arrays are inline or in
-    blocks. ``expand`` turns any other object into such a node.
+    blocks. Optics, and models that parameters follow, are such nodes themselves.
     """
     # the order of keys in YAML means nothing
-    text = json.dumps(_spelled(node, expand), sort_keys=True)
+    text = json.dumps(_spelled(node), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _spelled(node, expand):
+def _spelled(node):
     if isinstance(node, dict):
-        return {str(key): _spelled(item, expand) for key, item in node.items()}
+        return {str(key): _spelled(item) for key, item in node.items()}
     if isinstance(node, (list, tuple)):
-        return [_spelled(item, expand) for item in node]
+        return [_spelled(item) for item in node]
     if isinstance(node, u.Quantity):
-        return {"quantity": _spelled(node.value, expand), "unit": unit_text(node.unit)}
+        return {"quantity": _spelled(node.value), "unit": unit_text(node.unit)}
     if isinstance(node, float):
         # all bits, where a decimal text might round
         return {"float": float(node).hex()}
@@ -150,7 +153,7 @@ def _spelled(node, expand):
             array.shape
         )
         return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
-    return _spelled(expand(node), expand)
+    return _spelled(node_from_optic(node) if isinstance(node, Optic) else spelled_model(node))
 
 
 # ---- priors in a calibration file ----
@@ -241,8 +244,6 @@ def prior_from_node(node, name):
         values = [value_from_node(node[key]) for key in keys]
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CalibrationFileError(f"prior of {name}: {one_line(error)}") from None
-    # a number of its own type, as it was given
-    values = [v if hasattr(v, "unit") else v.item() for v in values]
     return cls(*values)
 
 
