@@ -61,7 +61,7 @@ def describe(header, instrument=None, stated=()):
     if layout is None:
         return {"instrument": found.name}
     # what is stated by the user, or is the identity itself, is no contradiction
-    own = _look_up(header, "instrument", layout)
+    own = _text(header, "instrument", layout)
     if "instrument" in stated or own in layout.identities:
         own = None
     header = layout.from_header(header)
@@ -69,12 +69,14 @@ def describe(header, instrument=None, stated=()):
     return {
         "instrument": found.name,
         "stated": own,
-        "mode": None if "mode" in stated else _text(_look_up(header, "filter", layout)),
+        "mode": None if "mode" in stated else _text(header, "filter", layout),
         "date": None if time is None else time.isot,
     }
 
 
-def _text(value):
+def _text(header, column, layout):
+    """Return as text what a header says, or None."""
+    value = look_up([header], column, layout)[1]
     return None if value is None else str(value).strip()
 
 
@@ -85,7 +87,7 @@ def recognized(header, known=None):
     # each instrument looks under its own keyword, so that all of them are asked
     for instrument in known:
         layout = instrument.files or instrument.headers
-        told = None if layout is None else _text(_look_up(header, "instrument", layout))
+        told = None if layout is None else _text(header, "instrument", layout)
         if told is None:
             continue
         if told in layout.identities or instrument.answers_to(told):
@@ -98,17 +100,12 @@ def recognized(header, known=None):
     )
 
 
-def _look_up(header, column, layout):
-    return look_up([header], column, layout)[1]
-
-
 def _time(header, layout):
     """Return when a frame was taken, or None."""
     try:
         return frame_time(header, layout)
     except (TypeError, ValueError):
-        told = (_look_up(header, key, layout) for key in ("mjd", "date", "time"))
-        mjd, date, clock = (_text(value) for value in told)
+        mjd, date, clock = (_text(header, key, layout) for key in ("mjd", "date", "time"))
         shown = mjd or f"{date} {clock or ''}".strip()
         raise CalibrationFileError(f"the header's date {shown!r} cannot be understood") from None
 
@@ -128,11 +125,19 @@ class FrameAngles:
         self.n_frames, headers = len(headers), [layout.from_header(header) for header in headers]
         table = QTable({"frame": np.arange(self.n_frames)})
         for column in (c for c in layout.keywords if c not in _OTHERS):
-            values = [_look_up(header, column, layout) for header in headers]
+            values = [look_up([header], column, layout)[1] for header in headers]
             if column == "flc_state":
                 # a word for no modulation is none
                 values = [v if layout.states.get(str(v).strip(), v) else None for v in values]
-            if self._complete(column, values):
+            missing = [i for i, value in enumerate(values) if value is None]
+            # some with and some without is a mixture of modes, or a
+            # broken header; none has it: not there
+            if 0 < len(missing) < len(values):
+                keyword = layout.keywords[column]
+                raise ObservationError(
+                    f"frame {missing[0]}: no {keyword} in the header, others have it"
+                )
+            if not missing:
                 table[column] = self._column(column, values)
         times = [_time(header, layout) for header in headers]
         if all(time is not None for time in times):
@@ -144,32 +149,28 @@ class FrameAngles:
         """One row per frame."""
         return self._table.copy()
 
-    def _complete(self, column, values):
-        missing = [i for i, value in enumerate(values) if value is None]
-        if not missing:
-            return True
-        # some with and some without is a mixture of modes, or a
-        # broken header; none has it: not there
-        if len(missing) < len(values):
-            keyword = self._layout.keywords[column]
-            raise ObservationError(
-                f"frame {missing[0]}: no {keyword} in the header, others have it"
-            )
-        return False
-
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
+        keyword, layout = self._layout.keywords[column], self._layout
         if column in _SKY:
             try:
                 return [sky_angle(column, value) for value in values] * u.deg
             except ValueError as error:
                 raise ObservationError(f"{column}: {one_line(error)}") from None
-        keyword, layout = self._layout.keywords[column], self._layout
+        words = [f"{v:g}" if isinstance(v, float) else str(v).strip() for v in values]
         if column == "flc_state":
-            return [self._state(i, value) for i, value in enumerate(values)] * u.rad
+            states = [layout.states.get(word, word) for word in words]
+            for i, state in enumerate(states):
+                if state not in ("A", "B"):
+                    raise ObservationError(
+                        f"frame {i}: {keyword} = {values[i]!r}, allowed are A and B"
+                    )
+            # as positions have them
+            return [float(state == "B") for state in states] * u.rad
+        texts = np.array([str(value).strip() for value in values])
         # states of a modulator, cameras and such
         if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
-            return np.array([str(value).strip() for value in values])
+            return texts
         # two turns: encoders count on past 360 deg, but what is further out is no angle
         low, high = RANGES.get(column, (-720.0, 720.0))
         angles = []
@@ -178,7 +179,7 @@ class FrameAngles:
                 angle = convert(column, value, layout, u.deg)
             except (TypeError, ValueError) as error:
                 if column not in (*ANGLES, *layout.transforms):
-                    return np.array([str(value).strip() for value in values])
+                    return texts
                 needed = "a number is needed" if column in ANGLES else error
                 raise ObservationError(f"frame {i}: {keyword} = {value!r}, {needed}") from None
             if not low <= angle <= high:
@@ -187,15 +188,6 @@ class FrameAngles:
                 )
             angles.append(angle)
         return angles * u.deg
-
-    def _state(self, i, value):
-        """Return 0 or 1 of a state of the modulator, as positions have it."""
-        word = f"{value:g}" if isinstance(value, float) else str(value).strip()
-        state = self._layout.states.get(word, word)
-        if state not in ("A", "B"):
-            keyword = self._layout.keywords["flc_state"]
-            raise ObservationError(f"frame {i}: {keyword} = {value!r}, allowed are A and B")
-        return float(state == "B")
 
     def position(self, column):
         """Return an angle of every frame in radian, a moment, a place, or the number of a state."""
@@ -220,7 +212,16 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
     known = None if optics_in is None else set(optics_in)
     for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
         inner = split_chain(without_nuisance(chain))[1]
-        if _matches(_optional(instrument, record), inner, known, beam or {}):
+        try:
+            present = set(instrument.setup(record)[1])
+            fits = known == present
+        except (AttributeError, AstropolcalError):
+            # an instrument knows which of its optics are optional; without one all may be
+            present = {leaf.name for leaf in inner}
+            fits = known is not None and known <= present
+        if known is None:
+            fits = all((name in present) == is_in for name, is_in in (beam or {}).items())
+        if fits:
             # chains of the same optics share them by name, so any one stands for all
             kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
     if not kinds:
@@ -235,22 +236,6 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
             f"{' or '.join(shown)}"
         )
     return next(iter(kinds.values()))
-
-
-def _optional(instrument, record):
-    """Return the optional optics of a dataset, or None if no instrument knows them."""
-    try:
-        return set(instrument.setup(record)[1])
-    except (AttributeError, AstropolcalError):
-        return None
-
-
-def _matches(optional, inner, wanted, beam):
-    # an instrument knows which of its optics are optional; without one all of the chain's may be
-    present = {leaf.name for leaf in inner} if optional is None else optional
-    if wanted is None:
-        return all((name in present) == is_in for name, is_in in beam.items())
-    return wanted <= present if optional is None else wanted == present
 
 
 def telescope_optics(calibration):
@@ -291,9 +276,17 @@ def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=N
     """
     held, ways = validity_of(calibration), _WAYS if ways is None else ways
     dated = dates and (held.valid_from is not None or held.valid_until is not None)
-    moments = {}
+    moments, way = {}, ways["mode"].format(repr(held.mode))
     for label, date, mode in frames:
-        _check_mode(held, label, mode, name, ways["mode"].format(repr(held.mode)))
+        if held.mode is not None and mode is None:
+            raise CalibrationFileError(
+                f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
+            )
+        if held.mode is not None and folded(mode) != folded(held.mode):
+            raise CalibrationFileError(
+                f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
+                f"another name, state it by {way}"
+            )
         if dated and date is None:
             raise CalibrationFileError(
                 f"{label}: its date is not known, and {name} holds for {held}; {ways['date']}"
@@ -309,14 +302,12 @@ def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=N
     days = _dates(calibration) or ([held.valid_from] if held.valid_from else [])
     if not (moments and days):
         return
-    changes = _changes(calibration, light)
-    if held.valid_from and held.valid_from > days[-1]:
-        # who states that it holds from a later day on vouches for what changed until then
-        changes = [change for change in changes if held.valid_from[:10] < change[1]]
-    for moment, label in moments.items():
-        _check_changes(changes, days, moment[:10], f"{label}, {name}", ways["date"])
+    _check_changes(calibration, light, days, moments, name, ways["date"])
+    # no word on leap seconds to come
+    with offline():
+        times, taken = (Time(texts, format="isot", scale="utc") for texts in (list(moments), days))
     # (n_moments, n_days), in days
-    apart = np.abs((_moments(list(moments))[:, None] - _moments(days)).to_value(u.day)).min(axis=1)
+    apart = np.abs((times[:, None] - taken).to_value(u.day)).min(axis=1)
     limit, worst = _max_age(max_age, held, instrument_of(calibration)), apart.argmax()
     if apart[worst] > limit:
         moment = list(moments)[worst]
@@ -329,46 +320,32 @@ def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=N
         )
 
 
-def _check_mode(held, label, mode, name, way):
-    if held.mode is None:
-        return
-    if mode is None:
-        raise CalibrationFileError(
-            f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
-        )
-    if folded(mode) != folded(held.mode):
-        raise CalibrationFileError(
-            f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
-            f"another name, state it by {way}"
-        )
-
-
-def _changes(calibration, light):
-    """Return the dated changes of the instrument that matter to light on its way."""
-    instrument = instrument_of(calibration)
+def _check_changes(calibration, light, days, moments, name, way):
+    """Refuse a day between which and all days of the data the instrument has changed."""
+    instrument, held = instrument_of(calibration), validity_of(calibration)
     if instrument is None:
-        return []
+        return
     own = {leaf.name for chain in calibration.chains for leaf in leaves(chain)}
     # a published telescope of the right epoch stands in where none was calibrated
     renewed = "date" in instrument.sky_options
-    return [
-        change
-        for change in instrument.changes
-        if change[0] is None or (light == "sky" and (change[0] in own or not renewed))
+    # who states that it holds from a later day on vouches for what changed until then
+    since = (held.valid_from or "")[:10] if (held.valid_from or "") > days[-1] else ""
+    changes = [
+        (first, last, words)
+        for optic, first, last, words in instrument.changes
+        if since < first and (optic is None or (light == "sky" and (optic in own or not renewed)))
     ]
-
-
-def _check_changes(changes, days, day, label, way):
-    """Refuse a day between which and all days of the data the instrument has changed."""
-    for _, first, last, words in changes:
+    for moment, label in moments.items():
+        day = moment[:10]
         spans = [sorted([old[:10], day]) for old in days]
-        # on an unknown day from first on and before last; ISO dates compare as text
-        if all(lo < last and hi >= first and not (first <= lo and hi < last) for lo, hi in spans):
-            raise CalibrationFileError(
-                f"{label}: {words} between the data of the calibration "
-                f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
-                f"calibrate again, or {way}"
-            )
+        for first, last, words in changes:
+            # on an unknown day from first on and before last; ISO dates compare as text
+            if all(a < last and b >= first and not (first <= a and b < last) for a, b in spans):
+                raise CalibrationFileError(
+                    f"{label}, {name}: {words} between the data of the calibration "
+                    f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
+                    f"calibrate again, or {way}"
+                )
 
 
 def _max_age(max_age, held, instrument):
@@ -385,9 +362,3 @@ def _max_age(max_age, held, instrument):
     if not days >= 0:
         raise ParameterError(f"max_age = {max_age!r}; a time is needed, such as 1 yr")
     return days
-
-
-def _moments(moments):
-    """Return ISO texts as `~astropy.time.Time`, without a word on leap seconds to come."""
-    with offline():
-        return Time(moments, format="isot", scale="utc")

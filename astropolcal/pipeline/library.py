@@ -101,11 +101,8 @@ class Entry:
     @property
     def calibration(self):
         """What the file holds; an error if that is not what the entry says."""
-        if self._calibration is None:
-            self._calibration = self._read()
-        return self._calibration
-
-    def _read(self):
+        if self._calibration is not None:
+            return self._calibration
         path = Path(self.path)
         try:
             calibration, record = _read(path, _state(path))
@@ -118,6 +115,7 @@ class Entry:
                 f"{path}: holds something else than when the library was read; read the library "
                 f"again, and delete {_INDEX} in it if that does not help"
             )
+        self._calibration = calibration
         return calibration
 
 
@@ -190,7 +188,14 @@ class Library:
         self.entries, self.problems, known = [], {}, {}
         for path, target in files:
             try:
-                entry, record = _looked_at(target, index.get(path.name))
+                state, record = _state(target), index.get(path.name)
+                entry = _entry(target, record, state)
+                if entry is None:
+                    record = _read(target, state)[1]
+                    entry = _entry(target, record, state)
+                    if not state[-1] or len(json.dumps(record)) > _MOST_BYTES:
+                        # it may change yet, or tells too much for the index
+                        record = None
             except (OSError, CalibrationFileError) as error:
                 reason = " ".join(str(error).split())
                 self.problems[path] = reason.removeprefix(f"{target}: ")
@@ -265,17 +270,15 @@ class Library:
         return self._confirmed(lambda: self._choice(instrument, wanted))
 
     def _choice(self, instrument, wanted):
-        if self.problems:
-            path, reason = next(iter(self.problems.items()))
-            raise CalibrationFileError(
-                f"{path}: {reason}; as it might be the one that is needed, remove or repair it"
-            )
+        self._check_readable("as it might be the one that is needed, remove or repair it")
         found, date = _of_instrument(self._in_force(), instrument), wanted["date"]
         # once, as it takes longer than to compare
         moment = _moment(date, "date")
         words = f"no calibration of {instrument}" if instrument else "no calibration"
+        if not found:
+            raise CalibrationFileError(f"{self._label}: {words}{_known(self.entries)}")
         for key, value in wanted.items():
-            if value is None or not found:
+            if value is None:
                 continue
             fitting = moment if key == "date" else value
             kept = [e for e in found if _fits(e.validity, key, fitting)]
@@ -284,27 +287,18 @@ class Library:
                 # calibration, but not of that time
                 if date is not None and not any(e.validity.holds(moment) for e in found):
                     key, value = "date", date
-                raise CalibrationFileError(self._lacking(words, key, value, found))
+                shown = "+".join(value) or "none" if key == "optics_in" else value
+                told = f"a beam {beam_words(value)}" if key == "beam" else f"{key} {shown}"
+                raise CalibrationFileError(f"{self._label}: {words} for {told}{_known(found)}")
             before, found = found, kept
-        if not found:
-            raise CalibrationFileError(f"{self._label}: {words}{self._known(self.entries)}")
         newest = self._newest(found, wanted | {"instrument": instrument})
         if date is not None:
             _check_replaced(newest, before, moment)
         return newest
 
-    def _lacking(self, words, key, value, found):
-        if key == "beam":
-            told = f"a beam {beam_words(value)}"
-        else:
-            told = f"{key} {'+'.join(value) or 'none' if key == 'optics_in' else value}"
-        return f"{self._label}: {words} for {told}{self._known(found)}"
-
-    def _known(self, entries):
-        if not entries:
-            return "; it holds none"
-        shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-_MOST_SHOWN:])
-        return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
+    def _check_readable(self, advice):
+        for path, reason in self.problems.items():
+            raise CalibrationFileError(f"{path}: {reason}; {advice}")
 
     def _newest(self, found, wanted):
         # a copy of a file is no second opinion
@@ -313,9 +307,8 @@ class Library:
             kinds = {getattr(e.validity, key): e for e in reversed(found)}
             if len(kinds) > 1 and wanted[key] is None:
                 # one of each kind is enough to choose by
-                names = _shown(
-                    [f"{e.name} ({e.validity})" for e in sorted(kinds.values(), key=_order)]
-                )
+                some = sorted(kinds.values(), key=_order)
+                names = _shown([f"{e.name} ({e.validity})" for e in some])
                 raise CalibrationFileError(
                     f"{self._label}: {names}: say which {key} is meant", argument=key
                 )
@@ -405,11 +398,8 @@ class Library:
             raise CalibrationFileError(f"{self._label}: only a folder can be frozen")
         with _locked(self.source):
             self._scan()
-            if self.problems:
-                path, reason = next(iter(self.problems.items()))
-                raise CalibrationFileError(f"{path}: {reason}; remove or repair it")
-            files = (path for path, _ in _files_of(self.source))
-            return freeze(self.source, name, list(files))
+            self._check_readable("remove or repair it")
+            return freeze(self.source, name, [path for path, _ in _files_of(self.source)])
 
     @property
     def contexts(self):
@@ -497,13 +487,14 @@ class Library:
         """Return a calibration that says which ones it supersedes, and these."""
         if not names:
             return calibration, supersedes_of(calibration)
+        names = [names] if isinstance(names, str) else names
         known = {entry.name: entry.content_hash for entry in self.entries}
-        for name in [names] if isinstance(names, str) else names:
+        for name in names:
             if name not in known:
                 raise CalibrationFileError(
                     f"supersedes: no {one_line(repr(name))} in {self._label}", argument="supersedes"
                 )
-        gone = sorted({known[name] for name in ([names] if isinstance(names, str) else names)})
+        gone = sorted({known[name] for name in names})
         settings = calibration.settings | {"supersedes": gone}
         return replace(calibration, settings=settings), tuple(gone)
 
@@ -574,17 +565,14 @@ def _fits(validity, key, value):
     return validity.optics_in is not None and optics_sets(value)[0] in validity.optics_in
 
 
-def _alike(one, other):
-    """Return whether two calibrations may hold for the same frame but for its date."""
+def _differ(first, second):
+    """Return whether two are different ones, of which some frame could choose either."""
+    one, other = first.validity, second.validity
     modes = None in (one.mode, other.mode) or folded(one.mode) == folded(other.mode)
     sets = None in (one.optics_in, other.optics_in) or set(one.optics_in) & set(other.optics_in)
-    return one.instrument == other.instrument and modes and bool(sets)
-
-
-def _differ(one, other):
-    """Return whether two are different ones, of which some frame could choose either."""
     # a copy under another name chooses the same
-    return one.content_hash != other.content_hash and _alike(one.validity, other.validity)
+    copied = first.content_hash == second.content_hash
+    return not copied and one.instrument == other.instrument and modes and bool(sets)
 
 
 def _meet(first, second):
@@ -614,6 +602,13 @@ def _check_replaced(entry, others, moment):
                 f"no calibration for {moment}: {other.name} ({other.validity}) had replaced "
                 f"{entry.name} ({held}) and has ended; state until when that one holds"
             )
+
+
+def _known(entries):
+    if not entries:
+        return "; it holds none"
+    shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-_MOST_SHOWN:])
+    return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
 
 
 def _shown(words):
@@ -696,30 +691,14 @@ def supersedes_of(calibration):
 
 
 def _quality(calibration):
-    return {
-        "datasets": ", ".join(record.name for record in calibration.datasets),
-        "s_res": _worst_median(calibration, "s_res"),
-        "s_cv": _worst_median(calibration, "s_cv"),
-        "converged": bool(calibration.converged),
-    }
-
-
-def _worst_median(calibration, key):
     tables = [r.accuracy for r in calibration.datasets if r.accuracy is not None]
-    known = [t[key].value[np.isfinite(t[key].value)] for t in tables if key in t.colnames]
-    # None of a column that no dataset fills: there is no accuracy, not a perfect one
-    return max((float(np.median(values)) for values in known if values.size), default=None)
-
-
-def _looked_at(path, told):
-    """Return the entry of a file, read unless the index tells it, and what the index keeps."""
-    state = _state(path)
-    entry = _entry(path, told, state)
-    if entry is not None:
-        return entry, told
-    record = _read(path, state)[1]
-    keeps = state[-1] and len(json.dumps(record)) <= _MOST_BYTES
-    return _entry(path, record, state), record if keeps else None
+    found = {"datasets": ", ".join(record.name for record in calibration.datasets)}
+    for key in ("s_res", "s_cv"):
+        known = [t[key].value[np.isfinite(t[key].value)] for t in tables if key in t.colnames]
+        # None of a column that no dataset fills: there is no accuracy, not a perfect one
+        medians = (float(np.median(values)) for values in known if values.size)
+        found[key] = max(medians, default=None)
+    return found | {"converged": bool(calibration.converged)}
 
 
 def _entry(path, record, state):

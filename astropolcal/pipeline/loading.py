@@ -22,12 +22,7 @@ from astropolcal.calibration.system import (
     match_wavelengths,
 )
 from astropolcal.calibration.uncertainty.covariance import full_covariance
-from astropolcal.chain import (
-    join,
-    leaves,
-    warn_beyond,
-    with_beam,
-)
+from astropolcal.chain import join, leaves, warn_beyond, with_beam
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -229,17 +224,22 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     >>> mueller.value.shape, mueller.covariance.shape
     ((22, 4, 4), (22, 16, 16))
     """
-    library = _library(path)
+    library = path
+    if isinstance(path, Calibration):
+        library, held = Library([]), validity_of(path)
+        library.entries = [Entry(Path("calibration in memory"), path, held, content_hash(path))]
+    elif not isinstance(path, Library):
+        library = Library(path)
     wanted = wanted_of(header, instrument, mode=mode, date=date, optics_in=optics_in)
-    chosen = {"instrument": instrument, "mode": mode, "date": date}
     entry = library.find(**wanted)
-    stated = {key: value for key, value in chosen.items() if value is not None}
+    stated = {"instrument": instrument, "mode": mode, "date": date}
+    stated = {key: value for key, value in stated.items() if value is not None}
     loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)
+    # whether the light comes from the sky, whose mirrors may have changed, is known later
     if header is not None:
-        # whether the light comes from the sky, whose mirrors may have changed, is known later
         loaded._check([("the frame", wanted["date"], wanted["mode"])], light="internal")
     elif date is not None:
-        loaded._check(loaded._stated_frame(), light="internal")
+        loaded._check(loaded._frames(None), light="internal")
     return loaded
 
 
@@ -267,17 +267,6 @@ def _headers(header):
     headers = [header] if single else list(() if header is None else header)
     paths = (str, PathLike)
     return [primary_header(one) if isinstance(one, paths) else one for one in headers], single
-
-
-def _library(source):
-    if isinstance(source, Library):
-        return source
-    if not isinstance(source, Calibration):
-        return Library(source)
-    library = Library([])
-    held, digest = validity_of(source), content_hash(source)
-    library.entries.append(Entry(Path("calibration in memory"), source, held, digest))
-    return library
 
 
 class LoadedCalibration:
@@ -414,7 +403,7 @@ class LoadedCalibration:
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
         headers, single = _headers(header)
-        frames = self._stated_frame() if header is None else self._frames(headers)
+        frames = self._frames(None if header is None else headers)
         if header is not None or "date" in self._stated:
             self._check(frames, light)
         chain, assumed = self._chain(light, headers, frames)
@@ -427,13 +416,17 @@ class LoadedCalibration:
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
         warn_beyond(chain, {k: finite_position(x, k) for k, x in positions.items() if k in PLACES})
         settings, which = distinct(positions)
-        if single:
-            which = which[0]
+        which = which[0] if single else which
         covariance = self._covariance
         matrices = MuellerMatrices(self.calibration, covariance, chain, lam, settings, which, mix)
-        shown = {name: _degrees(name, position) for name, position in positions.items()}
-        if single:
-            shown = {name: angle[0] for name, angle in shown.items()}
+        shown = {}
+        for name, position in positions.items():
+            if name in PLACES:
+                angle = finite_position(position, name) * PLACES[name]
+            else:
+                angle = u.Quantity(position)
+                angle = angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
+            shown[name] = angle[0] if single else angle
         return SystemMueller(matrices.values(), lam, beam, shown, assumed, matrices)
 
     def correct(
@@ -520,13 +513,11 @@ class LoadedCalibration:
         options = {"max_age": self._max_age, "light": light, "ways": _WAYS}
         check_frames(self.calibration, frames, self.path.name, **options)
 
-    def _stated_frame(self):
-        """Return a frame without a header, of the date that was stated."""
-        mode = self._stated.get("mode", self.validity.mode)
-        return [("the frame", self._stated.get("date"), mode)]
-
     def _frames(self, headers):
         """Return what to call each frame, its date and its mode; refuse other instruments."""
+        if headers is None:
+            mode = self._stated.get("mode", self.validity.mode)
+            return [("the frame", self._stated.get("date"), mode)]
         instrument = self.instrument
         if instrument is None:
             raise InstrumentError(
@@ -563,18 +554,14 @@ class LoadedCalibration:
 
     def _published(self, inner, dates):
         """Return a chain with the telescope as the instrument publishes it."""
-        told = {"wavelength": self.wavelength, "date": dates or None}
-        known = self.instrument.sky_options if self.instrument else ()
-        options = {key: told[key] for key in known}
-        try:
-            chain = self.instrument.on_sky(join(inner), **options) if self.instrument else None
-        except InstrumentError:
-            chain = None
-        if chain is None:
+        if self.instrument is None or not self.instrument.has_telescope:
             raise ChainError(
                 f"{self.path.name} calibrates no telescope, and no published one is known; "
                 "light='internal' leaves it out"
             )
+        told = {"wavelength": self.wavelength, "date": dates or None}
+        options = {key: told[key] for key in self.instrument.sky_options}
+        chain = self.instrument.on_sky(join(inner), **options)
         known = {leaf.name for leaf in inner}
         # axes of the telescope are optics, too, but there is nothing to calibrate in them
         assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)
@@ -586,13 +573,6 @@ class LoadedCalibration:
                 stacklevel=4,
             )
         return chain, assumed
-
-
-def _degrees(name, position):
-    if name in PLACES:
-        return finite_position(position, name) * PLACES[name]
-    angle = u.Quantity(position)
-    return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
 
 
 def _demodulation(hwp, state, difference):

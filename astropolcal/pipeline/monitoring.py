@@ -122,64 +122,55 @@ def _start(entry):
 def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     """Return what is to be said of the calibrations of an instrument and a mode."""
     dated = [e for e in entries if e.validity.valid_from is not None]
-    left_out = [f"{e.name} has no date" for e in entries if e.validity.valid_from is None]
-    found, why = None, ""
-    try:
-        found = courses(dated, events=events)
-    except (ParameterError, FitError) as problem:
-        why = str(problem)
     content = {
         "instrument": instrument,
         "mode": mode,
-        "calibrations": [_calibration(entry, rows[entry.name]) for entry in entries],
-        "courses": [] if found is None else _courses(found),
-        "events": [] if found is None else _events(found, dated),
-        "left_out": [*left_out, why] if why else left_out,
+        "calibrations": [
+            {
+                "name": entry.name,
+                "date": entry.validity.valid_from,
+                "datasets": rows[entry.name]["datasets"],
+                "s_res_percent": rows[entry.name]["s_res"],
+                "s_cv_percent": rows[entry.name]["s_cv"],
+                "converged": rows[entry.name]["converged"],
+            }
+            for entry in entries
+        ],
+        "courses": [],
+        "events": [],
+        "left_out": [f"{e.name} has no date" for e in entries if e.validity.valid_from is None],
     }
+    try:
+        found = courses(dated, events=events)
+    except (ParameterError, FitError) as problem:
+        found = ()
+        content["left_out"].append(str(problem))
+    for row in found:
+        what, course = row["what"], row["course"]
+        words = f"{what} {_COURSE_WORDS[course]} ({row[course]:.0%})"
+        one = {"what": what, "course": course} | {name: row[name] for name in COURSES}
+        content["courses"].append(one | {"words": words})
+        for (before, after), chance in zip(pairwise(dated), row["change"], strict=True):
+            if chance >= LIKELY:
+                days = [_start(e)[:10] for e in (before, after)]
+                words = f"{what} changed between {days[0]} and {days[1]} ({chance:.0%})"
+                one = {"what": what, "before": before.name, "after": after.name}
+                one |= {"from": days[0], "to": days[1], "probability": chance}
+                content["events"].append(one | {"words": words})
+    content["events"].sort(key=lambda one: one["to"])
     newest = dated[-1] if dated else entries[-1]
     known = instrument_of(newest.calibration) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
-    content["next"] = [
-        *_next(content, newest, moment, limit),
-        f"{newest.name}: {verdict.advice}",
-    ]
+    following = "Give the calibrations dates: with_validity(valid_from=) states one."
+    if dated:
+        due, n = moment_of(_start(newest), "date") + limit * u.day, len(dated)
+        words = "is due" if due < moment else f"is due by {due.isot[:10]}"
+        more = f"; {counted(3 - n, 'more run')} will show what changes" if n < 3 else ""
+        following = f"The next calibration {words}{more}."
+    content["next"] = [following, f"{newest.name}: {verdict.advice}"]
     return content
-
-
-def _calibration(entry, row):
-    return {
-        "name": entry.name,
-        "date": entry.validity.valid_from,
-        "datasets": str(row["datasets"]),
-        "s_res_percent": float(row["s_res"]),
-        "s_cv_percent": float(row["s_cv"]),
-        "converged": bool(row["converged"]),
-    }
-
-
-def _courses(found):
-    return [
-        {"what": str(row["what"]), "course": str(row["course"])}
-        | {name: float(row[name]) for name in COURSES}
-        | {"words": f"{row['what']} {_COURSE_WORDS[row['course']]} ({row[row['course']]:.0%})"}
-        for row in found
-    ]
-
-
-def _events(found, dated):
-    """Return the changes that are likely, in the order of time."""
-    events = []
-    for row in found:
-        for (before, after), chance in zip(pairwise(dated), row["change"], strict=True):
-            if chance >= LIKELY:
-                days = [_start(e)[:10] for e in (before, after)]
-                words = f"{row['what']} changed between {days[0]} and {days[1]} ({chance:.0%})"
-                one = {"what": str(row["what"]), "before": before.name, "after": after.name}
-                one |= {"from": days[0], "to": days[1], "probability": float(chance)}
-                events.append(one | {"words": words})
-    return sorted(events, key=lambda one: one["to"])
 
 
 def _alarms(content, newest, verdict, moment, goal, limit):
@@ -219,17 +210,6 @@ def _alarms(content, newest, verdict, moment, goal, limit):
             "beyond those that it states."
         )
     return found
-
-
-def _next(content, newest, moment, limit):
-    """Return when to calibrate again, a sentence in a list."""
-    n = len([one for one in content["calibrations"] if one["date"] is not None])
-    if not n:
-        return ["Give the calibrations dates: with_validity(valid_from=) states one."]
-    due = moment_of(_start(newest), "date") + limit * u.day
-    words = "is due" if due < moment else f"is due by {due.isot[:10]}"
-    more = f"; {counted(3 - n, 'more run')} will show what changes" if n < 3 else ""
-    return [f"The next calibration {words}{more}."]
 
 
 def write_health(content, path, *, figures=None):

@@ -151,13 +151,20 @@ def import_context(path, folder):
     try:
         with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as scratch:
             name, known = _checked(archive, path)
-            fresh = _poured(archive, known, Path(scratch), path)
-            _check_same(folder, known | {name: None}, Path(scratch))
+            # what it says of the sizes bounds what is unpacked
+            archive.extractall(scratch)
+            for file in (*known, name):
+                digest, there = sha256_of(Path(scratch) / file), folder / file
+                if known.get(file, digest) != digest:
+                    raise CalibrationFileError(f"{path}: {file} does not have its checksum")
+                if there.exists() and sha256_of(there) != digest:
+                    raise CalibrationFileError(
+                        f"{folder} has another file {file}; nothing is written"
+                    )
             folder.mkdir(parents=True, exist_ok=True)
             # the context last: it is there only when its files are
-            for file in (*fresh, name):
-                with atomic_path(folder / file, CalibrationFileError) as new:
-                    shutil.copyfile(Path(scratch) / file, new)
+            for file in (*known, name):
+                _copy(Path(scratch) / file, folder / file)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
         raise CalibrationFileError(f"{path}: is not an archive of a context") from None
     except OSError as problem:
@@ -183,28 +190,9 @@ def _checked(archive, path):
     return told[0], known
 
 
-def _poured(archive, known, scratch, path):
-    """Write the files of an archive into a folder that nobody sees; return their names."""
-    for item in archive.infolist():
-        digest, left = hashlib.sha256(), item.file_size
-        with archive.open(item) as source, open(scratch / item.filename, "wb") as target:
-            while block := source.read(min(_CHUNK, left + 1)):
-                # what it says of its size bounds what is read of it
-                left -= len(block)
-                if left < 0:
-                    raise CalibrationFileError(f"{path}: {item.filename} is larger than it says")
-                digest.update(block)
-                target.write(block)
-        if known.get(item.filename, digest.hexdigest()) != digest.hexdigest():
-            raise CalibrationFileError(f"{path}: {item.filename} does not have its checksum")
-    return list(known)
-
-
-def _check_same(folder, names, scratch):
-    for name in names:
-        there = folder / name
-        if there.exists() and sha256_of(there) != sha256_of(scratch / name):
-            raise CalibrationFileError(f"{folder} has another file {name}; nothing is written")
+def _copy(source, path):
+    with atomic_path(path, CalibrationFileError) as new:
+        shutil.copyfile(source, new)
 
 
 def fetch(url, folder, *, sha256):
@@ -257,8 +245,7 @@ def fetch(url, folder, *, sha256):
     if not (path.exists() and sha256_of(path) == sha256.lower()):
         path.parent.mkdir(parents=True, exist_ok=True)
         check_new(path, error=CalibrationFileError)
-        with atomic_path(path, CalibrationFileError) as new:
-            shutil.copyfile(cached, new)
+        _copy(cached, path)
     return path
 
 
@@ -271,23 +258,21 @@ def _download(url, path):
             "fetching needs fsspec: pip install 'astropolcal[remote]'"
         ) from None
     path.parent.mkdir(parents=True, exist_ok=True)
-    digest, size = hashlib.sha256(), 0
     with atomic_path(path, CalibrationFileError) as new:
         try:
             with fsspec.open(str(url), "rb") as source, open(new, "wb") as target:
                 while block := source.read(_CHUNK):
-                    size += len(block)
-                    if size > _MOST_ALL:
-                        raise CalibrationFileError(f"{url}: is larger than calibrations are")
-                    digest.update(block)
                     target.write(block)
+                    if target.tell() > _MOST_ALL:
+                        raise CalibrationFileError(f"{url}: is larger than calibrations are")
         except CalibrationFileError:
             raise
         except Exception as problem:
             # each file system has errors of its own
             said = one_line(str(problem)) or type(problem).__name__
             raise CalibrationFileError(f"{url}: cannot be fetched: {said}") from problem
-        if digest.hexdigest() != path.name:
+        digest = sha256_of(new)
+        if digest != path.name:
             raise CalibrationFileError(
-                f"{url}: has the checksum {digest.hexdigest()}, not {path.name}; it is not kept"
+                f"{url}: has the checksum {digest}, not {path.name}; it is not kept"
             )
