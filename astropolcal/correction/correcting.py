@@ -366,7 +366,7 @@ def _block(source, solution, wavelengths, by_variance, in_order, shape):
             # as for all other pixels: where V is not determined it is taken as zero
             solved = 3 if n == 4 and not known[i, 3] else n
             limit = solution.settings["max_condition"]
-            found = _solved(sums[:, np.nonzero(bad)[0] == i], n, solved, limit)
+            found = _solved(sums[..., np.nonzero(bad)[0] == i], solved, limit)
             out[:, i, bad[i]] = found[: len(out)]
     # the components, then their covariances
     for kept, column in enumerate([*((c,) for c in range(n)), *index]):
@@ -408,13 +408,11 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
     """
     Return the normal equations of pixels that lack some fluxes, summed over some units.
 
-    Of ``pixels``, (n_wavelengths, n_pixels), those that are true: their matrices and what the
-    scatter of the data adds to these, by the order of `covariance_index`, and the right sides.
+    Of ``pixels``, (n_wavelengths, n_pixels), those that are true: their matrices, what the scatter
+    of the data adds to these, and the right sides, (n, n + n + 1, n_true).
     """
     n, of = len(solution.components), np.nonzero(pixels)[0]
-    index = covariance_index(n)
-    normal, spread = np.zeros((2, len(index), of.size))
-    right = np.zeros((n, of.size))
+    sums = np.zeros((n, 2 * n + 1, of.size))
 
     def channels_of(read, frames, power=1):
         cells = [slice(f, f + 1) for f in frames]
@@ -437,41 +435,35 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
                         # a flux that the user gave the weight zero stays out
                         weight = (weight > 0) / variance[channel]
             weight = np.where(good, weight, 0.0)
-            right += row * (weight * np.where(good, data[channel], 0.0))
-            products = np.array([row[i] * row[j] for i, j in index])
-            normal += products * weight
+            products = row[:, None] * row
+            sums[:, :n] += products * weight
+            sums[:, 2 * n] += row * (weight * np.where(good, data[channel], 0.0))
             if variance is not None:
                 # A^T W V W A: with W = 1 / V it is the normal matrix itself
-                spread += products * (weight**2 * np.where(good, variance[channel], 0.0))
-    return np.concatenate([normal, spread, right])
+                scatter = np.where(good, variance[channel], 0.0)
+                sums[:, n : 2 * n] += products * (weight**2 * scatter)
+    return sums
 
 
-def _solved(sums, n, solved, max_condition):
+def _solved(sums, solved, max_condition):
     """Return components and covariances of pixels; NaN where they are poorly determined."""
-    index = covariance_index(n)
-    normal, spread, right = np.split(sums, [len(index), 2 * len(index)])
-    matrix = _full(normal, n)[:, :solved, :solved]
+    n = len(sums)
+    sums = np.moveaxis(sums, -1, 0)[:, :solved]
+    matrix, spread = sums[..., :solved], sums[..., n : n + solved]
     # eigenvalues of A^T W A are the squares of the singular values of the rows
     values = np.linalg.eigvalsh(matrix)
     good = values[:, 0] * max_condition**2 > values[:, -1]
     inverse = np.full(matrix.shape, np.nan)
     inverse[good] = np.linalg.inv(matrix[good])
-    out = np.full((n + len(index), sums.shape[1]), np.nan)
-    out[:solved] = np.einsum("pij,jp->ip", inverse, right[:solved])
+    index = covariance_index(n)
+    out = np.full((n + len(index), len(matrix)), np.nan)
+    out[:solved] = np.einsum("pij,pj->ip", inverse, sums[..., 2 * n])
     # (A^T W A)^-1 A^T W V W A (A^T W A)^-1, right for any weights W
-    covariance = inverse @ _full(spread, n)[:, :solved, :solved] @ inverse
+    covariance = inverse @ spread @ inverse
     for plane, (i, j) in enumerate(index, start=n):
         if max(i, j) < solved:
             out[plane] = covariance[:, i, j]
     return out
-
-
-def _full(planes, n):
-    """Return symmetric matrices, (n_pixels, n, n), of their upper triangles."""
-    matrix = np.empty((planes.shape[1], n, n))
-    for plane, (i, j) in zip(planes, covariance_index(n), strict=True):
-        matrix[:, i, j] = matrix[:, j, i] = plane
-    return matrix
 
 
 def _on_cluster(address, function, parts):

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Science frames: the fluxes of both beams, where the stages stood, how the field was turned."""
 
+import warnings
 from dataclasses import dataclass, field, replace
 
 import astropy.units as u
@@ -264,14 +265,9 @@ class ScienceFrames:
         difference, total = np.asarray(difference), np.asarray(total)
         # var(r - l) = var(r) + var(l), shared evenly as nothing else is known
         half = None if variance is None else np.asarray(variance) / 2
-        return cls.from_arrays(
-            (total + difference) / 2,
-            (total - difference) / 2,
-            *arguments,
-            variance_right=half,
-            variance_left=half,
-            **settings,
-        )
+        settings |= {"variance_right": half, "variance_left": half}
+        beams = (total + difference) / 2, (total - difference) / 2
+        return cls.from_arrays(*beams, *arguments, **settings)
 
     @classmethod
     def from_files(
@@ -338,7 +334,7 @@ class ScienceFrames:
         left = [layout.left_file(path) for path in files] if layout.beam_files else None
         source = CubeFiles(
             files,
-            _in_files(_centres(centres, layout), layout),
+            _centres(centres, layout),
             size,
             position_angle=position_angle,
             extension=layout.cube_extension,
@@ -400,50 +396,36 @@ def _circle(shape):
 
 def _pairs(hwp, positions, names):
     """Return the pairs of frames, or None where there are none; only some corrections need them."""
-    import warnings
-
     derotator = positions.get("derotator")
-    if derotator is not None and not isinstance(derotator, u.Quantity):
-        derotator = np.asarray(derotator) * u.rad
+    if derotator is not None:
+        derotator = u.Quantity(derotator, getattr(derotator, "unit", u.rad))
+        derotator = np.broadcast_to(derotator, hwp.shape, subok=True)
+    # on sky it follows the field, so more than at the internal source
+    options = {"derotator_tolerance": 2 * u.deg, "labels": names}
     try:
         with warnings.catch_warnings():
             # that frames are left over matters only where pairs are used
             warnings.simplefilter("ignore")
-            found = pair_frames(
-                hwp,
-                None if derotator is None else np.broadcast_to(derotator, hwp.shape, subok=True),
-                positions.get("flc_state"),
-                # on sky it follows the field, so more than at the internal source
-                derotator_tolerance=2 * u.deg,
-                labels=names,
-            )
+            found = pair_frames(hwp, derotator, positions.get("flc_state"), **options)
     except ObservationError:
         return None
     return found if len(found) else None
 
 
 def _centres(centres, layout):
-    """Return the place of the same point in the right and the left beam."""
+    """Return the place of the same point in the right and the left beam, in the image of each."""
     if centres is None:
         left, right = layout.internal_apertures[:2]
         # the place of the left beam such that both are equally far from their rectangles
-        middle = (np.add(left, right) - layout.star_offset) / 2
-        centres = middle
-    centres = np.asarray(centres, dtype=float)
+        centres = (np.add(left, right) - layout.star_offset) / 2
+    centres = np.array(centres, dtype=float)
     if centres.shape[-1:] != (2,) or not np.all(np.isfinite(centres)):
         raise ParameterError(f"centres of shape {centres.shape}; x and y of each are needed")
     if centres.shape == (2,) or (centres.ndim == 2 and centres.shape != (2, 2)):
         centres = np.stack([centres + layout.star_offset, centres], axis=-2)
-    return centres
-
-
-def _in_files(centres, layout):
-    """Return centres in the image of each beam, whose files may be apart."""
-    if not layout.beam_files:
-        return centres
-    centres = np.array(centres)
-    # side by side the left image comes first
-    centres[..., 0, 0] -= layout.file_shape[2]
+    if layout.beam_files:
+        # their files are apart; side by side the left image comes first
+        centres[..., 0, 0] -= layout.file_shape[2]
     return centres
 
 
@@ -456,14 +438,31 @@ def frame_positions(instrument, table, chain, names=None):
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))
-    for stage in (stage for stage in stages(chain) if stage not in COORDINATES):
-        if stage in ("parallactic", "altitude") and {"time", "right_ascension"} & set(
-            table.colnames
-        ):
-            continue
-        _check_angles(table, stage, names)
-    if "flc_state" in stages(chain):
-        _check_states(table, names)
+    modulated = "flc_state" in stages(chain)
+    needed = [stage for stage in stages(chain) if stage not in COORDINATES]
+    if {"time", "right_ascension"} & set(table.colnames):
+        # these are worked out
+        needed = [stage for stage in needed if stage not in ("parallactic", "altitude")]
+    for stage in needed:
+        if stage not in table.colnames:
+            raise ObservationError(
+                f"{names[0]}: no angle {stage!r}, which the calibrated chain needs; there is "
+                f"{', '.join(table.colnames) or 'nothing'}"
+            )
+        values = table[stage]
+        # numpy drops the mask of both kinds of masked columns without a word
+        values = values.filled(np.nan) if hasattr(values, "filled") else values
+        unknown = ~np.isfinite(np.asarray(values.value, dtype=float))
+        if unknown.any():
+            raise ObservationError(f"{names[int(np.argmax(unknown))]}: no angle {stage!r}")
+    states = table["flc_state"] if "flc_state" in table.colnames else [""] * len(table)
+    states = np.ma.filled(np.ma.asarray(states).astype(str), "")
+    for name, state in zip(names, states, strict=True):
+        if modulated and not state.strip():
+            raise ObservationError(
+                f"{name}: no state of the modulator, flc_state, which the calibrated chain needs; "
+                "allowed are A and B"
+            )
     table["frame"], table["bin"] = np.arange(len(table)), np.zeros(len(table), dtype=int)
     # a table of observations needs a wavelength; no position depends on it
     table["wavelength"] = 1 * u.um
@@ -473,28 +472,3 @@ def frame_positions(instrument, table, chain, names=None):
     table.meta = {key: table.meta[key] for key in ("tracking",) if key in table.meta}
     observations = Observations.from_table(table, name=names[0])
     return dict(instrument.positions(observations, chain))
-
-
-def _check_angles(table, stage, names):
-    if stage not in table.colnames:
-        raise ObservationError(
-            f"{names[0]}: no angle {stage!r}, which the calibrated chain needs; there is "
-            f"{', '.join(table.colnames) or 'nothing'}"
-        )
-    values = table[stage]
-    # numpy drops the mask of both kinds of masked columns without a word
-    values = values.filled(np.nan) if hasattr(values, "filled") else values
-    unknown = ~np.isfinite(np.asarray(values.value, dtype=float))
-    if unknown.any():
-        raise ObservationError(f"{names[int(np.argmax(unknown))]}: no angle {stage!r}")
-
-
-def _check_states(table, names):
-    """Refuse frames without the state of the modulator that the chain has."""
-    found = table["flc_state"] if "flc_state" in table.colnames else [""] * len(table)
-    for name, state in zip(names, np.ma.filled(np.ma.asarray(found).astype(str), ""), strict=True):
-        if not state.strip():
-            raise ObservationError(
-                f"{name}: no state of the modulator, flc_state, which the calibrated chain needs; "
-                "allowed are A and B"
-            )

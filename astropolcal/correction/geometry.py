@@ -11,7 +11,6 @@ of the sky already.
 from functools import lru_cache
 from itertools import pairwise
 
-import astropy.units as u
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -27,30 +26,24 @@ _EXACT = 1e-12
 _REACH = 25
 
 
-def derotate(
-    image, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
-):
+def derotate(image, position_angle, *, centre=None, size=None, mirrored=False, order=3):
     """
     Resample images (..., Y, X) so that north is up and east is left.
 
     NaN outside and where a pixel without a value has a share.
 
     ``position_angle`` is that of the +y axis, from north through east; ``centre`` the 0-based x and
-    y that stays (by default the middle), ``centre_out`` where it lies in the result of ``size``
-    rows and columns; ``mirrored`` images have east to the right of north; ``order`` is the
-    spline's, 0 to 5. Surface brightness is interpolated: a rotation keeps the area of a pixel, so
-    flux is conserved.
+    y that stays (by default the middle), or lies in the middle of the result of ``size`` rows and
+    columns; ``mirrored`` images have east to the right of north; ``order`` is the spline's, 0 to 5.
+    Surface brightness is interpolated: a rotation keeps the area of a pixel, so flux is conserved.
     """
     image = np.asarray(image, dtype=float)
-    grid = _grid(image, position_angle, centre, size, mirrored, centre_out)
     if not 0 <= order <= 5:
         raise ParameterError(f"order = {order}; allowed are 0 to 5")
-    return _resampled(image, *grid, order)
+    return _resampled(image, *_grid(image.shape, position_angle, centre, size, mirrored), order)
 
 
-def derotate_variance(
-    variance, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
-):
+def derotate_variance(variance, position_angle, *, centre=None, size=None, mirrored=False, order=3):
     """
     Return the variances of images turned by `derotate`, of independent pixels.
 
@@ -58,26 +51,25 @@ def derotate_variance(
     variance is the same within a few pixels. Correlations that resampling makes are not in it.
     """
     variance = np.asarray(variance, dtype=float)
-    matrix, offset, shape = _grid(variance, position_angle, centre, size, mirrored, centre_out)
+    grid = _grid(variance.shape, position_angle, centre, size, mirrored)
     # linear at most: a cubic spline would make negative variances beside a bright pixel
-    smooth = _resampled(variance, matrix, offset, shape, min(order, 1))
-    y, x = _places(matrix, offset, shape)
-    # the weights of a spline in two dimensions are products, and so are the sums of their squares
-    return smooth * _gain(y, order) * _gain(x, order)
+    smooth = _resampled(variance, *grid, min(order, 1))
+    fraction, gain = _gain_table(order)
+    for place in _places(*grid):
+        # the weights of a spline in two dimensions are products, and so are the sums of their
+        # squares
+        smooth = smooth * np.interp(place - np.floor(place), fraction, gain)
+    return smooth
 
 
-def _grid(image, position_angle, centre, size, mirrored, centre_out):
+def _grid(image_shape, position_angle, centre, size, mirrored):
     """Return matrix and offset from pixels of the result to those of the image, and its shape."""
     angle = float(angle_to_rad(position_angle, "position_angle"))
     if not np.isfinite(angle):
         raise ParameterError(f"position_angle = {position_angle} must be finite")
-    height, width = image.shape[-2:]
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    x, y = _point("centre", middle if centre is None else centre)
-    shape = (height, width) if size is None else tuple(np.broadcast_to(size, 2).tolist())
-    if centre_out is None:
-        centre_out = (x, y) if size is None else ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
-    out_x, out_y = _point("centre_out", centre_out)
+    shape = image_shape[-2:] if size is None else tuple(np.broadcast_to(size, 2).tolist())
+    x, y = _point(centre, image_shape[-2:])
+    out_x, out_y = (x, y) if size is None else _point(None, shape)
     cosine, sine = _clean(np.cos(angle)), _clean(np.sin(angle))
     parity = -1.0 if mirrored else 1.0
     # a direction at the position angle of +y, (-sin, cos) on the sky, is (0, 1) in the image
@@ -91,10 +83,12 @@ def _clean(value):
     return float(np.rint(value)) if abs(value - np.rint(value)) < _EXACT else float(value)
 
 
-def _point(name, point):
-    point = np.asarray(point, dtype=float)
+def _point(point, shape):
+    """Return x and y of a point of an image, by default its middle."""
+    middle = [(shape[1] - 1) / 2, (shape[0] - 1) / 2]
+    point = np.asarray(middle if point is None else point, dtype=float)
     if point.shape != (2,) or not np.all(np.isfinite(point)):
-        raise ParameterError(f"{name} = {point}; two finite numbers are needed, x and y")
+        raise ParameterError(f"centre = {point}; two finite numbers are needed, x and y")
     return point
 
 
@@ -114,7 +108,12 @@ def _resampled(image, matrix, offset, shape, order):
         # the holes of masked pixels by many rows
         share = _interpolated(bad.astype(float), matrix, offset, shape, min(order, 1))
         out[np.broadcast_to(share > _EXACT, out.shape)] = np.nan
-    out[:, _outside(matrix, offset, shape, flat.shape[1:])] = np.nan
+    # beyond the middles of the last pixels; rounding of the rotation must not cost those
+    slack = 1e-9
+    for place, last in zip(
+        _places(matrix, offset, shape), np.array(flat.shape[1:]) - 1, strict=True
+    ):
+        out[:, (place < -slack) | (place > last + slack)] = np.nan
     return out.reshape(*image.shape[:-2], *shape)
 
 
@@ -144,16 +143,6 @@ def _cropped(image, matrix, offset, shape):
     return image[..., low[0] : high[0], low[1] : high[1]], offset - low
 
 
-def _outside(matrix, offset, shape, image_shape):
-    """Return which pixels of the result lie beyond the middles of the image's last pixels."""
-    y, x = _places(matrix, offset, shape)
-    # rounding of the rotation must not cost the outermost rows
-    slack = 1e-9
-    height, width = image_shape
-    outside = (y < -slack) | (y > height - 1 + slack)
-    return outside | (x < -slack) | (x > width - 1 + slack)
-
-
 def _places(matrix, offset, shape):
     """Return y and x in the image of all pixels of the result."""
     rows, columns = np.indices(shape)
@@ -176,24 +165,6 @@ def _gain_table(order, steps=100):
     return fraction, (kernel.reshape(31, -1) ** 2).sum(axis=0)
 
 
-def _gain(place, order):
-    return np.interp(place - np.floor(place), *_gain_table(order))
-
-
-def position_angles(shape, centre=None):
-    """
-    Return the position angle of every pixel about a point of an image with north up.
-
-    Degree, from north through east, -180 to 180; the point is 0-based x and y, by default the
-    middle.
-    """
-    height, width = shape
-    x, y = _point("centre", ((width - 1) / 2, (height - 1) / 2) if centre is None else centre)
-    rows, columns = np.indices(shape)
-    # north is +y and east is -x
-    return np.rad2deg(np.arctan2(x - columns, rows - y)) * u.deg
-
-
 def azimuthal(q, u_, centre=None):
     """
     Return Q_phi and U_phi about a star; positive Q_phi is polarization across the direction to it.
@@ -207,7 +178,11 @@ def azimuthal(q, u_, centre=None):
 
 
 def _double(shape, centre):
-    angle = 2 * position_angles(shape, centre).to_value(u.rad)
+    """Return cosine and sine of twice the position angle of every pixel about a point."""
+    x, y = _point(centre, shape)
+    rows, columns = np.indices(shape)
+    # from north, +y, through east, which is -x
+    angle = 2 * np.arctan2(x - columns, rows - y)
     return np.cos(angle), np.sin(angle)
 
 
@@ -298,17 +273,12 @@ def _weights(block, matrix, offset, size, order):
 
 def _taps(place, n, order):
     """Return the pixels that have a share at each place along an axis of n pixels, and shares."""
+    from scipy.interpolate import BSpline
+
     # what lies outside has no value in the end; it must only not lie outside of the array
-    place = np.clip(place, 0.0, n - 1.0)
-    # the last pixel itself lies at the end of the last interval, not at the begin of another
-    first = np.minimum(place.astype(np.int32), n - 2)
-    f = (place - first)[:, None]
-    g = 1.0 - f
-    if order == 1:
-        return first[:, None] + np.arange(2, dtype=np.int32), np.concatenate([g, f], axis=1)
-    # the cubic B-spline at distances 1 + f, f, 1 - f and 2 - f, times six
-    shares = [g**3, 4 - 6 * f**2 + 3 * f**3, 4 - 6 * g**2 + 3 * g**3, f**3]
-    pixels = first[:, None] + np.arange(-1, 3, dtype=np.int32)
+    place, knots = np.clip(place, 0.0, n - 1.0), np.arange(-order, n + order, dtype=float)
+    basis = BSpline.design_matrix(place, knots, order)
+    pixels = basis.indices.reshape(-1, order + 1) - order // 2
     # taps beyond an end fall on the pixels mirrored about it
     pixels = n - 1 - np.abs(n - 1 - np.abs(pixels))
-    return pixels, np.concatenate(shares, axis=1) / 6
+    return pixels, basis.data.reshape(pixels.shape)

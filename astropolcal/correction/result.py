@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Corrected Stokes parameters with what is known of their errors."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
@@ -12,7 +12,7 @@ from astropolcal.correction.geometry import azimuthal, azimuthal_variances
 from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.star import measured_star, stated_star, without_star
-from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.stokes import debias_dolp, polarization_angle, polarization_errors
 from astropolcal.words import check_choice
 
@@ -173,14 +173,9 @@ class Corrected:
         """
         return fractions(self.stokes, self.covariances(kind), self.components)
 
-    def polarization(self, method="mas"):
+    def polarization(self):
         """
         Return degree and angle of linear polarization with their errors.
-
-        Parameters
-        ----------
-        method : str
-            Of `~astropolcal.stokes.debias_dolp`, for the statistical error.
 
         Returns
         -------
@@ -190,7 +185,7 @@ class Corrected:
             degree).
         """
         kinds = {kind: self.fractional_errors(kind) for kind in _KINDS}
-        return polarization(self.q, self.u, kinds, method)
+        return polarization(self.q, self.u, kinds)
 
     def azimuthal(self):
         """
@@ -236,8 +231,7 @@ class Corrected:
         """
         inside = self._circle(radius, centre, inner)
         covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
-        changed = {"stokes": self.stokes[..., inside].sum(axis=-1), "covariance": covariance}
-        return type(self)(**{**self.__dict__, **changed})
+        return replace(self, stokes=self.stokes[..., inside].sum(axis=-1), covariance=covariance)
 
     def _circle(self, radius, centre=None, inner=0.0):
         """Return the pixels of a circle, or of a ring, that does not leave the images."""
@@ -342,23 +336,19 @@ class Corrected:
             ``"I"``, ``"q"``, ``"u"`` (and ``"v"``). The uncertainty is the statistical one; the
             systematic one, one value per wavelength, stands in ``meta["systematic"]``.
         """
-        try:
-            from specutils import Spectrum
-        except ImportError:
-            raise AstropolcalError("spectra need specutils 2, which is not installed") from None
         from astropy.nddata import StdDevUncertainty
+        from specutils import Spectrum
 
-        table = self.table()
-        found = {}
+        table, found = self.table(), {}
         for name in ("I", *self.components[1:].lower()):
-            flux = u.Quantity(table[name])
+            keys = (name, *(f"{name}_{kind}" for kind in _KINDS))
+            flux, *errors = (u.Quantity(table[key]) for key in keys)
             found[name] = Spectrum(
                 flux=flux,
                 spectral_axis=self.wavelength,
-                uncertainty=StdDevUncertainty(u.Quantity(table[f"{name}_statistical"])),
+                uncertainty=StdDevUncertainty(errors[0]),
                 mask=~np.isfinite(flux.value),
-                meta=dict(table.meta)
-                | {"systematic": np.asarray(u.Quantity(table[f"{name}_systematic"]).value)},
+                meta=dict(table.meta) | {"systematic": np.asarray(errors[1].value)},
             )
         return found
 
@@ -426,28 +416,21 @@ def fractions(stokes, covariances, components="IQU"):
     share = stokes / light
     found = {}
     with np.errstate(invalid="ignore"):
-        for i, name in enumerate(components[1:].lower(), start=1):
+
+        def cross(i, j):
             # dq = (dQ - q dI) / I to first order
-            variance = (
-                covariances[i, i]
-                - 2 * share[i] * covariances[0, i]
-                + share[i] ** 2 * covariances[0, 0]
-            ) / light**2
+            mixed = share[i] * covariances[0, j] + share[j] * covariances[0, i]
+            return (covariances[i, j] - mixed + share[i] * share[j] * covariances[0, 0]) / light**2
+
+        for i, name in enumerate(components[1:].lower(), start=1):
             # what is open has no covariance, but an infinite error all the same
-            variance = np.where(np.isinf(covariances[i, i]), np.inf, variance)
+            variance = np.where(np.isinf(covariances[i, i]), np.inf, cross(i, i))
             found[name] = np.where(bright, np.sqrt(np.maximum(variance, 0)), np.nan)
-        # the same for the covariance of q and u
-        cross = (
-            covariances[1, 2]
-            - share[1] * covariances[0, 2]
-            - share[2] * covariances[0, 1]
-            + share[1] * share[2] * covariances[0, 0]
-        ) / light**2
-    found["covariance_qu"] = np.where(bright, cross, np.nan)
+        found["covariance_qu"] = np.where(bright, cross(1, 2), np.nan)
     return found
 
 
-def polarization(q, u, errors, method="mas"):
+def polarization(q, u, errors):
     """
     Return degree and angle of linear polarization with their errors.
 
@@ -465,7 +448,7 @@ def polarization(q, u, errors, method="mas"):
         result[f"s_p_{kind}"], result[f"s_chi_{kind}"] = s_p, s_chi
         if kind == "statistical":
             known = np.isfinite(across) & np.isfinite(dolp)
-            result["dolp_debiased"][known] = debias_dolp(dolp[known], across[known], method)
+            result["dolp_debiased"][known] = debias_dolp(dolp[known], across[known])
     return result
 
 

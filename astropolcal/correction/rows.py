@@ -26,27 +26,22 @@ from astropolcal.units import length_to_um
 __all__ = ["ideal_chain", "measurement_rows"]
 
 
-def sky_chain(
-    calibration, dataset=None, *, optics_in=None, beam=None, label="the calibration", date=None
-):
+def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration", date=None):
     """
     Return the optics from the sky to the detector, with calibrated values.
 
     The chain of a star that was calibrated, without the star; if there is none, the instrument's
     chain from the sky with the calibrated optics inside. Without a telescope it begins with the
-    first optic on a stage. ``dataset`` picks one of the calibration's chains, by default that of
-    the optics in the beam: ``optics_in`` (all of them), ``beam`` (single ones, see
-    `Instrument.optics_of`). ``date`` is that of the frames, for a telescope that changed.
+    first optic on a stage. Of several chains it is that of the optics in the beam: ``optics_in``
+    (all of them), ``beam`` (single ones, see `Instrument.optics_of`). ``date`` is that of the
+    frames, for a telescope that changed.
     """
-    chains = getattr(calibration, "chains", [calibration])
-    if dataset is not None:
-        chains = [chains[dataset]]
-    elif hasattr(calibration, "datasets"):
-        inner = inner_optics(calibration, optics_in, beam, label)
-        chains = [join([*(telescope_optics(calibration) or ()), *inner])]
-    instrument = known_instrument(getattr(calibration, "instrument", None))
-    wavelength = getattr(calibration, "wavelength", None)
-    return chain_from_sky(chains, instrument, wavelength, date)[0]
+    if not hasattr(calibration, "datasets"):
+        return chain_from_sky([calibration])[0]
+    inner = inner_optics(calibration, optics_in, beam, label)
+    chain = join([*(telescope_optics(calibration) or ()), *inner])
+    instrument = known_instrument(calibration.instrument)
+    return chain_from_sky([chain], instrument, calibration.wavelength, date)[0]
 
 
 class RowModel(Rows):

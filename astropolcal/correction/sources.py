@@ -252,11 +252,7 @@ def _places(path, extension):
 
     Shape, type and start of each; no start if its numbers are packed or scaled.
     """
-    with (
-        readable_fits(path),
-        open_fits(path) as stream,
-        fits.open(stream, memmap=True) as hdus,
-    ):
+    with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
         if len(hdus) <= extension:
             raise ObservationError(f"{path}: no extension {extension} in it")
         packed = isinstance(stream, io.BytesIO)

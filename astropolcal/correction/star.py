@@ -32,7 +32,13 @@ COLUMNS += ["dolp", "aolp", *(f"{n}_{kind}" for n in ("s_p", "s_chi") for kind i
 
 def measured_star(corrected, annulus):
     """Return the light within two radii as a spectrum, of the pixels that have a value."""
-    inner, outer = _radii(annulus)
+    try:
+        inner, outer = (float(radius) for radius in annulus)
+    except (TypeError, ValueError):
+        inner = outer = np.nan
+    if not 0 <= inner < outer < np.inf:
+        raise ParameterError(f"annulus = {annulus}; two radii in pixels are needed, inner < outer")
+    words = f"annulus of {inner:g} to {outer:g} pixels"
     known = np.isfinite(corrected.stokes[:3]).all(axis=0)
     inside = corrected._circle(outer, inner=inner)
     # a wavelength that is not determined has no value anywhere
@@ -40,8 +46,8 @@ def measured_star(corrected, annulus):
         missing = int((inside & ~known[w]).sum())
         if 2 * missing > inside.sum():
             raise ObservationError(
-                f"annulus of {inner:g} to {outer:g} pixels: {missing} of its {inside.sum()} pixels "
-                f"have no value at {corrected.wavelength[w]:.6g}; at least half are needed"
+                f"{words}: {missing} of its {inside.sum()} pixels have no value at "
+                f"{corrected.wavelength[w]:.6g}; at least half are needed"
             )
     covariance = corrected.covariance
     if covariance is not None:
@@ -52,26 +58,16 @@ def measured_star(corrected, annulus):
     dark = star["I"] <= 0
     if dark.any():
         raise ObservationError(
-            f"annulus of {inner:g} to {outer:g} pixels: no light at "
-            f"{corrected.wavelength[np.argmax(dark)]:.6g}, from which a polarization would follow"
+            f"{words}: no light at {corrected.wavelength[np.argmax(dark)]:.6g}, from which a "
+            "polarization would follow"
         )
     most = np.nanmax(np.hypot(star.q, star.u), initial=0.0)
     if most > 1:
         raise ObservationError(
-            f"annulus of {inner:g} to {outer:g} pixels: its light is polarized by "
-            f"{100 * most:.3g} %, which no light is; it holds too little of the star"
+            f"{words}: its light is polarized by {100 * most:.3g} %, which no light is; it holds "
+            "too little of the star"
         )
     return star
-
-
-def _radii(annulus):
-    try:
-        inner, outer = (float(radius) for radius in annulus)
-    except (TypeError, ValueError):
-        inner = outer = np.nan
-    if not 0 <= inner < outer < np.inf:
-        raise ParameterError(f"annulus = {annulus}; two radii in pixels are needed, inner < outer")
-    return inner, outer
 
 
 def stated_star(corrected, dolp, aolp, errors):

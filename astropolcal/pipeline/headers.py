@@ -263,18 +263,14 @@ def told_beam(headers, instrument, labels=None):
     return {name: is_in for name, (_, is_in) in found.items()}
 
 
-# how a caller states what headers lack, where a command has no option for it
-_WAYS = {"date": "date= states it", "mode": "mode={}"}
-
-
-def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True):
+def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", dates=True):
     """Refuse frames for which a calibration does not hold, and warn if it is old for some.
 
     ``frames`` are label, date (UTC) and mode, None where not known. ``light`` is "sky" or
     "internal"; ``ways`` says what the caller can do about a missing ``date`` or ``mode``, or an
     ``other date``.
     """
-    held, ways = validity_of(calibration), _WAYS if ways is None else ways
+    held = validity_of(calibration)
     dated = dates and (held.valid_from is not None or held.valid_until is not None)
     moments, way = {}, ways["mode"].format(repr(held.mode))
     for label, date, mode in frames:

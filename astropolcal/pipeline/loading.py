@@ -430,14 +430,7 @@ class LoadedCalibration:
         return SystemMueller(matrices.values(), lam, beam, shown, assumed, matrices)
 
     def correct(
-        self,
-        stokes,
-        header=None,
-        *,
-        positions=None,
-        hwp=None,
-        difference="right-left",
-        **options,
+        self, stokes, header=None, *, positions=None, hwp=None, difference="right-left", **options
     ):
         r"""
         Correct a Stokes cube that a pipeline has made of frames by differences.

@@ -119,16 +119,6 @@ def test_bias_is_removed_by_the_statistical_error_only():
     assert np.isnan(only["dolp_debiased"]).all()
 
 
-def test_other_estimators_of_the_degree():
-    for method in ["mas", "wardle-kronberg"]:
-        q, u, error = np.array([0.005]), np.zeros(1), {"statistical": errors(2e-3, 2e-3, 0.0)}
-        found = polarization(q, u, error, method)["dolp_debiased"]
-        np.testing.assert_allclose(found, debias_dolp(np.array([0.005]), np.array([2e-3]), method))
-        # p - s^2 (1 - exp(-p^2/s^2)) / (2 p), Plaszczynski et al. 2014; sqrt(p^2 - s^2)
-        known = {"mas": 5e-3 - 4e-6 * (1 - np.exp(-6.25)) / 1e-2, "wardle-kronberg": np.sqrt(21e-6)}
-        np.testing.assert_allclose(found, known[method], rtol=1e-6)
-
-
 def test_nothing_polarized_has_no_angle():
     found = polarization(np.zeros(1), np.zeros(1), {"statistical": errors(1e-3, 1e-3, 0.0)})
     assert found["dolp"][0] == 0

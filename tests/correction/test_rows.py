@@ -156,7 +156,6 @@ def test_chain_of_the_optics_in_the_beam(two_beams):
         for chain in (
             sky_chain(two_beams, optics_in=optics_in),
             sky_chain(two_beams, beam=told),
-            sky_chain(two_beams, dataset=len(optics_in)),
         ):
             names = [leaf.name for leaf in leaves(chain)]
             assert names[:2] == ["parallactic", "m3"]
