@@ -109,13 +109,12 @@ class _Config(AsdfConfig):
 
     @property
     def extensions(self):
-        get_ours = get_extensions
-        return _plugged_in("asdf.extensions", ExtensionProxy, get_ours, self.packages)
+        return _plugged_in("asdf.extensions", ExtensionProxy, get_extensions, self.packages)
 
     @property
     def resource_mappings(self):
-        get_ours = get_resource_mappings
-        return _plugged_in("asdf.resource_mappings", ResourceMappingProxy, get_ours, self.packages)
+        group, get = "asdf.resource_mappings", get_resource_mappings
+        return _plugged_in(group, ResourceMappingProxy, get, self.packages)
 
 
 class _ConfigWithUnits(_Config):

@@ -360,7 +360,8 @@ def _parameter_node(optic, key):
         node["unit"] = declared.to_string()
     if parameter.grid is not None:
         node["wavelength"] = np.array(parameter.grid)
-    node |= {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
+    bounds = [None if bound is None else float(bound) for bound in parameter.bounds]
+    node |= {"fixed": bool(parameter.fixed), "bounds": bounds}
     known = {} if parameter.prior is None else {"prior": prior_node(parameter.prior, label)}
     return node | known | _law_node(optic, key)
 
@@ -377,10 +378,6 @@ def _law_node(optic, key):
         "coefficients": {name: _parameter_node(optic, label) for name, label in names},
     }
     return {"law": node if law.since is None else node | {"since": law.since}}
-
-
-def _bounds(parameter):
-    return [None if bound is None else float(bound) for bound in parameter.bounds]
 
 
 # ---- optics, read ---------------------------------------------------------------------

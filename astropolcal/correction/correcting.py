@@ -425,7 +425,7 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
         data = channels_of(source.fluxes, frames)
         variance = channels_of(source.variances, frames, 2) if source.has_variances else None
         for channel in (0, 1):
-            row = solution.channel_rows[channel, wavelengths, unit, :n][of].T
+            row = np.take(solution.channel_rows[channel, wavelengths, unit, :n].T, of, axis=1)
             weight = solution.weights[channel, wavelengths, unit][of]
             good = np.isfinite(data[channel])
             if variance is not None:
@@ -434,14 +434,13 @@ def _equations(source, solution, wavelengths, pixels, by_variance, units):
                     with np.errstate(divide="ignore", invalid="ignore"):
                         # a flux that the user gave the weight zero stays out
                         weight = (weight > 0) / variance[channel]
-            weight = np.where(good, weight, 0.0)
-            products = row[:, None] * row
-            sums[:, :n] += products * weight
-            sums[:, 2 * n] += row * (weight * np.where(good, data[channel], 0.0))
+            weighted = row * np.where(good, weight, 0.0)
+            sums[:, :n] += row[:, None] * weighted
+            sums[:, 2 * n] += weighted * np.where(good, data[channel], 0.0)
             if variance is not None:
                 # A^T W V W A: with W = 1 / V it is the normal matrix itself
                 scatter = np.where(good, variance[channel], 0.0)
-                sums[:, n : 2 * n] += products * (weight**2 * scatter)
+                sums[:, n : 2 * n] += weighted[:, None] * (weighted * scatter)
     return sums
 
 

@@ -185,7 +185,6 @@ class ScienceFrames:
         variance_right=None,
         variance_left=None,
         names=None,
-        batch=None,
         hwp=None,
         position_angle=None,
         centre=None,
@@ -205,8 +204,6 @@ class ScienceFrames:
             each beam to its fluxes: ``positions`` are still those of the exposures.
         names : sequence of str, optional
             What to call the frames.
-        batch : int, optional
-            Frames that are read at a time.
         wavelength, positions
             As the attributes.
         hwp : `~astropy.units.Quantity`, optional
@@ -233,7 +230,7 @@ class ScienceFrames:
             # no light falls where there is no beam, and nothing is learnt from it
             left = np.broadcast_to(0.0, np.shape(right))
             variance_left = None if variance_right is None else np.broadcast_to(1.0, left.shape)
-        source = ArraySource(right, left, variance_right, variance_left, names, batch)
+        source = ArraySource(right, left, variance_right, variance_left, names)
         if position_angle is not None:
             options = {"centre": centre, "mirrored": mirrored, "order": order}
             source = TurnedSource(source, position_angle, **options)

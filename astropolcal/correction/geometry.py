@@ -121,7 +121,8 @@ def _interpolated(planes, matrix, offset, shape, order):
     """Return what a spline through finite planes gives at the places of the result."""
     from scipy.ndimage import affine_transform
 
-    if suits(planes.shape, order):
+    many = planes.shape[0] >= _FEWEST_PLANES and min(planes.shape[1:]) >= _SHORTEST
+    if many and order in (1, 3):
         return resample(planes, matrix, offset, shape, order)
     # mirrored edges are what the filter of our own spline assumes too
     settings = {"output_shape": shape, "mode": "mirror", "order": order}
@@ -211,11 +212,6 @@ _POLE = np.sqrt(3.0) - 2.0
 _RECURSION = 25
 # pixels of the result whose weights are in memory at a time: 16 each, 12 bytes a weight
 _BLOCK = 2**17
-
-
-def suits(shape, order):
-    """Return whether `resample` takes images of this shape, (planes, rows, columns)."""
-    return order in (1, 3) and shape[0] >= _FEWEST_PLANES and min(shape[1:]) >= _SHORTEST
 
 
 def resample(planes, matrix, offset, shape, order):

@@ -103,10 +103,7 @@ class Corrected:
         return self.stokes[self._index(component)]
 
     def _index(self, component):
-        if len(component) != 1 or component not in self.components:
-            raise ParameterError(
-                f"no component {component!r}; there is {', '.join(self.components)}"
-            )
+        check_choice("component", component, list(self.components), ParameterError)
         return self.components.index(component)
 
     @property

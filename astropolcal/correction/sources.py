@@ -23,14 +23,11 @@ class ArraySource:
     """
     Beams as arrays, (n_frames, n_wavelengths, ...): in memory, mapped from disk, or of dask.
 
-    ``batch`` frames are read at a time; by default all of arrays in memory, those of a chunk of
-    dask arrays, and one of arrays on disk.
+    At a time all frames of arrays in memory are read, those of a chunk of dask arrays, and one of
+    arrays on disk.
     """
 
-    def __init__(
-        self, right, left, variance_right=None, variance_left=None, names=None, batch=None
-    ):
-        self._batch = batch
+    def __init__(self, right, left, variance_right=None, variance_left=None, names=None):
         self._beams = [_array(right), _array(left)]
         given = [v is not None for v in (variance_right, variance_left)]
         if any(given) != all(given):
@@ -50,9 +47,8 @@ class ArraySource:
     def batches(self):
         """Return the frames that are read at a time, a list of slices."""
         array = self._beams[0]
-        batch = self._batch or (1 if isinstance(array, np.memmap) else self.n_frames)
-        ends = [*range(0, self.n_frames, batch), self.n_frames]
-        if self._batch is None and hasattr(array, "chunks"):
+        ends = range(self.n_frames + 1) if isinstance(array, np.memmap) else [0, self.n_frames]
+        if hasattr(array, "chunks"):
             # a part of a chunk costs as much as all of it
             ends = np.cumsum([0, *array.chunks[0]]).tolist()
         return [slice(start, end) for start, end in pairwise(ends)]

@@ -45,7 +45,7 @@ from astropolcal.exceptions import CalibrationFileError, InstrumentError
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
-from astropolcal.words import check_type
+from astropolcal.words import check_type, listed
 
 __all__ = ["Entry", "Library"]
 
@@ -308,12 +308,12 @@ class Library:
             if len(kinds) > 1 and wanted[key] is None:
                 # one of each kind is enough to choose by
                 some = sorted(kinds.values(), key=_order)
-                names = _shown([f"{e.name} ({e.validity})" for e in some])
+                names = listed([f"{e.name} ({e.validity})" for e in some], most=_MOST_SHOWN)
                 raise CalibrationFileError(
                     f"{self._label}: {names}: say which {key} is meant", argument=key
                 )
         if len(found) > 1 and wanted["date"] is None:
-            names = _shown([e.name for e in found])
+            names = listed([e.name for e in found], most=_MOST_SHOWN)
             raise CalibrationFileError(f"{self._label}: {names}: a date is needed to choose")
         *others, newest = found
         for other in others:
@@ -609,12 +609,6 @@ def _known(entries):
         return "; it holds none"
     shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-_MOST_SHOWN:])
     return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
-
-
-def _shown(words):
-    """Return the first few in a line."""
-    more = f" and {len(words) - _MOST_SHOWN} more" if len(words) > _MOST_SHOWN else ""
-    return ", ".join(words[:_MOST_SHOWN]) + more
 
 
 def _name(held, digest):

@@ -17,7 +17,7 @@ from pathlib import Path
 from astropy.config.paths import get_cache_dir
 
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.files import atomic_path, check_new, one_line
+from astropolcal.files import atomic_path, check_new, one_line, understood
 from astropolcal.words import check_choice
 
 __all__ = ["fetch", "import_context"]
@@ -144,31 +144,29 @@ def import_context(path, folder):
     ...     try:
     ...         import_context(path, folder)
     ...     except ValueError as problem:
-    ...         str(problem).endswith("is not an archive of a context")
+    ...         "is not an archive of a context" in str(problem)
     True
     """
     folder = Path(folder)
-    try:
-        with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch:
+        with (
+            understood(path, CalibrationFileError, "is not an archive of a context"),
+            zipfile.ZipFile(path) as archive,
+        ):
             name, known = _checked(archive, path)
             # what it says of the sizes bounds what is unpacked
             archive.extractall(scratch)
-            for file in (*known, name):
-                digest, there = sha256_of(Path(scratch) / file), folder / file
-                if known.get(file, digest) != digest:
-                    raise CalibrationFileError(f"{path}: {file} does not have its checksum")
-                if there.exists() and sha256_of(there) != digest:
-                    raise CalibrationFileError(
-                        f"{folder} has another file {file}; nothing is written"
-                    )
+        for file in (*known, name):
+            digest, there = sha256_of(Path(scratch) / file), folder / file
+            if known.get(file, digest) != digest:
+                raise CalibrationFileError(f"{path}: {file} does not have its checksum")
+            if there.exists() and sha256_of(there) != digest:
+                raise CalibrationFileError(f"{folder} has another file {file}; nothing is written")
+        with understood(folder, CalibrationFileError, "cannot be written", reads=False):
             folder.mkdir(parents=True, exist_ok=True)
-            # the context last: it is there only when its files are
-            for file in (*known, name):
-                _copy(Path(scratch) / file, folder / file)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
-        raise CalibrationFileError(f"{path}: is not an archive of a context") from None
-    except OSError as problem:
-        raise CalibrationFileError(f"{path}: {one_line(str(problem))}") from problem
+        # the context last: it is there only when its files are
+        for file in (*known, name):
+            _copy(Path(scratch) / file, folder / file)
     return name.removesuffix(_SUFFIX)
 
 

@@ -112,9 +112,8 @@ def test_memory(tmp_path, chain, capsys, n_frames):
             array[i] = 1.0 + i
         array.flush()
         beams.append(np.load(tmp_path / name, mmap_mode="r"))
-    frames = ScienceFrames.from_arrays(
-        *beams, instruments.get("charis").wavelength, positions(n_frames), batch=1
-    )
+    wavelength = instruments.get("charis").wavelength
+    frames = ScienceFrames.from_arrays(*beams, wavelength, positions(n_frames))
     correct(chain, frames, workers=1)
     tracemalloc.start()
     result = correct(chain, frames, workers=1)

@@ -219,7 +219,7 @@ def test_open_choice_is_refused(calibration, library):
         library.find("charis", date="2026-01-01")
     assert caught.value.argument == "optics_in"
     library.add(calibration, name="c.asdf", optics_in=["nbs"], valid_from="2026-01-01")
-    with refused("b.asdf, c.asdf: a date is needed"):
+    with refused("b.asdf and c.asdf: a date is needed"):
         library.find("charis", optics_in=["nbs"])
 
 
@@ -769,6 +769,12 @@ def test_forged_archives_write_nothing(years, tmp_path_factory):
     ):
         with refused(message):
             import_context(forged(change), folder / "there")
+    # a bit of what is packed
+    content = bytearray(good.read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / "damaged.zip").write_bytes(content)
+    with refused("damaged.zip: is not an archive"):
+        import_context(folder / "damaged.zip", folder / "there")
     assert not (folder / "there").exists()
     (folder / "none.zip").write_bytes(b"PK")
     for path in (folder / "none.zip", folder / "missing.zip"):

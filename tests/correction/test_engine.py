@@ -15,17 +15,19 @@ from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
 
 
-def test_a_cluster_changes_no_number(star, sky, charis):
+def test_a_cluster_changes_no_number(star, sky, charis, tmp_path):
     """It divides the frames, also those from which a flux is missing."""
     distributed = pytest.importorskip("distributed", reason="distributed is not installed")
     beams = [np.array(beam) for beam in (star.right, star.left)]
     # it is fitted from the other frames, which are divided too
     beams[0][3, 5] = np.nan
-    given = (*beams, charis.wavelength, star.positions)
+    np.save(tmp_path / "right.npy", beams[0])
+    mapped = np.load(tmp_path / "right.npy", mmap_mode="r")
     settings = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
     with distributed.LocalCluster(processes=False, **settings) as cluster:
-        for batch, chunk in ((None, 4), (1, None)):
-            frames = ScienceFrames.from_arrays(*given, batch=batch)
+        for right, chunk in ((beams[0], 4), (mapped, None)):
+            given = (right, beams[1], charis.wavelength, star.positions)
+            frames = ScienceFrames.from_arrays(*given)
             found = correct(sky, frames, cluster=cluster.scheduler_address, chunk=chunk)
             np.testing.assert_array_equal(found.stokes, correct(sky, frames).stokes)
     assert np.isfinite(found.stokes).all()

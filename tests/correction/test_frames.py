@@ -110,7 +110,7 @@ def test_positions_of_all_frames_alike():
         assert arrays(positions={"hwp": position}).positions["hwp"] is position, position
 
 
-def test_brightness_counts_all_light_of_a_frame():
+def test_brightness_counts_all_light_of_a_frame(tmp_path):
     """Images are summed, without what lacks a value."""
     clouds = np.array([0.5, 1.0, 1.5, 1.0])
     rows = measurement_rows(CHAIN, {"hwp": HWP}, LAM)
@@ -119,8 +119,9 @@ def test_brightness_counts_all_light_of_a_frame():
     shape[1:4, 1:4] = 1 / 9
     right, left = spectrum[..., None, None] * shape
     right[:, :, 0, 0] = left[:, :, 0, 0] = np.nan
-    for batch in (None, 1, 3):
-        frames = ScienceFrames.from_arrays(right, left, LAM, {"hwp": HWP}, batch=batch)
+    np.save(tmp_path / "right.npy", right)
+    for beam in (right, np.load(tmp_path / "right.npy", mmap_mode="r")):
+        frames = ScienceFrames.from_arrays(beam, left, LAM, {"hwp": HWP})
         found = frames.with_brightness(rows)
         np.testing.assert_allclose(found.scale, np.tile(clouds, (2, 1)), rtol=1e-9)
         assert frames.scale is None

@@ -50,7 +50,7 @@ def test_components_by_name(spectrum):
         np.testing.assert_array_equal(spectrum[name], spectrum.stokes[i])
     assert spectrum.stokes_axis.symbol.tolist() == ["I", "Q", "U"]
     for name in ("V", "IQ", "", "q"):
-        with pytest.raises(ParameterError, match=rf"no component '{name}'; there is I, Q, U"):
+        with pytest.raises(ParameterError, match=rf"component = '{name}'; allowed are I, Q, U"):
             spectrum[name]
 
 

@@ -43,15 +43,13 @@ def test_lists_will_do():
 
 
 def test_how_many_frames_are_read_at_a_time(images, tmp_path):
-    """All of what is in memory, one of what is on disk, and what the user says."""
+    """All of what is in memory, one of what is on disk."""
     flux, _ = images
     assert ArraySource(*flux).batches() == [slice(0, 3)]
-    assert ArraySource(*flux, batch=2).batches() == [slice(0, 2), slice(2, 3)]
     np.save(tmp_path / "a.npy", flux[0])
     mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
     one_by_one = [slice(0, 1), slice(1, 2), slice(2, 3)]
     assert ArraySource(mapped, mapped).batches() == one_by_one
-    assert ArraySource(mapped, mapped, batch=3).batches() == [slice(0, 3)]
 
 
 def test_chunks_of_dask_are_read_whole(images):
@@ -59,7 +57,6 @@ def test_chunks_of_dask_are_read_whole(images):
     flux = [da.from_array(beam, chunks=(2, 1, 9, 9)) for beam in images[0]]
     source = ArraySource(*flux)
     assert source.batches() == [slice(0, 2), slice(2, 3)]
-    assert ArraySource(*flux, batch=1).batches() == [slice(i, i + 1) for i in range(3)]
     found = source.fluxes(0, slice(0, 2), ALL)
     assert isinstance(found, np.ndarray)
     np.testing.assert_array_equal(found, images[0][0, :2])

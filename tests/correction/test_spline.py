@@ -65,10 +65,3 @@ def test_pixels_without_values_spoil_the_same_of_the_result(cube):
         np.testing.assert_allclose(together, alone, atol=1e-11)
         lost = np.isnan(together).sum(axis=(1, 2))
         assert lost[2] > lost[0] or everywhere, everywhere
-
-
-def test_what_it_is_not_for_goes_to_scipy(cube):
-    assert _spline.suits(cube.shape, 3)
-    assert not _spline.suits(cube.shape, 2)
-    assert not _spline.suits((1, 34, 41), 3)
-    assert not _spline.suits((5, 20, 41), 3)
