@@ -93,9 +93,7 @@ def _axes(header, corrected):
     """Describe the axes; the Stokes axis by the codes of the FITS standard."""
     n = corrected.stokes.ndim
     # 1, 2, 3, 4 for I, Q, U, V (Greisen and Calabretta 2002, Table 7): evenly spaced as FITS needs
-    codes = corrected.stokes_axis.value
-    keys = {"CTYPE": "STOKES", "CRPIX": 1.0, "CRVAL": float(codes[0]), "CDELT": 1.0}
-    for key, value in keys.items():
+    for key, value in {"CTYPE": "STOKES", "CRPIX": 1.0, "CRVAL": 1.0, "CDELT": 1.0}.items():
         header[f"{key}{n}"] = value
     header[f"CTYPE{n - 1}"] = ("BIN", "see the table WAVELENGTH")
     if n == 4 and corrected.centre is not None and corrected.pixel_scale is not None:

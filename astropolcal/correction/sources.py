@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.files import understood
+from astropolcal.files import one_line, understood
 from astropolcal.fitscheck import open_fits, readable_fits
 
 __all__ = []
@@ -86,7 +86,13 @@ class TurnedSource:
             )
         height, width = source.image_shape
         centre = ((width - 1) / 2, (height - 1) / 2) if centre is None else centre
-        self._centres = np.broadcast_to(np.asarray(centre, dtype=float), (source.n_frames, 2, 2))
+        try:
+            shape = (source.n_frames, 2, 2)
+            self._centres = np.broadcast_to(np.asarray(centre, dtype=float), shape)
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"centre = {one_line(centre)}; x and y are needed, or those of each beam and frame"
+            ) from None
         self._options = options | {"size": size}
         self.image_shape = source.image_shape if size is None else tuple(np.broadcast_to(size, 2))
         self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths

@@ -154,13 +154,12 @@ def _noise(star, measured):
     q, u_, cross = (np.nan_to_num(errors[key]) for key in ("q", "u", "covariance_qu"))
     # columns of a triangular root of the covariance of q and u
     slope = np.divide(cross, q, out=np.zeros(size), where=q > 0)
-    roots = [(q, slope), (np.zeros(size), np.sqrt(np.maximum(u_**2 - slope**2, 0.0)))]
+    roots = np.array([[q, slope], [0 * q, np.sqrt(np.maximum(u_**2 - slope**2, 0.0))]])
     # noise of one wavelength is not that of another; a value that is stated is one for all
     parts = np.eye(size) if measured else np.ones((1, size))
-    found = np.zeros((len(roots), len(parts), size, n, n))
-    for direction, root in zip(found, roots, strict=True):
-        for row, values in zip((1, 2), root, strict=True):
-            direction[:, :, row, 0] = -parts * values
+    found = np.zeros((2, len(parts), size, n, n))
+    # d: directions, r: rows of q and u, p: parts, w: wavelengths
+    found[..., 1:3, 0] = -np.einsum("pw,drw->dpwr", parts, roots)
     return found.reshape(-1, size, n, n)
 
 

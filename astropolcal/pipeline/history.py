@@ -219,8 +219,10 @@ def significance(calibrations, parameters=None):
     if len(named) < 2:
         raise FitError(f"{len(named)} calibration: at least two are needed to compare")
     found = compared(named, parameters)
-    chi2, rank = found.chi2, found.deviations.shape[1]
-    dof = rank * (len(named) - 1)
+    apart = found.deviations
+    # of one common value for all
+    chi2 = float(np.einsum("ni,nij,nj->", apart, found.weights, apart))
+    dof = apart.shape[1] * (len(named) - 1)
     p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
     labels = [name for name, _ in named]
     return Change(labels, found.names, chi2, dof, p, found.left_out, found.n_open)
@@ -239,11 +241,6 @@ class Compared:
     #: Of each calibration from the common value, (n, n_directions), and their information.
     deviations: np.ndarray
     weights: np.ndarray
-
-    @property
-    def chi2(self):
-        """Of one common value for all."""
-        return float(np.einsum("ni,nij,nj->", self.deviations, self.weights, self.deviations))
 
 
 def compared(named, parameters=None):

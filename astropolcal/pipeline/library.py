@@ -466,7 +466,7 @@ class Library:
             self._scan()
             calibration, gone = self._superseding(calibration, supersedes)
             held, digest = validity_of(calibration), content_hash(calibration)
-            path = self.source / (_name(held, digest) if name is None else _checked_name(name))
+            path = self.source / _file_name(name, held, digest)
             new = Entry(path, calibration, held, digest, gone)
             same = self._confirmed(
                 lambda: next((e for e in self.entries if e.content_hash == digest), None)
@@ -611,14 +611,12 @@ def _known(entries):
     return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
 
 
-def _name(held, digest):
-    parts = [held.instrument, held.mode, (held.valid_from or "")[:10], digest[:8]]
-    slugs = [re.sub(r"[^A-Za-z0-9.-]+", "-", part)[:_LONGEST_SLUG] for part in parts if part]
-    return "_".join(slug.strip("-.") for slug in slugs) + ".asdf"
-
-
-def _checked_name(name):
+def _file_name(name, held, digest):
     """Return the name of a file to add, refused where it leads out of the folder or is hidden."""
+    if name is None:
+        parts = [held.instrument, held.mode, (held.valid_from or "")[:10], digest[:8]]
+        slugs = [re.sub(r"[^A-Za-z0-9.-]+", "-", part)[:_LONGEST_SLUG] for part in parts if part]
+        return "_".join(slug.strip("-.") for slug in slugs) + ".asdf"
     good = (
         isinstance(name, str)
         # of another system too: a library may be copied there
