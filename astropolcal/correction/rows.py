@@ -80,7 +80,6 @@ class RowModel(Rows):
         placed, nodes = _placed(positions, stages(chain))
         warn_beyond(chain, placed)
         super().__init__(chain, length_to_um(self.wavelength), placed, free, mix, nodes)
-        self.n_frames = self._shape[1]
 
     @property
     def held(self):
