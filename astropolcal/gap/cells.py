@@ -25,8 +25,8 @@ from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 
 __all__ = []
 
-# kinds that a detector may have, and the dependence of each where there is one only
-_DETECTOR = {
+#: Kinds that only a detector may have, and the dependence of each.
+DETECTED = {
     "background": "flux",
     "background_of_one_beam": "flux",
     "nonlinearity": "flux",
@@ -352,8 +352,8 @@ class Probes:
 
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
-        if kind in _DETECTOR:
-            return [_DETECTOR[kind], *(name for name in self.waves if name[:8] == "dataset:")]
+        if kind in DETECTED:
+            return [DETECTED[kind], *(name for name in self.waves if name[:8] == "dataset:")]
         if len(self.slopes[place, kind]) > 1:
             return list(self.waves)
         # a place in one chain only is in that run anyway

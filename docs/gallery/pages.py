@@ -359,7 +359,7 @@ def effect_row(name):
     effect = EFFECTS[name]
     parts = [f"Place: {effect.place}", f"Shows: {effect.shows}"]
     if effect.kind != "discrete":
-        keys = sorted(getattr(effect, "components", None) or effect.free)
+        keys = sorted(effect.free)
         listed = ", ".join(f"``{key}``" for key in keys)
         sizes = f"about {_quantity(effect.scale)}, at most {_quantity(effect.limit)}"
         parts.append(f"Law: {_law_of(effect)}")

@@ -13,7 +13,7 @@ from astropolcal.gap.effects.effect import KINDS, Context, Edit, Effect, EffectP
 from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.where import Roles, adapted
 from astropolcal.gap.problem import GapProblem
-from astropolcal.units import canonical_factor, to_unit
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = [
@@ -206,9 +206,22 @@ def _check_against(effect, chains, observations):
         problem = GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
     except AstropolcalError as error:
         raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
-    if not discrete:
-        _check_names(effect, edit, problem, nominal)
-        _check_identity(effect, problem, nominal)
+    if discrete:
+        return
+    for parameter in edit.parameters:
+        _check_parameter(effect, parameter, problem, nominal)
+    for number, pair in enumerate(zip(problem.datasets, nominal.datasets, strict=True)):
+        new, old = (
+            np.stack(dataset.forward(one.vector(one.start)).fluxes)
+            for dataset, one in zip(pair, (problem, nominal), strict=True)
+        )
+        change = np.max(np.abs(new - old)) / np.max(np.abs(old))
+        if not change < _SAME:
+            raise _failed(
+                effect,
+                f"changes the fluxes of dataset {number} by {change:.2g} at zero parameters; "
+                "it must be the identity there",
+            )
     for parameter in edit.parameters:
         _check_derivative(effect, problem, parameter)
 
@@ -227,78 +240,51 @@ def _state(chain):
     return found
 
 
-def _check_names(effect, edit, problem, nominal):
-    """Check that parameters are new, and in the chains."""
-    for parameter in edit.parameters:
-        name = parameter.name
-        if name not in problem.free.by_name:
-            known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
-            raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
-        # a lifted bound, or prior, frees nothing that was not free: it gives room
-        known = name in nominal.free.by_name and name not in nominal.known
-        if known and effect.kind != "bound":
-            raise _failed(effect, f"{name} is free in the chains without it already")
-        slot = problem.free.by_name[name]
-        if parameter.basis is not None and len(parameter.basis) != slot.size:
-            raise _failed(effect, f"{name}: a law for {len(parameter.basis)} of {slot.size} values")
-        for what in ("scale", "limit"):
-            if not _canonical(getattr(parameter, what), slot, effect) > 0:
-                raise _failed(effect, f"{name}: {what} = {getattr(parameter, what)} not positive")
-
-
-def _canonical(value, slot, effect):
-    try:
-        return float(to_unit(value, slot.unit, slot.name)) * canonical_factor(slot.unit)
-    except AstropolcalError as error:
-        raise _failed(effect, str(error)) from error
-
-
-def _check_identity(effect, problem, nominal):
-    pairs = zip(problem.datasets, nominal.datasets, strict=True)
-    for number, (edited, plain) in enumerate(pairs):
-        new = np.stack(edited.forward(problem.vector(problem.start)).fluxes)
-        old = np.stack(plain.forward(nominal.vector(nominal.start)).fluxes)
-        change = np.max(np.abs(new - old)) / np.max(np.abs(old))
-        if not change < _SAME:
-            raise _failed(
-                effect,
-                f"changes the fluxes of dataset {number} by {change:.2g} at zero parameters; "
-                "it must be the identity there",
-            )
+def _check_parameter(effect, parameter, problem, nominal):
+    """Check that a parameter is new, and in the chains."""
+    name, free, there = parameter.name, problem.free.by_name, nominal.free.by_name
+    if name not in free:
+        new = ", ".join(sorted(set(free) - set(there)))
+        raise _failed(effect, f"{name} is not free in its chains; new and free: {new or '-'}")
+    # a lifted bound, or prior, frees nothing that was not free: it gives room
+    if name in there and name not in nominal.known and effect.kind != "bound":
+        raise _failed(effect, f"{name} is free in the chains without it already")
+    slot = free[name]
+    if parameter.basis is not None and len(parameter.basis) != slot.size:
+        raise _failed(effect, f"{name}: a law for {len(parameter.basis)} of {slot.size} values")
+    for what in ("scale", "limit"):
+        size = getattr(parameter, what)
+        try:
+            is_positive = to_unit(size, slot.unit, slot.name) > 0
+        except AstropolcalError as error:
+            raise _failed(effect, str(error)) from error
+        if not is_positive:
+            raise _failed(effect, f"{name}: {what} = {size} not positive")
 
 
 def _check_derivative(effect, problem, parameter):
     """Compare the derivative of both channels with central differences."""
-    slot, where = problem.free.by_name[parameter.name], problem.slices[parameter.name]
-    scale = _canonical(parameter.scale, slot, effect)
+    where, scale = problem.slices[parameter.name], parameter.canonical_scale
+    # f' = (8 [f(h) - f(-h)] - [f(2h) - f(-2h)]) / 12 h, with an error of h^4
+    steps, weights = _STEP * scale * np.array([1, -1, 2, -2]), np.array([8, -8, -1, 1])
     for place in _PLACES:
         middle = problem.start.copy()
         middle[where] += place * scale
         slopes = problem.jacobian(middle, whitened=False)
         for column in range(where.start, where.stop):
-            found, expected = slopes[:, column], _difference(problem, middle, column, scale)
+            moved = [middle + step * np.eye(problem.size)[column] for step in steps]
+            # differences are observed minus predicted
+            rows = [np.concatenate([d.ravel() for d in problem.differences(q)]) for q in moved]
+            expected = -(weights @ rows) / (12 * _STEP * scale)
             # a derivative that is zero has no relative error
             size = max(np.abs(expected).max(), 1e-9 / scale)
-            worst = np.abs(found - expected).max() / size
+            worst = np.abs(slopes[:, column] - expected).max() / size
             if not worst < _ERROR:
                 raise _failed(
                     effect,
                     f"derivative to {problem.names[column]} differs from central differences by "
                     f"{100 * worst:.3g} % of its largest value",
                 )
-
-
-def _difference(problem, middle, column, scale):
-    """Return the derivative of the predicted rows by differences of fourth order."""
-    step, total = _STEP * scale, 0.0
-    # f' = (8 [f(h) - f(-h)] - [f(2h) - f(-2h)]) / 12 h, with an error of h^4
-    for factor, weight in ((1, 8), (-1, -8), (2, -1), (-2, 1)):
-        q = middle.copy()
-        q[column] += factor * step
-        # differences are observed minus predicted
-        rows = np.concatenate([d.ravel() for d in problem.differences(q)])
-        total = total - weight * rows
-    return total / (12 * step)
 
 
 for _effect in LIBRARY:

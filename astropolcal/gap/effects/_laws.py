@@ -3,6 +3,7 @@
 
 import astropy.units as u
 import numpy as np
+from scipy.linalg import helmert
 
 from astropolcal import optics
 from astropolcal.calibration.identifiability.linearized import ranked
@@ -30,13 +31,19 @@ def lagging(mount):
 # ---- what else effects need --------------------------------------------------------------------
 
 
-def mirror_leaves(*keys):
-    """Return whether no parameter of the telescope's mirror is free, its angle and keys aside."""
+def mirror_leaves(key, polarized=False):
+    """
+    Return whether no parameter of the telescope's mirror is free, its angle and a key aside.
+
+    Of light that may be polarized, where that is needed.
+    """
 
     def when(roles):
         mirror = roles.telescope_mirror
+        if polarized and not may_be_polarized(roles):
+            return False
         # nothing is free in what is not there; what is free takes the effect up
-        names = () if mirror is None else set(mirror.param_names) - {"theta", *keys}
+        names = () if mirror is None else set(mirror.param_names) - {"theta", key}
         return all(is_held(getattr(mirror, key)) for key in names)
 
     return when
@@ -61,7 +68,9 @@ def every_wavelength(context):
 
 def without_constant(context):
     """Return a law of degree 2 less its constant, which is an orientation."""
-    return context.basis(2, constant=False)
+    basis = context.basis(2)
+    # values per wavelength, less their mean; singular vectors would be any basis of these
+    return helmert(len(basis)).T if context.degree is None else basis[:, 1:]
 
 
 class WavelengthScale(Effect):
@@ -125,48 +134,45 @@ class Fringes(Effect):
 class Elliptical(Effect):
     """A derotator that is an elliptical retarder: exchanged in place, as two do not commute."""
 
-    components = ("diagonal",)
-
     def applies_to(self, roles):
         """Return whether the derotator lacks this component."""
         derotator = self.where.anchor(roles)
         if isinstance(derotator, optics.EllipticalRetarder):
-            return all(getattr(derotator, key).fixed for key in self.components)
+            return all(getattr(derotator, key).fixed for key in self.free)
         return derotator is not None and not any(o.name == self.label for o in roles.leaves)
 
     def put(self, chain, roles, context, label):
         """Return the chain with an elliptical derotator; see `Effect.put`."""
-        old, ties = self.where.anchor(roles), {}
-        values = dict.fromkeys(self.components, np.zeros(len(context.wavelength)) * u.deg)
+        old, is_new, ties = self.where.anchor(roles), False, {}
+        values = dict.fromkeys(self.free, np.zeros(len(context.wavelength)))
         if isinstance(old, optics.EllipticalRetarder):
-            held = {k: np.broadcast_to(getattr(old, k).value, v.shape) for k, v in values.items()}
-            new = old.with_parameters(**{key: value * u.deg for key, value in held.items()})
+            values = {k: np.broadcast_to(getattr(old, k).value, v.shape) for k, v in values.items()}
+            new = old.with_parameters(**{key: value * u.deg for key, value in values.items()})
         else:
-            own = {"theta": old.theta.value * u.deg, "mount": old.mount}
-            is_retarder = isinstance(old, optics.LinearRetarder)
-            if is_retarder:
-                own |= {"horizontal": old.retardance.value * u.deg, "name": old.name}
-            new = optics.EllipticalRetarder(**{"name": label} | own, **values)
-            for key in {"theta", "horizontal", "diagonal", "circular"} - set(self.components):
+            # what is more than a retarder stays, and the new one turns with it
+            is_new = not isinstance(old, optics.LinearRetarder)
+            new = optics.EllipticalRetarder(
+                theta=old.theta.value * u.deg,
+                horizontal=(0.0 if is_new else old.retardance.value) * u.deg,
+                mount=old.mount,
+                name=label if is_new else old.name,
+                **{key: value * u.deg for key, value in values.items()},
+            )
+            for key in new.param_names:
                 getattr(new, key).fixed = True
-            if is_retarder:
-                # what was free stays free, so that the nominal parameters keep their meaning
-                for ours, theirs in (("theta", "theta"), ("horizontal", "retardance")):
-                    was, now = getattr(old, theirs), getattr(new, ours)
-                    now.fixed, now.bounds = was.fixed, was.bounds
-        for key in self.components:
+            # what was free stays free, so that the nominal parameters keep their meaning
+            pairs = () if is_new else (("theta", "theta"), ("horizontal", "retardance"))
+            for ours, theirs in pairs:
+                was, now = getattr(old, theirs), getattr(new, ours)
+                now.fixed, now.bounds = was.fixed, was.bounds
+        for key in self.free:
             getattr(new, key).fixed = False
-        if new.name == old.name:
+        if not is_new:
             return replace_optic(chain, old.name, new), [new], ties
-        # what is more than a retarder stays, and the new one turns with it
         new.theta.bounds = (None, None)
         if not old.theta.fixed:
             ties[f"{label}.theta"] = Tie(f"{old.name}.theta")
         return insert_optic(chain, new, after=old.name), [new], ties
-
-    def free_of(self, optic):
-        """Return the components."""
-        return self.components
 
 
 class BandAverage(Effect):
@@ -279,54 +285,6 @@ class Recoating(Effect):
         return Edit(edited, self.parameters(names, chains, context))
 
 
-class StandardPolarization(Effect):
-    """Polarization of a star itself, which the model holds at zero or at a catalogue's value."""
-
-    def applies_to(self, roles):
-        """Return whether the polarization of a star is held."""
-        return held_star(roles.leaves) is not None
-
-    def edit(self, chains, context):
-        """Return the chains with q and u of the stars free; see `Effect.edit`."""
-        edited, added = [], {}
-        for chain in chains:
-            star = held_star(leaves(chain))
-            if star is not None:
-                size = len(context.wavelength)
-                values = {k: np.broadcast_to(getattr(star, k).value, size) for k in self.free}
-                fresh = star.with_parameters(**values)
-                for key, held in values.items():
-                    free = getattr(fresh, key)
-                    free.fixed, free.prior = False, None
-                    # a lamp that is known to be nearly fully polarized is outside the bounds of one
-                    # that is fitted
-                    low, high = free.bounds
-                    free.bounds = (
-                        min(low, held.min() - self.limit),
-                        max(high, held.max() + self.limit),
-                    )
-                    # the law must hold the catalogue's values, from which the size counts
-                    law = None if size == 1 else able_to_hold(held, context.basis(self.degree))
-                    name = f"{star.name}.{key}"
-                    added[name] = EffectParameter(name, self.scale, self.limit, law, np.array(held))
-                chain = replace_optic(chain, star.name, fresh)
-            edited.append(chain)
-        return Edit(edited, list(added.values()))
-
-
-def held_star(optics_of_chain):
-    """Return the first star whose polarization is fixed."""
-    stars = (o for o in optics_of_chain if isinstance(o, optics.PolarizedSource))
-    return next((star for star in stars if is_held(star.q) and is_held(star.u)), None)
-
-
-def able_to_hold(values, basis):
-    """Return a basis that can represent the values as well."""
-    left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
-    size = np.abs(left).max()
-    return basis if size < 1e-12 else np.column_stack([basis, left / size])
-
-
 # ---- parameters that the model holds, or that have run into a bound ------------------------------
 
 
@@ -343,42 +301,43 @@ class Held(Effect):
         at_low = low is not None and np.any(value <= low + near)
         return bool(at_low or (high is not None and np.any(value >= high - near)))
 
-    def _keys(self, optic):
-        own = [key for key in self.free if key in optic.param_names]
-        return [key for key in own if self.is_open(getattr(optic, key))]
+    def held(self, roles):
+        """Return the optic, and the names of its parameters on which the effect may act."""
+        optic = self.where.anchor(roles)
+        own = () if optic is None else (key for key in self.free if key in optic.param_names)
+        return optic, [key for key in own if self.is_open(getattr(optic, key))]
 
     def applies_to(self, roles):
         """Return whether one of the parameters is held."""
-        optic = self.where.anchor(roles)
-        return optic is not None and bool(self._keys(optic))
+        return bool(self.held(roles)[1])
 
     def edit(self, chains, context):
         """Return the chains with the parameters free; see `Effect.edit`."""
         edited, added = [], {}
         for chain in chains:
-            optic = self.where.anchor(self.roles(chain))
-            if optic is not None:
-                fresh = optic.copy()
+            optic, keys = self.held(self.roles(chain))
+            if keys:
+                fresh, found = self.released(optic, keys, context)
                 # a dict, for the same parameter in two datasets is one
-                added |= self._release(fresh)
+                added |= {one.name: one for one in found}
                 chain = replace_optic(chain, optic.name, fresh)
             edited.append(chain)
         return Edit(edited, list(added.values()))
 
-    def _release(self, optic):
-        """Free the parameters of one optic, and return them by name."""
-        found = {}
-        for key in self._keys(optic):
-            parameter = getattr(optic, key)
+    def released(self, optic, keys, context):
+        """Return a copy of an optic with parameters free, and what the effect says of these."""
+        fresh, found = optic.copy(), []
+        for key in keys:
+            parameter = getattr(fresh, key)
             # where it was held is where the effect is absent
             known = parameter.prior
             value = parameter.value if known is None else known.mean()
             value = u.Quantity(value, parameter.unit or u.one)
-            parameter.fixed, parameter.prior = False, None
             parameter.bounds = around(parameter, self.limit, getattr(type(optic), key).bounds)
+            parameter.fixed, parameter.prior = False, None
             name = f"{optic.name}.{key}"
-            found[name] = EffectParameter(name, self.scale, self.limit, neutral=value)
-        return found
+            found.append(EffectParameter(name, self.scale, self.limit, neutral=value))
+        return fresh, found
 
 
 def _in_unit(quantity, parameter):
@@ -401,6 +360,45 @@ def around(parameter, limit, possible):
     )
 
 
+class StandardPolarization(Held):
+    """Polarization of a star itself, which the model holds at zero or at a catalogue's value."""
+
+    def held(self, roles):
+        """Return the first star whose polarization is held, and the names of its parameters."""
+        star = held_star(roles.leaves)
+        return star, () if star is None else self.free
+
+    def released(self, optic, keys, context):
+        """Return a copy of a star with q and u free, and what the effect says of these."""
+        size, found = len(context.wavelength), []
+        values = {key: np.broadcast_to(getattr(optic, key).value, size) for key in keys}
+        fresh = optic.with_parameters(**values)
+        for key, held in values.items():
+            parameter = getattr(fresh, key)
+            # a lamp that is known to be nearly fully polarized is outside the bounds of one
+            # that is fitted
+            parameter.bounds = around(parameter, self.limit, (None, None))
+            parameter.fixed, parameter.prior = False, None
+            # the law must hold the catalogue's values, from which the size counts
+            law = None if size == 1 else able_to_hold(held, context.basis(self.degree))
+            name = f"{optic.name}.{key}"
+            found.append(EffectParameter(name, self.scale, self.limit, law, np.array(held)))
+        return fresh, found
+
+
+def held_star(optics_of_chain):
+    """Return the first star whose polarization is fixed."""
+    stars = (o for o in optics_of_chain if isinstance(o, optics.PolarizedSource))
+    return next((star for star in stars if is_held(star.q) and is_held(star.u)), None)
+
+
+def able_to_hold(values, basis):
+    """Return a basis that can represent the values as well."""
+    left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    size = np.abs(left).max()
+    return basis if size < 1e-12 else np.column_stack([basis, left / size])
+
+
 # ---- discrete alternatives -----------------------------------------------------------------------
 
 
@@ -412,9 +410,9 @@ class Alternative(Effect):
     #: Function of chain, roles, the optic and the law of its tracking that changes the chain.
     change = None
 
-    def __init__(self, name, title, words, role, change, **settings):
+    def __init__(self, name, title, words, role, change, shows, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role
-        super().__init__(name, title, where, words=words, change=change, **settings)
+        super().__init__(name, title, where, words=words, change=change, shows=shows, **settings)
 
     def cells(self, chains):
         """Return none: an alternative is not a perturbation."""

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
-from scipy.linalg import helmert
 
 from astropolcal import instruments, optics
-from astropolcal.chain import insert_optic, leaves
+from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError, InstrumentError, ParameterError
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.where import SEVERAL, Roles, Where
@@ -46,7 +45,7 @@ _SAME = 1e-9
 _SETTINGS = (
     *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
     *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
-    *("components", "change"),
+    "change",
 )
 
 
@@ -96,11 +95,8 @@ class EffectParameter:
     @property
     def canonical_neutral(self):
         """Value at which the effect is absent, canonical; scalar or one per wavelength."""
-        if self.neutral is not None:
-            value = u.Quantity(self.neutral)
-            return value.value * canonical_factor(value.unit)
         # an optic that keeps all of the polarization is none
-        return 1.0 if self.is_retained else 0.0
+        return float(self.is_retained) if self.neutral is None else _canonical(self.neutral)
 
     @property
     def is_retained(self):
@@ -110,7 +106,7 @@ class EffectParameter:
 
 def _canonical(value):
     value = u.Quantity(value)
-    return float(value.value * canonical_factor(value.unit))
+    return value.value * canonical_factor(value.unit)
 
 
 @dataclass(frozen=True)
@@ -199,17 +195,9 @@ class Context:
             datasets=tuple(o.name for o in observations),
         )
 
-    def basis(self, degree, constant=True):
-        """Return the law's basis; without its constant where that is known already."""
-        wanted = degree if self.degree == "default" else self.degree
-        found = law_basis(self.wavelength, wanted)
-        if constant:
-            return found
-        # a constant over the wavelengths is the orientation of the optic, which is known by itself
-        if wanted is None:
-            # values per wavelength, less their mean; singular vectors would be any basis of these
-            return helmert(len(found)).T
-        return found[:, 1:]
+    def basis(self, degree):
+        """Return the basis of the law of an effect."""
+        return law_basis(self.wavelength, degree if self.degree == "default" else self.degree)
 
 
 def tracking_laws(observations):
@@ -328,28 +316,28 @@ class Effect:
             wanted = (kind,) if isinstance(kind, str) else tuple(kind)
             self.around = "orientation" in wanted
             self.kinds = tuple(g for one in wanted for g in _SEVERAL.get(one, (one,)))
-        self._check()
-        if self.place is None and self.where is not None:
-            self.place = self.where.words
-
-    def _check(self):
-        if self.where is not None and not isinstance(self.where, Where):
-            given, self.where = self.where, Where.of(str(self.where))
+        if place is not None and not isinstance(place, Where):
+            self.where = Where.of(str(place))
             if self.where is None:
                 raise GapError(
-                    f"effect {self.name}: place = {given!r}; allowed are 'after:OPTIC', "
+                    f"effect {name}: place = {place!r}; allowed are 'after:OPTIC', "
                     "'before:OPTIC', 'in:OPTIC', 'source', 'telescope' and 'detector'"
                 )
+        if self.place is None and self.where is not None:
+            self.place = self.where.words
+        if self.inserted is None:
+            self._check_perturbation()
+
+    def _check_perturbation(self):
         known = (*GENERATORS, *_SEVERAL)
-        for one in self.kinds if self.inserted is None else ():
+        for one in self.kinds:
             if one not in known:
                 near = did_you_mean(one, known)
                 raise GapError(f"effect {self.name}: kind {one!r}{near}; known: {', '.join(known)}")
-        if self.inserted is None:
-            try:
-                Dependence(self.dependence)
-            except ParameterError as error:
-                raise GapError(f"effect {self.name}: {error}") from None
+        try:
+            Dependence(self.dependence)
+        except ParameterError as error:
+            raise GapError(f"effect {self.name}: {error}") from None
 
     @classmethod
     def insert(cls, optic, after=None, before=None, inside=None, **settings):
@@ -658,68 +646,53 @@ def _in_frame(place, parts, label):
     return [ends[0], *parts, ends[1]]
 
 
+#: What only a detector does: the optic, what of it is free, and other settings of an `Effect`.
+DETECTOR = {
+    # the amount is a share of the usual flux of both beams together
+    "background": (optics.StrayLight(mount="total_flux"), "amount", {"flux": 2}),
+    "background_of_one_beam": (optics.FluxGain(power=-1, mount="flux"), "right", {"flux": 1}),
+    # one detector: the same law for both beams
+    "nonlinearity": (
+        *(optics.FluxGain(power=1, mount="flux"), "right"),
+        {"flux": 1, "equal": {"left": "right"}},
+    ),
+    # the gain of a beam grows as the flux before over the flux now
+    "persistence": (
+        *(optics.FluxGain(power=-1, mount="previous_flux"), "right"),
+        {"equal": {"left": "right"}},
+    ),
+    "crosstalk": (optics.Perturbation(kind="depolarization_linear"), "amplitude", {}),
+}
+_IN_FRONT = ("background", "crosstalk")
+
+
 class CellEffect(Effect):
     """An effect that is one cell: a perturbation of some kind at some place."""
 
     def __init__(self, cell, degree=2):
-        everywhere = "constant" if cell.run is None else f"dataset:{cell.run}"
+        place, dependence, settings = cell.place, cell.dependence, {}
+        if cell.kind in DETECTOR:
+            optic, free, more = DETECTOR[cell.kind]
+            settings = {"inserted": optic, "free": (free,), "scale": cell.scale, "limit": _LIMIT}
+            settings |= more
+            dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
+            if cell.kind in _IN_FRONT:
+                place = Where("before", "splitter", True, otherwise=Where("detector"))
         super().__init__(
             cell.name,
             cell.title,
-            cell.place,
-            # what only a detector has is put in by itself, see `edit`
-            *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", everywhere)),
+            place,
+            cell.kind,
+            dependence,
             degree,
             category="cell",
             words=cell.place,
             shows="what the cell does to the data",
             reference="a perturbation of no name",
+            **settings,
         )
         self._cell = cell
 
     def cells(self, chains):
         """Return the cell."""
         return (self._cell,)
-
-    def edit(self, chains, context):
-        """Return the chains with the perturbation at zero; see `Effect.edit`."""
-        if self._cell.kind in GENERATORS:
-            return super().edit(chains, context)
-        optic, side, *free = _of_detector(self._cell.kind, self.label, context)
-        for name in optic.param_names:
-            getattr(optic, name).fixed = name not in free
-        edited, ties = [], {}
-        for i, chain in enumerate(chains):
-            if self._in_dataset(context, i):
-                found = leaves(chain)
-                split = next((o.name for o in found if o.splits_light), None)
-                # of one beam the detector is behind the last optic
-                place = {side: split} if split else {"after": found[-1].name}
-                chain = insert_optic(chain, optic.copy(), **place)
-                # one detector: the same law for both beams
-                ties = {f"{self.label}.{key}": Tie(f"{self.label}.{free[0]}") for key in free[1:]}
-            edited.append(chain)
-        basis = None if self.degree is None else context.basis(self.degree)
-        size = EffectParameter(f"{self.label}.{free[0]}", self._cell.scale, _LIMIT, basis)
-        return Edit(edited, [size], ties)
-
-
-def _of_detector(kind, name, context):
-    """Return the optic of a kind that only a detector has, its side of the splitter, what is free.
-
-    Of the free parameters all follow the first.
-    """
-    size, flux = np.zeros(len(context.wavelength)), context.flux
-    if kind == "background":
-        settings = {"reference": 2 * flux, "mount": "total_flux"}
-        return optics.StrayLight(amount=size, name=name, **settings), "before", "amount"
-    if kind == "crosstalk":
-        loss = optics.Perturbation(amplitude=size, kind="depolarization_linear", name=name)
-        return loss, "before", "amplitude"
-    power, reference, mount, *free = {
-        "background_of_one_beam": (-1, flux, "flux", "right"),
-        "nonlinearity": (1, flux, "flux", "right", "left"),
-        "persistence": (-1, 1.0, "previous_flux", "right", "left"),
-    }[kind]
-    settings = {"power": power, "reference": reference, "mount": mount, "name": name}
-    return optics.FluxGain(right=size, left=size, **settings), "after", *free

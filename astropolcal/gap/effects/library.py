@@ -8,29 +8,9 @@ Places are given by the role of an optic, see `Roles`, so that a row fits every 
 import astropy.units as u
 
 from astropolcal import optics
-from astropolcal.gap.effects._laws import (
-    LAG,
-    Alternative,
-    BandAverage,
-    Elliptical,
-    Fringes,
-    Held,
-    Recoating,
-    StandardPolarization,
-    WavelengthScale,
-    every_wavelength,
-    flipped_before,
-    flipped_behind,
-    following,
-    has_law,
-    lagging,
-    may_be_polarized,
-    mirror_leaves,
-    other_sign,
-    turned_by,
-    without_constant,
-)
-from astropolcal.gap.effects.effect import NUMBER, Effect
+from astropolcal.gap.cells import DETECTED
+from astropolcal.gap.effects import _laws as laws
+from astropolcal.gap.effects.effect import DETECTOR, NUMBER, Effect
 from astropolcal.gap.effects.where import Where
 
 __all__ = []
@@ -41,32 +21,29 @@ _HARTEN = "van Harten et al. 2009, arXiv:0903.2740"
 _HOLSTEIN = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 _MCINTOSH = "McIntosh et al. 2026, Sec. 4"
 _PATAT = "Patat & Romaniello 2006, doi:10.1086/497581"
-_SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
+_SIGNS = f"McIntosh et al. 2026, Sec. 6.1; {_HOLSTEIN}"
 _THART = "'t Hart et al. 2021, doi:10.1117/12.2594962"
 
-_PLATE = Where("in", "plate", True, in_front=True)
-_DEROTATOR = Where("in", "derotator", True)
-_RELAY = Where("after", "relay", True)
-_POLARIZER = Where("after", "polarizer", True)
-_MIRROR = Where("after", "mirror", True)
+_PLATE = Where("in", "plate", True, in_front=True, said="half-wave plate")
+_DEROTATOR = Where("in", "derotator", True, said="derotator")
+_RELAY = Where("after", "relay", True, said="relay downstream of the derotator")
+_POLARIZER = Where("after", "polarizer", True, said="calibration polarizer")
+_MIRROR = Where("after", "mirror", True, said="mirror upstream of the half-wave plate")
 _SPLITTER = Where("before", "splitter", True)
 _DETECTOR = Where("detector")
-_ENTRANCE = Where("before", "entrance", True)
-_SKY = Where("before", "parallactic", True)
+_ENTRANCE = Where("before", "entrance", True, said="upstream of the half-wave plate")
+_SKY = Where("before", "parallactic", True, said="sky")
 # behind the mirror: small diattenuations of one plane add up in any order
-_M3 = Where("in", "telescope_mirror", True, turned=0.0, otherwise=Where("before", "altitude", True))
+_ALTITUDE = Where("before", "altitude", True)
+_M3 = Where("in", "telescope_mirror", True, turned=0.0, otherwise=_ALTITUDE, said="tertiary mirror")
+_TELESCOPE = Where("telescope")
 
-_ON_PLATE = {"words": "half-wave plate"}
 _AT_DETECTOR = {"words": "detector", "category": "detector"}
-_BEHIND = {"words": "relay downstream of the derotator"}
-_IN_TELESCOPE = {
-    kind: {"words": "tertiary mirror", "near": (Where("telescope"), (f"{kind}_h", f"{kind}_d"))}
-    for kind in ("diattenuation", "retardance")
-}
 
 _WAVES = ("cosine", "sine")
 _ANY_AXIS = ("horizontal", "diagonal")
-_CIRCULAR_H_D = ("retardance_d", "retardance_h", "rotation")
+_RETARDANCE = ("retardance_d", "retardance_h")
+_DIATTENUATION = ("diattenuation_h", "diattenuation_d")
 _DEPOLARIZED = ("depolarization_d", "depolarization_linear", "depolarization_circular")
 
 
@@ -75,12 +52,10 @@ def _size(scale, limit, unit=1.0):
 
 
 def _effect(name, title, place, kind, optic, free, size, shows, reference, **more):
-    """Return the effect of an optic that there is already, of which some parameters are free."""
+    """Return the effect of an optic that is inserted, of which some parameters are free."""
     free = (free,) if isinstance(free, str) else free
-    return Effect(
-        name, title, place, kind, more.pop("dependence", None), more.pop("degree", 2),
-        inserted=optic, free=free, shows=shows, reference=reference, **size, **more,
-    )  # fmt: skip
+    more |= {"inserted": optic, "free": free, "shows": shows, "reference": reference}
+    return more.pop("cls", Effect)(name, title, place, kind, **size, **more)
 
 
 def _encoder(name, n, place, optic, like, shows):
@@ -100,7 +75,7 @@ def _transmission(name, n, title):
         name, title, _PLATE, (), optics.HarmonicGain(harmonic=n), _WAVES, _size(0.003, 0.1),
         f"harmonic {n} of the plate angle in sums, none in differences",
         "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023", degree=NUMBER,
-        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
+        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)),
     )  # fmt: skip
 
 
@@ -112,33 +87,31 @@ _PLATE_EFFECTS = [
         _PLATE, "orientation", optics.EllipticalRetarder(), "circular", _size(1, 20, u.deg),
         "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles",
         "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654",
-        degree=without_constant, **_ON_PLATE, category="parameter",
+        degree=laws.without_constant, category="parameter",
     ),
     _effect(
         "hwp_retardance", "error of the half-wave plate's retardance law",
         _PLATE, "retardance_h", _NO_RETARDER, "retardance", _size(1, 30, u.deg),
-        "harmonics 2 and 4 of the plate angle, smooth in wavelength", _THART,
-        **_ON_PLATE, category="parameter",
+        "harmonics 2 and 4 of the plate angle, smooth in wavelength", _THART, category="parameter",
     ),
     # one value per wavelength, for two layers and any smooth law may be too stiff
     _effect(
         "hwp_retardance_free", "retardance of the half-wave plate that no smooth law describes",
         _PLATE, "retardance_h", _NO_RETARDER, "retardance", _size(1, 30, u.deg),
         "harmonics 2 and 4 of the plate angle, any course with wavelength", _THART,
-        degree=None, **_ON_PLATE, category="parameter",
+        degree=None, category="parameter",
     ),
-    WavelengthScale(
+    _effect(
         "wavelength_scale", "shift of the wavelength scale", _PLATE, "retardance_h",
-        inserted=_NO_RETARDER, free=("retardance",), **_size(0.3, 10, u.deg),
-        words="spectrograph", category="detector", when=lambda roles: has_law(roles.plate),
-        shows="the model's derivative to wavelength",
-        reference="template of a shifted wavelength scale; compare Harrington & Sueoka 2017",
+        _NO_RETARDER, "retardance", _size(0.3, 10, u.deg), "the model's derivative to wavelength",
+        "template of a shifted wavelength scale; compare Harrington & Sueoka 2017",
+        cls=laws.WavelengthScale, words="spectrograph", category="detector",
+        when=lambda roles: laws.has_law(roles.plate),
     ),
     _effect(
         "hwp_diattenuation", "diattenuation of the half-wave plate",
         _PLATE, "diattenuation_h", optics.Diattenuator(), "diattenuation", _size(0.003, 0.1),
         "harmonic 2 of the plate angle in sums and in differences of unpolarized light", _BRYAN,
-        **_ON_PLATE,
     ),
     _transmission(
         "hwp_transmission", 2, "transmission of the half-wave plate that changes twice a turn",
@@ -162,7 +135,7 @@ _PLATE_EFFECTS = [
         _PLATE, "retardance_h", optics.HarmonicRetarder(harmonic=2), _WAVES,
         _size(0.5, 20, u.deg), "harmonics 2, 4, 6 and 8 of the plate angle",
         "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074",
-        degree=NUMBER, dependence="harmonic:own:2", **_ON_PLATE,
+        degree=NUMBER, dependence="harmonic:own:2",
     ),
     _encoder(
         "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
@@ -178,10 +151,9 @@ _PLATE_EFFECTS = [
 def _elliptical(name, title, shows, kinds, *components):
     # with the horizontal component the diagonal one turns the axis: by half the arctangent of
     # their ratio
-    return Elliptical(
-        name, title, _DEROTATOR, kinds, components=components,
-        words="derotator", category="parameter", shows=shows, reference=_MCINTOSH,
-        **_size(2, 60, u.deg),
+    return _effect(
+        name, title, _DEROTATOR, kinds, None, components, _size(2, 60, u.deg), shows, _MCINTOSH,
+        cls=laws.Elliptical, category="parameter",
     )  # fmt: skip
 
 
@@ -202,19 +174,18 @@ _DEROTATOR_EFFECTS = [
         "rotation of Q and U that depends on wavelength, in part on the derotator angle",
         ("retardance_d", "rotation"), "diagonal", "circular",
     ),
-    BandAverage(
+    _effect(
         "derotator_band_average",
-        "retardance of the derotator that changes within a wavelength bin",
-        _DEROTATOR, ("depolarization_h", "depolarization_linear", "depolarization_circular"),
-        **_size(0.005, 0.2), free=("retained_u",), words="derotator",
-        shows="less modulation where the retardance is steep, most between the axes of the "
-        "derotator", reference=_HARRINGTON_2019,
+        "retardance of the derotator that changes within a wavelength bin", _DEROTATOR,
+        ("depolarization_h", "depolarization_linear", "depolarization_circular"),
+        None, "retained_u", _size(0.005, 0.2),
+        "less modulation where the retardance is steep, most between the axes of the derotator",
+        _HARRINGTON_2019, cls=laws.BandAverage,
     ),
     _effect(
         "derotator_diattenuation", "diattenuation of the derotator",
         _DEROTATOR, "diattenuation_h", optics.Diattenuator(), "diattenuation", _size(0.005, 0.2),
         "harmonic 2 of the derotator angle, constant with the plate", _HOLSTEIN,
-        words="derotator",
     ),
     *(
         _encoder(
@@ -228,51 +199,48 @@ _DEROTATOR_EFFECTS = [
     _effect(
         "derotator_motion",
         "angle of the derotator of another moment than the middle of the exposure",
-        _DEROTATOR, "orientation", lambda derotator: lagging(derotator.mount), "rate", LAG,
+        _DEROTATOR, "orientation", lambda leaf: laws.lagging(leaf.mount), "rate", laws.LAG,
         "rotation of Q and U by the rate of the derotator, most near transit", _HOLSTEIN,
         degree=NUMBER, when=lambda roles: any(o.stage == "parallactic" for o in roles.leaves),
-        words="stage of the derotator",
-        category="parameter",
+        words="stage of the derotator", category="parameter",
     ),
 ]  # fmt: skip
 
-_FRINGES = Fringes(
-    "fringes", "fringes of a plane-parallel window", _RELAY, ("retardance_d", "retardance_h"),
-    inserted=optics.EllipticalRetarder(), free=_ANY_AXIS, **_size(1, 30, u.deg),
-    words="plane-parallel window downstream of the derotator",
-    shows="sinusoid in one over the wavelength",
-    reference="Harrington et al. 2017, doi:10.1117/1.JATIS.3.4.048001",
+_WINDOW = {"cls": laws.Fringes, "words": "plane-parallel window downstream of the derotator"}
+_FRINGES = _effect(
+    "fringes", "fringes of a plane-parallel window", _RELAY, _RETARDANCE,
+    optics.EllipticalRetarder(), _ANY_AXIS, _size(1, 30, u.deg),
+    "sinusoid in one over the wavelength",
+    "Harrington et al. 2017, doi:10.1117/1.JATIS.3.4.048001", **_WINDOW,
 )  # fmt: skip
-_DRIFTING = Fringes(
+_DRIFTING = _effect(
     "fringes_drift", "fringes of a plane-parallel window that drift through the run", _RELAY,
-    ("retardance_d", "retardance_h"), inserted=optics.DriftRetarder(mount="sequence"),
-    near=(_RELAY, ("retardance_d", "retardance_h"), ("time", "constant")),
-    free=(*_ANY_AXIS, "horizontal_rate", "diagonal_rate"), **_size(1, 30, u.deg),
-    words="plane-parallel window downstream of the derotator",
-    shows="sinusoid in one over the wavelength, with time",
-    reference="Harrington & Sueoka 2018, doi:10.1117/1.JATIS.4.1.018006",
+    _RETARDANCE, optics.DriftRetarder(mount="sequence"),
+    (*_ANY_AXIS, "horizontal_rate", "diagonal_rate"), _size(1, 30, u.deg),
+    "sinusoid in one over the wavelength, with time",
+    "Harrington & Sueoka 2018, doi:10.1117/1.JATIS.4.1.018006",
+    near=(_RELAY, _RETARDANCE, ("time", "constant")), **_WINDOW,
 )  # fmt: skip
 
 _RELAY_EFFECTS = [
     # beyond half a turn a retardance comes back with the other sign
     _effect(
         "static_retarder", "retarder that is static downstream of the derotator",
-        _RELAY, _CIRCULAR_H_D, optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
-        _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength",
-        _HARRINGTON_2019, **_BEHIND,
+        _RELAY, (*_RETARDANCE, "rotation"), optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
+        _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength", _HARRINGTON_2019,
     ),
     _effect(
         "dichroic_j_band", "retardance of a dichroic that changes steeply with wavelength",
-        _RELAY, ("retardance_d", "retardance_h"), optics.EllipticalRetarder(), _ANY_AXIS,
+        _RELAY, _RETARDANCE, optics.EllipticalRetarder(), _ANY_AXIS,
         _size(5, 360, u.deg), "pattern in derotator angle, sharp in wavelength", _HARRINGTON_2019,
-        degree=every_wavelength, words="dichroic",
+        degree=laws.every_wavelength, words="dichroic",
     ),
     *(one.of(thickness) for thickness in (8, 4, 12) for one in (_FRINGES, _DRIFTING)),
     _effect(
         "static_diattenuator", "diattenuator that is static downstream of the derotator",
         _RELAY, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.005, 0.3),
         "single differences of all sources, at all plate and derotator angles",
-        "de Boer et al. 2020, doi:10.1051/0004-6361/201834989", **_BEHIND,
+        "de Boer et al. 2020, doi:10.1051/0004-6361/201834989",
     ),
     # at 0 deg it would scale what the splitter sees, which the efficiency takes up; a retarder
     # averaged over a band keeps what is along its axis and loses the rest alike: a loss of Q alone
@@ -282,14 +250,14 @@ _RELAY_EFFECTS = [
         "depolarizer downstream of the derotator that is not the same for all orientations",
         _RELAY, _DEPOLARIZED, optics.Depolarizer(theta=22.5 * u.deg), "retained_q",
         _size(0.01, 0.5), "Q measured where there is U, with the derotator angle",
-        _HARRINGTON_2019, equal={"retained_v": "retained_q"}, **_BEHIND,
+        _HARRINGTON_2019, equal={"retained_v": "retained_q"},
     ),
-    BandAverage(
+    _effect(
         "dichroic_band_average", "retardance of a dichroic that changes within a wavelength bin",
         _SPLITTER, ("depolarization_linear", "depolarization_h", *_DEPOLARIZED),
-        **_size(0.005, 0.2), free=("retained_u",), words="dichroic",
-        shows="less modulation where the retardance is steep, with the derotator angle",
-        reference=_HARRINGTON_2019,
+        None, "retained_u", _size(0.005, 0.2),
+        "less modulation where the retardance is steep, with the derotator angle",
+        _HARRINGTON_2019, cls=laws.BandAverage, words="dichroic",
     ),
     _effect(
         "beam_crosstalk", "light of one beam in the other, or any loss of contrast",
@@ -313,17 +281,16 @@ _SOURCE_EFFECTS = [
     _effect(
         "source_circular",
         "circular polarization of the source (or a retarder upstream of the plate)",
-        Where("after", "polarizer", True, turned=45), ("retardance_d", "retardance_h"),
-        _NO_RETARDER, "retardance", _size(1, 45, u.deg),
-        "constant in plate angle, varies with derotator angle",
+        Where("after", "polarizer", True, turned=45), _RETARDANCE, _NO_RETARDER, "retardance",
+        _size(1, 45, u.deg), "constant in plate angle, varies with derotator angle",
         "computed from the measurement equation; McIntosh et al. 2026, Sec. 2",
         words="source", category="source",
     ),
     _effect(
         "retarder_before_plate",
         "retarder upstream of the half-wave plate in the path of the unpolarized source",
-        Where("after", "mirror", True, turned=45), ("retardance_d", "retardance_h"),
-        _NO_RETARDER, "retardance", _size(5, 90, u.deg),
+        Where("after", "mirror", True, turned=45), _RETARDANCE, _NO_RETARDER, "retardance",
+        _size(5, 90, u.deg),
         "constant in plate angle, varies with derotator angle, unpolarized data alone", _HOLSTEIN,
         words="upstream of the half-wave plate",
     ),
@@ -332,8 +299,7 @@ _SOURCE_EFFECTS = [
         "linear polarization of the source, or a mirror upstream of the half-wave plate",
         _ENTRANCE, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.01, 0.3),
         "harmonic 4 of the plate angle, as the derotator turns it",
-        "McIntosh et al. 2026, Sec. 5.2 (fold mirror of the internal source)",
-        words="upstream of the half-wave plate", category="source",
+        "McIntosh et al. 2026, Sec. 5.2 (fold mirror of the internal source)", category="source",
     ),
     _effect(
         "source_rotation_drift", "polarization of the source that turns through the run",
@@ -349,14 +315,14 @@ _SOURCE_EFFECTS = [
         "retained_q", _size(0.01, 0.3),
         "amplitude of the polarized data alone: the efficiency takes it up", _THART,
         equal={"retained_u": "retained_q", "retained_v": "retained_q"},
-        absorbed_by="wollaston.efficiency", words="calibration polarizer", category="source",
+        absorbed_by="wollaston.efficiency", category="source",
     ),
-    StandardPolarization(
+    _effect(
         "standard_polarization", "polarization of the standard star itself, which the model holds",
-        Where("after", "star", True), "diattenuation", free=("q", "u"), **_size(0.003, 0.3),
-        words="star", category="source",
-        shows="harmonic 4 of the plate angle, with a phase that is fixed on the sky",
-        reference="Blinov et al. 2023, doi:10.1051/0004-6361/202346778",
+        Where("after", "star", True), "diattenuation", None, ("q", "u"), _size(0.003, 0.3),
+        "harmonic 4 of the plate angle, with a phase that is fixed on the sky",
+        "Blinov et al. 2023, doi:10.1051/0004-6361/202346778",
+        cls=laws.StandardPolarization, words="star", category="source",
     ),
 ]  # fmt: skip
 
@@ -365,21 +331,21 @@ _SKY_EFFECTS = [
         "m3_diattenuation", "diattenuation of the telescope's tertiary mirror",
         _M3, "diattenuation", optics.Diattenuator(), "diattenuation", _size(0.01, 0.1),
         "harmonic 4 of the plate angle, with a phase that follows altitude and derotator",
-        _HARTEN, when=mirror_leaves("retardance"), **_IN_TELESCOPE["diattenuation"],
+        _HARTEN, when=laws.mirror_leaves("retardance"), near=(_TELESCOPE, _DIATTENUATION),
     ),
     # a retarder does nothing to unpolarized light: such stars cannot tell it
     _effect(
         "m3_retardance", "retardance of the telescope's tertiary mirror",
         _M3, "retardance", _NO_RETARDER, "retardance", _size(5, 180, u.deg),
         "circular from linear polarization of stars, with altitude; none of unpolarized ones",
-        _HARTEN, **_IN_TELESCOPE["retardance"],
-        when=lambda roles: may_be_polarized(roles) and mirror_leaves("diattenuation")(roles),
+        _HARTEN, near=(_TELESCOPE, ("retardance_h", "retardance_d")),
+        when=laws.mirror_leaves("diattenuation", polarized=True),
     ),
-    Recoating(
+    _effect(
         "m3_recoating", "tertiary mirror that is recoated between two datasets of stars",
-        _M3, "diattenuation", inserted=optics.Diattenuator(), free=("diattenuation",),
-        **_size(0.003, 0.1), **_IN_TELESCOPE["diattenuation"], reference=_HARTEN,
-        shows="as the diattenuation of the tertiary mirror, in some datasets and not in others",
+        _M3, "diattenuation", optics.Diattenuator(), "diattenuation", _size(0.003, 0.1),
+        "as the diattenuation of the tertiary mirror, in some datasets and not in others", _HARTEN,
+        cls=laws.Recoating, near=(_TELESCOPE, _DIATTENUATION),
     ),
     # constant in flux, so that bright frames are polarized less by it
     _effect(
@@ -387,15 +353,27 @@ _SKY_EFFECTS = [
         _SKY, "diattenuation", optics.PolarizedBackground(mount="total_flux"), ("q", "u"),
         _size(0.002, 0.1),
         "harmonic 4 of the plate angle with a phase of its own, as one over the flux", _PATAT,
-        degree=1, flux=2, words="sky", category="source",
+        degree=1, flux=2, category="source",
     ),
     _effect(
         "sky_motion", "parallactic angle of another moment than the middle of the exposure",
-        _SKY, "rotation", lagging("parallactic"), "rate", LAG,
+        _SKY, "rotation", laws.lagging("parallactic"), "rate", laws.LAG,
         "polarization of stars turned by the rate of the parallactic angle, most near transit",
-        _HOLSTEIN, degree=NUMBER, when=may_be_polarized, words="telescope", category="parameter",
+        _HOLSTEIN, degree=NUMBER, when=laws.may_be_polarized, words="telescope",
+        category="parameter",
     ),
 ]  # fmt: skip
+
+
+def _detected(name, title, kind, size, shows, reference, **more):
+    """Return the effect of what only a detector has."""
+    optic, free, settings = DETECTOR[kind]
+    place = _SPLITTER if kind == "background" else _DETECTOR
+    return _effect(
+        name, title, place, (), optic, free, size, shows, reference,
+        near=(_DETECTOR, (kind,), DETECTED[kind]), **settings, **_AT_DETECTOR, **more,
+    )  # fmt: skip
+
 
 _DETECTOR_EFFECTS = [
     _effect(
@@ -404,90 +382,69 @@ _DETECTOR_EFFECTS = [
         "single differences of all sources, constant and harmonic 8 of the plate angle", _PATAT,
         **_AT_DETECTOR,
     ),
-    # the amount is a share of the usual flux of both beams together
-    _effect(
-        "background", "background or stray light in the apertures",
-        _SPLITTER, (), optics.StrayLight(mount="total_flux"), "amount", _size(0.003, 0.2),
-        "amplitude of differences, as one over the flux", _PATAT,
-        flux=2, near=(Where("detector"), ("background",), "flux"), **_AT_DETECTOR,
+    _detected(
+        "background", "background or stray light in the apertures", "background",
+        _size(0.003, 0.2), "amplitude of differences, as one over the flux", _PATAT,
     ),
-    # one detector: the same law for both beams
-    _effect(
-        "detector_nonlinearity", "detector that does not answer linearly",
-        _DETECTOR, (), optics.FluxGain(power=1, mount="flux"), "right", _size(0.01, 0.3),
-        "harmonic 8 of the plate angle in sums, 12 in differences, as the flux",
+    _detected(
+        "detector_nonlinearity", "detector that does not answer linearly", "nonlinearity",
+        _size(0.01, 0.3), "harmonic 8 of the plate angle in sums, 12 in differences, as the flux",
         "Didier et al. 2019, doi:10.3847/1538-4357/ab0f36; Takakura et al. 2017", degree=0,
-        flux=1, equal={"left": "right"}, near=(Where("detector"), ("nonlinearity",), "flux"),
-        **_AT_DETECTOR,
     ),
-    # the gain of a beam grows as the flux before over the flux now
-    _effect(
-        "persistence", "light of the frame before that is still in the detector",
-        _DETECTOR, (), optics.FluxGain(power=-1, mount="previous_flux"), "right",
+    _detected(
+        "persistence", "light of the frame before that is still in the detector", "persistence",
         _size(0.003, 0.1), "differences that follow those of the frame before",
-        "Smith et al. 2008, doi:10.1117/12.789372", degree=0, equal={"left": "right"},
-        near=(Where("detector"), ("persistence",), "previous"), **_AT_DETECTOR,
+        "Smith et al. 2008, doi:10.1117/12.789372", degree=0,
     ),
 ]  # fmt: skip
 
 _HELD = "orientation of the {}, which the model holds fixed"
 _PHASE = "phase of harmonic 4 of the plate angle, {}"
-_BOUND = {
-    "category": "bound",
-    "shows": "along the derivative to the parameter that is at its bound",
-    "reference": "residual of a constrained fit; Nocedal & Wright 2006, chapter 12",
-}
 _HALF_DEGREE, _TEN_DEGREES = _size(0.5, 5, u.deg), _size(1, 10, u.deg)
 
 
-def _held(name, title, where, kind, words, size, free=("theta",), **more):
-    more = {"category": "parameter", "reference": _HOLSTEIN} | more
-    return Held(name, title, where, kind, words=words, free=free, **size, **more)
+def _held(name, title, where, kind, size, shows, free="theta", reference=_HOLSTEIN, **more):
+    more = {"cls": laws.Held, "category": "parameter"} | more
+    return _effect(name, title, where, kind, None, free, size, shows, reference, **more)
+
+
+def _bound(name, what, where, kind, size, free="theta"):
+    return _held(
+        name, f"{what} beyond its bound", where, kind, size,
+        "along the derivative to the parameter that is at its bound", free,
+        "residual of a constrained fit; Nocedal & Wright 2006, chapter 12", category="bound",
+    )  # fmt: skip
 
 
 _HELD_EFFECTS = [
     _held(
-        "hwp_misalignment", _HELD.format("half-wave plate"), _PLATE, "orientation",
-        "half-wave plate", _HALF_DEGREE, shows=_PHASE.format("the same at all wavelengths"),
+        "hwp_misalignment", _HELD.format("half-wave plate"), _PLATE, "orientation", _HALF_DEGREE,
+        _PHASE.format("the same at all wavelengths"),
     ),
     _held(
         "derotator_misalignment", _HELD.format("derotator"), _DEROTATOR, "orientation",
-        "derotator", _HALF_DEGREE,
-        shows="pattern in derotator angle of a turned derotator, with its retardance",
+        _HALF_DEGREE, "pattern in derotator angle of a turned derotator, with its retardance",
     ),
     _held(
         "polarizer_misalignment", _HELD.format("calibration polarizer"), _POLARIZER, "rotation",
-        "calibration polarizer", _HALF_DEGREE, shows=_PHASE.format("polarized data alone"),
+        _HALF_DEGREE, _PHASE.format("polarized data alone"),
     ),
     # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
     _held(
         "mirror_misalignment",
         "orientation of the mirror upstream of the half-wave plate, far from where it should be",
-        _MIRROR, "rotation", "mirror upstream of the half-wave plate", _size(1, 45, u.deg),
-        shows=_PHASE.format("unpolarized data alone"),
+        _MIRROR, "rotation", _size(1, 45, u.deg), _PHASE.format("unpolarized data alone"),
     ),
-    _held(
-        "hwp_angle_bound", "orientation of the half-wave plate beyond its bound",
-        _PLATE, "orientation", "half-wave plate", _TEN_DEGREES, **_BOUND,
-    ),
-    _held(
-        "derotator_angle_bound", "orientation of the derotator beyond its bound",
-        _DEROTATOR, "orientation", "derotator", _TEN_DEGREES, **_BOUND,
-    ),
-    _held(
-        "polarizer_angle_bound", "orientation of the calibration polarizer beyond its bound",
-        _POLARIZER, "rotation", "calibration polarizer", _TEN_DEGREES, **_BOUND,
-    ),
-    _held(
-        "hwp_thickness_bound", "thickness of a layer of the half-wave plate beyond its bound",
-        _PLATE, "retardance_h", "half-wave plate", _size(0.02, 0.5, u.mm), ("w_sio2", "w_mgf2"),
-        **_BOUND,
-    ),
-    _held(
-        "derotator_retardance_bound", "retardance of the derotator beyond its bound",
-        _DEROTATOR, "retardance_h", "derotator", _size(5, 180, u.deg),
-        ("retardance", "horizontal", "diagonal", "circular"), **_BOUND,
-    ),
+    _bound("hwp_angle_bound", "orientation of the half-wave plate", _PLATE, "orientation",
+           _TEN_DEGREES),
+    _bound("derotator_angle_bound", "orientation of the derotator", _DEROTATOR, "orientation",
+           _TEN_DEGREES),
+    _bound("polarizer_angle_bound", "orientation of the calibration polarizer", _POLARIZER,
+           "rotation", _TEN_DEGREES),
+    _bound("hwp_thickness_bound", "thickness of a layer of the half-wave plate", _PLATE,
+           "retardance_h", _size(0.02, 0.5, u.mm), ("w_sio2", "w_mgf2")),
+    _bound("derotator_retardance_bound", "retardance of the derotator", _DEROTATOR, "retardance_h",
+           _size(5, 180, u.deg), ("retardance", "horizontal", "diagonal", "circular")),
 ]  # fmt: skip
 
 _TURNED = "everywhere: the polarization turns the other way"
@@ -495,49 +452,61 @@ _BY_DEROTATOR = "everywhere that depends on the derotator angle"
 _SIGN = "angle of the {} with the wrong sign"
 _OFFSET = "angle of the {} from another zero or keyword, off by 45 deg"
 _PLATE_WORDS, _DEROTATOR_WORDS = "stage of the half-wave plate", "stage of the derotator"
+_QUARTER = laws.turned_by(45)
 
 
 def _followed(name, title, shows, *factors, needs="parallactic"):
     """Return a plate that follows the sky by another law than its instrument says."""
-    return Alternative(
-        name, f"half-wave plate that {title}", _PLATE_WORDS, "plate", following(*factors),
-        shows=f"everywhere on sky: the polarization turns with {shows}", reference=_SIGNS,
+    return laws.Alternative(
+        name, f"half-wave plate that {title}", _PLATE_WORDS, "plate", laws.following(*factors),
+        f"everywhere on sky: the polarization turns with {shows}", reference=_SIGNS,
         when=lambda roles: getattr(roles, needs) is not None,
     )  # fmt: skip
 
 
 _ALTERNATIVES = [
-    Alternative(
+    laws.Alternative(
         "mirror_flip",
         "odd number of reflections downstream of the derotator, missing or in excess",
-        "relay downstream of the derotator", "relay", flipped_behind,
-        shows="everywhere: U and V have the wrong sign",
+        _RELAY.said, "relay", laws.flipped_behind, "everywhere: U and V have the wrong sign",
         when=lambda roles: roles.splitter is not None,
     ),
     # an odd number in all: two flips with only rotators between them are a rotation
-    Alternative(
+    laws.Alternative(
         "mirror_flip_before_plate",
         "odd number of reflections upstream of the half-wave plate that the model lacks",
-        "upstream of the half-wave plate", Where("before", "plate"), flipped_before, shows=_TURNED,
+        _ENTRANCE.said, Where("before", "plate"), laws.flipped_before, _TURNED,
     ),
-    Alternative("hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", other_sign,
-                shows=_TURNED),
-    Alternative("derotator_sign", _SIGN.format("derotator"), _DEROTATOR_WORDS, "derotator",
-                other_sign, shows=_BY_DEROTATOR),
+    laws.Alternative(
+        "hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", laws.other_sign, _TURNED
+    ),
+    laws.Alternative(
+        "derotator_sign", _SIGN.format("derotator"), _DEROTATOR_WORDS, "derotator",
+        laws.other_sign, _BY_DEROTATOR,
+    ),
     # T(-90) exchanges the axes of the prism, and with them the beams
-    Alternative("beams_swapped", "right and left beam exchanged", "detector", "splitter",
-                turned_by(90), shows="everywhere: the differences have the wrong sign"),
+    laws.Alternative(
+        "beams_swapped", "right and left beam exchanged", "detector", "splitter",
+        laws.turned_by(90), "everywhere: the differences have the wrong sign",
+    ),
     # two plates 45 deg apart differ by the sign of Q and U: polarization turned by 90 deg
-    Alternative("hwp_offset", _OFFSET.format("half-wave plate"), _PLATE_WORDS, "plate",
-                turned_by(45), shows="everywhere: the polarization is turned by 90 deg"),
-    Alternative("derotator_offset", _OFFSET.format("derotator"), _DEROTATOR_WORDS, "derotator",
-                turned_by(45), shows=_BY_DEROTATOR),
-    Alternative("parallactic_sign", "parallactic angle with the wrong sign", "sky", "parallactic",
-                other_sign, reference=_SIGNS,
-                shows="polarization of stars that turns with the parallactic angle"),
-    Alternative("altitude_sign", "altitude with the wrong sign", "telescope", "altitude",
-                other_sign, reference=_SIGNS,
-                shows="everywhere on sky: the polarization turns with twice the altitude"),
+    laws.Alternative(
+        "hwp_offset", _OFFSET.format("half-wave plate"), _PLATE_WORDS, "plate", _QUARTER,
+        "everywhere: the polarization is turned by 90 deg",
+    ),
+    laws.Alternative(
+        "derotator_offset", _OFFSET.format("derotator"), _DEROTATOR_WORDS, "derotator", _QUARTER,
+        _BY_DEROTATOR,
+    ),
+    laws.Alternative(
+        "parallactic_sign", "parallactic angle with the wrong sign", "sky", "parallactic",
+        laws.other_sign, "polarization of stars that turns with the parallactic angle",
+        reference=_SIGNS,
+    ),
+    laws.Alternative(
+        "altitude_sign", "altitude with the wrong sign", "telescope", "altitude", laws.other_sign,
+        "everywhere on sky: the polarization turns with twice the altitude", reference=_SIGNS,
+    ),
     _followed("hwp_tracking_parallactic_sign", "follows the parallactic angle with the wrong sign",
               "the parallactic angle", -1.0, 1.0),
     _followed("hwp_tracking_altitude_sign", "follows the altitude with the wrong sign",

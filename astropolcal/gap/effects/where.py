@@ -35,6 +35,8 @@ class Where:
     turned: float | None = None
     #: The place of chains that lack the optic.
     otherwise: object = None
+    #: The place in words, where they are not those of the optic.
+    said: str = ""
 
     @classmethod
     def of(cls, place):
@@ -47,7 +49,7 @@ class Where:
     def words(self):
         """The place in words."""
         side = {"after": "downstream of the ", "before": "upstream of the "}.get(self.relation, "")
-        return f"{side}{self.optic or self.relation}"
+        return self.said or f"{side}{self.optic or self.relation}"
 
     @property
     def follows(self):
@@ -260,23 +262,18 @@ def adapted(effects, chains):
     chains = list(chains)
     found = [one for effect in effects for one in effect.per_optic(chains)]
     found = [one for one in found if one.applies(chains)]
-    found = [_renamed(one, chains) for one in found]
-    if any(Roles(chain).derotator is not None for chain in chains):
-        return found
-    return [_reworded(one) for one in found]
-
-
-def _renamed(effect, chains):
-    """Name the plate as its chain does, where none is on the stage of a half-wave plate."""
-    every = [o for chain in chains for o in Roles(chain).all("plate")]
-    if not every or any(o.stage == "hwp" for o in every) or effect.acts_on != "plate":
-        return effect
-    name = effect.optic or every[0].name
-    words = {"title": effect.title, "place": effect.place}
-    return effect.changed(**{k: v.replace("half-wave plate", name) for k, v in words.items()})
-
-
-def _reworded(effect):
-    words = {"title": effect.title, "place": effect.place}
-    new = {key: text.replace(_BEHIND, _BEHIND_PLATE) for key, text in words.items()}
-    return effect if new == words else effect.changed(**new)
+    every = [Roles(chain) for chain in chains]
+    plates = [o for roles in every for o in roles.all("plate")]
+    # none is on the stage of a half-wave plate
+    own_name = plates and not any(o.stage == "hwp" for o in plates)
+    for i, one in enumerate(found):
+        words = {}
+        if own_name and one.acts_on == "plate":
+            words["half-wave plate"] = one.optic or plates[0].name
+        if all(roles.derotator is None for roles in every):
+            words[_BEHIND] = _BEHIND_PLATE
+        for old, new in words.items():
+            if old in one.title + one.place:
+                title, place = (text.replace(old, new) for text in (one.title, one.place))
+                found[i] = one = one.changed(title=title, place=place)
+    return found
