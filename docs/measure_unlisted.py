@@ -20,8 +20,9 @@ from scipy.linalg import expm
 from astropolcal import calibrate
 from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.system import inverse_rows
-from astropolcal.gap._bench import ACTIONS, Bench, Setup, _turned
+from astropolcal.gap._bench import ACTIONS, Bench, Setup
 from astropolcal.gap._faults import Fault
+from astropolcal.mueller import rotate
 
 TABLE = Path(__file__).with_name("unlisted_effects.csv")
 COLUMNS = "seed,place,kind,dependence,snr,real_30,stated_30,real_1,stated_1\n"
@@ -76,7 +77,9 @@ def rows(bench, optics, kicks):
         for place, action, exponent in kicks if light is not None else ():
             if name == bench.anchor(0, place):
                 turn = angle if place.startswith("in:") else 0.0
-                light = expm(exponent[..., None, None] * _turned(ACTIONS[action], turn)) @ light
+                light = (
+                    expm(exponent[..., None, None] * rotate(ACTIONS[action], turn * u.rad)) @ light
+                )
     return light[..., 0, :3].swapaxes(1, 2)
 
 

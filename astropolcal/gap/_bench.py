@@ -2,8 +2,8 @@
 """
 Simulated calibrations with faults in them, for the challenge.
 
-Nothing of the diagnosis is used: Stokes vectors go through the Mueller matrices of the optics, and
-a fault is the matrix exponential of a generator of its own, or something that no such matrix is.
+Nothing of the diagnosis is used but names: Stokes vectors go through the Mueller matrices of the
+optics, and a fault is the matrix exponential of a generator, or something that no such matrix is.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,13 @@ from scipy.optimize import least_squares
 from astropolcal import instruments
 from astropolcal.chain import leaves, stages, with_beam
 from astropolcal.exceptions import GapError
+from astropolcal.gap.cells import DETECTED
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.mueller import rotate
 from astropolcal.observations import Observations
 from astropolcal.optics import COORDINATES
+from astropolcal.optics.perturbations import GENERATORS, Dependence
 from astropolcal.simulation import half_wave_plate_cycles, simulate
-from astropolcal.units import canonical_factor
 
 #: Stages that a lamp on the bench knows.
 _BENCH_STAGES = {"hwp", "derotator", "flc_state"}
@@ -37,32 +40,10 @@ _OPEN = 1e-4
 _TRIES = 14
 
 
-def _unit(row, column, sign):
-    matrix = np.zeros((4, 4))
-    matrix[row, column], matrix[column, row] = 1, sign
-    return matrix
-
-
 #: What optics can do to a Stokes vector, to first order.
-ACTIONS = {
-    "retardance_h": _unit(2, 3, -1),
-    "retardance_d": _unit(3, 1, -1),
-    "rotation": 2 * _unit(1, 2, -1),
-    "diattenuation_h": _unit(0, 1, 1),
-    "diattenuation_d": _unit(0, 2, 1),
-    "diattenuation_c": _unit(0, 3, 1),
-    "depolarization_linear": -np.diag([0.0, 1, 1, 0]),
-    "depolarization_h": -np.diag([0.0, 1, -1, 0]),
-    "depolarization_d": -_unit(1, 2, 1),
-    "depolarization_circular": -np.diag([0.0, 0, 0, 1]),
-}
+ACTIONS = {kind: matrix for kind, matrix in GENERATORS.items() if kind != "gain"}
 #: What a detector does, and the dependence under which the key has it; a gain may have any.
-DETECTOR = {
-    "background": "flux",
-    "background_of_one_beam": "flux",
-    "nonlinearity": "flux",
-    "persistence": "previous",
-}
+DETECTOR = {kind: on for kind, on in DETECTED.items() if kind != "crosstalk"}
 
 
 @dataclass(frozen=True)
@@ -135,7 +116,10 @@ class Bench:
         self.setup, self.rng = setup, rng
         wavelength = setup.wavelength
         self.micron = wavelength.to_value(u.um)
-        self.law = legvander(_scaled(np.log(self.micron)), min(_DEGREE, len(wavelength) - 1))
+        x = np.log(self.micron)
+        # over the range of the wavelengths, from -1 to 1
+        x = 2 * (x - x.min()) / np.ptp(x) - 1
+        self.law = legvander(x, min(_DEGREE, len(wavelength) - 1))
         self.chains = _varied(setup.chains(), self.law, rng)
         self.shuffled = bool(rng.random() < 0.5)
         order = rng.permutation(setup.n_derotator) if self.shuffled else None
@@ -162,7 +146,10 @@ class Bench:
             for chain, source in zip(self.chains, setup.sources, strict=True)
         ]
         self.optics = [self.split(chain) for chain in self.chains]
-        self._slots()
+        self._free = FreeParameters(self.chains, len(wavelength))
+        self._start = self._free.start()
+        every = (leaf for chain in self.chains for leaf in leaves(chain))
+        self._known = {leaf.name: leaf.canonical_values() for leaf in every}
         ideal = self.expose()
         #: Electrons for a flux of one, (F, W).
         self.bright = [
@@ -213,7 +200,7 @@ class Bench:
             for place, action, exponent in kicks:
                 if name == self.anchor(dataset, place):
                     turn = angle if place.startswith("in:") else 0.0
-                    kick = expm(exponent[..., None, None] * _turned(ACTIONS[action], turn))
+                    kick = expm(exponent[..., None, None] * rotate(ACTIONS[action], turn * u.rad))
                     light = kick @ light
         return light[..., 0, 0]
 
@@ -250,58 +237,32 @@ class Bench:
 
     def waves(self, dataset, dependence):
         """Return the functions of the frame that a dependence is, (F, k)."""
-        clean = self.clean[dataset]
-        n = clean.n_frames
-        head, *rest = dependence.split(":")
-        t = np.linspace(-1, 1, n)
-        if head == "harmonic":
-            angle = int(rest[1]) * clean.position(rest[0])
-            return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        if head in ("direction", "move"):
-            move = np.diff(clean.position(rest[0]), prepend=clean.position(rest[0])[:1])
-            # what stands has moved last where it moved last
-            last = np.maximum.accumulate(np.where(move != 0, np.arange(n), 0))
-            wave = move[last] < 0 if head == "direction" else move
-        else:
-            wave = {
-                "constant": lambda: np.ones(n),
-                "time": lambda: t,
-                "time2": lambda: t**2 - 1 / 3,
-                "step": lambda: np.arange(n) >= int(rest[0]),
-                "dataset": lambda: np.full(n, clean.name == rest[0]),
-            }[head]()
-        return np.asarray(wave, dtype=float)[:, None]
+        how, clean = Dependence(dependence), self.clean[dataset]
+        place = np.ones(clean.n_frames) if how.driver is None else clean.position(how.driver)
+        return how.waves(place).T * (how.run in (None, clean.name))
 
     def expose(self, faults=()):
         """Return the fluxes (2, F, W) of each dataset for unit lamps, with faults."""
         return [self._exposed(dataset, faults) for dataset in range(len(self.clean))]
 
     def _exposed(self, dataset, faults):
-        positions, kicks, chains, spread, ghosts = {}, [], self.chains, 0.0, []
+        positions, kicks, chains, spread = {}, [], self.chains, 0.0
         for fault in faults:
-            what = fault.told.get("what")
             kicks += fault.kicks(dataset)
             chains = fault.edited(chains)
             for stage, moved in fault.moves(dataset).items():
                 clean = self.clean[dataset].position(stage)
                 positions[stage] = positions.get(stage, clean) + moved
-            if what == "smear":
+            if fault.told.get("what") == "smear":
                 spread = fault.amplitude * self.waves(dataset, "move:hwp")[:, 0]
-            elif what == "ghost":
-                ghosts.append(fault)
         optics = None if chains is self.chains else self.split(chains[dataset])
         still = positions.get("hwp", self.clean[dataset].position("hwp"))
         nodes = (-1, -0.5, 0, 0.5, 1) if np.any(spread) else (0,)
-        flux = np.mean(
-            [
-                self.path(dataset, positions | {"hwp": still + x * spread}, None, kicks, optics)
-                for x in nodes
-            ],
-            axis=0,
-        )
-        for fault in ghosts:
-            skipped = self.path(dataset, positions, skip=fault.told["optic"])
-            flux = flux + fault.amplitude * skipped
+        found = [
+            self.path(dataset, positions | {"hwp": still + x * spread}, None, kicks, optics)
+            for x in nodes
+        ]
+        flux = np.mean(found, axis=0)
         for fault in faults:
             flux = fault.detected(dataset, flux)
         # light cannot be less than none
@@ -347,7 +308,7 @@ class Bench:
         common = (sums * unit).sum(axis=-1, keepdims=True)
         return sums - (1 - 1 / np.sqrt(1 + (self.flicker * length) ** 2)) * common * unit
 
-    def _whiten(self, channels):
+    def _whiten(self, channels, known=0.0):
         """Return both channels (..., 2, F, W) of each dataset as rows of unit noise."""
         rows = []
         for one, weight, lamp in zip(channels, self._weights, self._lamps, strict=True):
@@ -356,42 +317,19 @@ class Bench:
             sums = self._steadied(scaled[..., 1, :, :], weight[1]).reshape(*shape, -1)
             rows += [scaled[..., 0, :, :].reshape(*shape, -1), sums - (sums @ lamp) @ lamp.T]
         # behind the data, what is known beforehand of the parameters: no fault changes that
-        known = np.zeros((*rows[0].shape[:-1], np.count_nonzero(self._weight)))
+        known = np.broadcast_to(
+            known, (*rows[0].shape[:-1], self._free.prior_residuals(self._start).size)
+        )
         return np.concatenate([*rows, known], axis=-1)
 
-    def _slots(self):
-        """Collect the free parameters: name of the optic, place among its values, size."""
-        self._known, self._free, start, bounds, known = {}, [], [], [], []
-        for optics in self.optics:
-            for leaf, _ in optics:
-                if leaf.name in self._known:
-                    continue
-                self._known[leaf.name] = leaf.canonical_values()
-                for i, key in enumerate(leaf.param_names):
-                    parameter = getattr(leaf, key)
-                    if parameter.fixed:
-                        continue
-                    value = np.atleast_1d(self._known[leaf.name][i])
-                    self._free.append((leaf.name, i, np.shape(self._known[leaf.name][i])))
-                    start.append(value)
-                    unit = 1.0 if parameter.unit is None else canonical_factor(parameter.unit)
-                    # what is known beforehand is one more datum each
-                    error = np.inf if parameter.prior is None else parameter.prior.std() * unit
-                    known += [1 / error] * value.size
-                    limits = [
-                        default if b is None else b * unit
-                        for b, default in zip(parameter.bounds, (-np.inf, np.inf), strict=True)
-                    ]
-                    bounds += [limits] * value.size
-        self._start, self._bounds = np.concatenate(start), np.array(bounds, dtype=float).T
-        self._weight = np.array(known)
-
     def _values(self, vector):
-        values, at = {name: list(known) for name, known in self._known.items()}, 0
-        for name, i, shape in self._free:
-            size = int(np.prod(shape))
-            values[name][i] = vector[at : at + size].reshape(shape)
-            at += size
+        values = {name: list(known) for name, known in self._known.items()}
+        for leaf in (leaf for optics in self.optics for leaf, _ in optics):
+            for i, key in enumerate(leaf.param_names):
+                slot = self._free.by_name.get(f"{leaf.name}.{key}")
+                if slot is not None:
+                    shape = np.shape(self._known[leaf.name][i])
+                    values[leaf.name][i] = vector[slot.slice].reshape(shape)
         return values
 
     def _model(self, vector):
@@ -402,25 +340,16 @@ class Bench:
 
     def _jacobian(self, vector):
         """Return the derivative of the whitened model, by finite differences."""
-        base, columns, at = self._model(vector), [], 0
-        for _, _, shape in self._free:
-            h, size = 1e-6, int(np.prod(shape))
+        base, columns, h = self._model(vector), [], 1e-6
+        known = self._free.prior_jacobian(vector)
+        for slot in self._free.slots:
             moved = vector.copy()
-            moved[at : at + size] += h
-            slopes = [(m - b) / h for m, b in zip(self._model(moved), base, strict=True)]
-            if shape:
-                # each wavelength has a value of its own
-                slopes = [np.eye(size)[:, None, None, :] * s for s in slopes]
-            columns.append(np.atleast_2d(self._whiten(slopes)))
-            at += size
-        return self._with_known(np.concatenate(columns).T, np.diag(self._weight))
-
-    def _with_known(self, rows, known):
-        """Fill the rows of what is known beforehand of the parameters."""
-        some = self._weight > 0
-        if some.any():
-            rows[-np.count_nonzero(some) :] = known[some]
-        return rows
+            moved[slot.slice] += h
+            # each wavelength has a value of its own, or all have one
+            own = np.eye(slot.size)[:, None, None, :]
+            slopes = [own * (m - b) / h for m, b in zip(self._model(moved), base, strict=True)]
+            columns.append(self._whiten(slopes, known[slot.slice]))
+        return np.concatenate(columns).T
 
     def residual(self, faults):
         """Return what faults leave beside the refitted nominal model, whitened, and the fit."""
@@ -430,12 +359,13 @@ class Bench:
 
         def miss(vector):
             model = self._model(vector)
-            rows = self._whiten([m - s for m, s in zip(model, seen, strict=True)])
-            return self._with_known(rows, (vector - self._start) * self._weight)
+            missed = [m - s for m, s in zip(model, seen, strict=True)]
+            return self._whiten(missed, self._free.prior_residuals(vector))
 
         fit = least_squares(
-            miss, self._start, self._jacobian, self._bounds, x_scale="jac", max_nfev=25, ftol=1e-6
-        )
+            miss, self._start, self._jacobian, self._free.bounds(),
+            x_scale="jac", max_nfev=25, ftol=1e-6,
+        )  # fmt: skip
         return -fit.fun, fit
 
     def _cells(self, vector, own=None, law=None):
@@ -450,7 +380,7 @@ class Bench:
             ends = [self._ends(d, sweeps[d], place) for d in n_sets]
             for kind, action in ACTIONS.items():
                 slopes = [
-                    np.einsum("bfwi,...fwij,fwj->bfw", row, _turned(action, turn), light)
+                    np.einsum("bfwi,...fwij,fwj->bfw", row, rotate(action, turn * u.rad), light)
                     for row, light, turn in ends
                 ]
                 for name, wave in waves.items():
@@ -461,15 +391,12 @@ class Bench:
         still = waves["constant"]
         for kind, name in DETECTOR.items():
             slopes = [self.glow(d, kind, flux[d]) for d in n_sets]
-            yield (
-                f"detector/{kind}/{name}",
-                np.concatenate(
-                    [
-                        self._columns(flux, [s * on[:, None, None] for s in slopes], still, law)
-                        for on in (np.eye(2) if kind != "background" else np.ones((1, 2)))
-                    ]
-                ),
-            )
+            beams = np.ones((1, 2)) if kind == "background" else np.eye(2)
+            columns = [
+                self._columns(flux, [s * on[:, None, None] for s in slopes], still, law)
+                for on in beams
+            ]
+            yield f"detector/{kind}/{name}", np.concatenate(columns)
 
     def _ends(self, dataset, sweep, place):
         """Return the analyser rows and the light of a place, and the turn of its frame."""
@@ -521,9 +448,8 @@ class Bench:
         for name, columns in self._cells(fit.x, own, np.eye(len(self.micron)) if sharp else None):
             length = np.linalg.norm(columns, axis=1)
             columns = (columns[length > 0] / length[length > 0, None]).T
-            left, size, _ = np.linalg.svd(
-                columns - taken @ (taken.T @ columns), full_matrices=False
-            )
+            columns = columns - taken @ (taken.T @ columns)
+            left, size, _ = np.linalg.svd(columns, full_matrices=False)
             share = np.sum((left[:, size > _OPEN].T @ signal) ** 2) / np.sum(signal**2)
             if share >= _LEAST_SHARE:
                 found[name] = round(float(share), 3)
@@ -531,8 +457,7 @@ class Bench:
 
     def taken_up(self, share):
         """Return place and kind of a constant cell that the nominal parameters absorb."""
-        jacobian = self._jacobian(self._start)
-        taken, found = np.linalg.qr(jacobian)[0], []
+        taken, found = np.linalg.qr(self._jacobian(self._start))[0], []
         for name, columns in self._cells(self._start):
             place, kind, dependence = name.split("/")
             left = np.linalg.norm(columns - (columns @ taken) @ taken.T)
@@ -568,20 +493,6 @@ class Bench:
         residual, fit = self.residual([fault])
         fault.snr = float(np.linalg.norm(residual))
         return residual, fit
-
-
-def _scaled(x):
-    """Bring numbers to -1 to 1."""
-    return 2 * (x - x.min()) / np.ptp(x) - 1
-
-
-def _turned(matrix, angle):
-    """Return a matrix of an optic at an angle, (..., 4, 4)."""
-    angle = np.asarray(angle)
-    c, s, one, o = np.cos(2 * angle), np.sin(2 * angle), np.ones(angle.shape), np.zeros(angle.shape)
-    turn = np.array([[one, o, o, o], [o, c, s, o], [o, -s, c, o], [o, o, o, one]])
-    turn = np.moveaxis(turn, (0, 1), (-2, -1))
-    return turn.swapaxes(-1, -2) @ matrix @ turn
 
 
 def _channels(flux, bright):

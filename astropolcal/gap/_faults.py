@@ -3,11 +3,10 @@
 
 import numpy as np
 
-from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap._bench import ACTIONS, DETECTOR
 from astropolcal.gap.effects import EFFECTS, Context, get_effect
-from astropolcal.units import canonical_factor
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.words import check_choice
 
 _FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
@@ -135,10 +134,10 @@ class Fault:
         context = Context(bench.micron, float(np.median(middle)))
         self._edit = lambda chains: effect.edit([chain.copy() for chain in chains], context)
         edit = self._edit(bench.chains)
-        self._laws = {p.name: _law(p, edit.chains, rng) for p in edit.parameters}
-        self._absent = {p.name: p.canonical_neutral for p in edit.parameters}
-        sizes = [p.canonical_limit / np.abs(self._laws[p.name]).max() for p in edit.parameters]
-        self.largest = 0.9 * min(sizes) if sizes else 1.0
+        free = FreeParameters(edit.chains, len(bench.micron), edit.ties)
+        self._laws = [(p, _law(p, free.by_name[p.name].size, rng)) for p in edit.parameters]
+        sizes = [p.canonical_limit / np.abs(law).max() for p, law in self._laws]
+        self.largest = 0.9 * min(sizes, default=1 / 0.9)
 
     def cells(self, residual, fit):
         """Return the share of its signal that each cell carries; its own is all of it."""
@@ -172,12 +171,12 @@ class Fault:
         if self.told["type"] != "listed":
             return chains
         edit = self._edit(chains)
-        for name, law in self._laws.items():
-            value = self._absent[name] + self.amplitude * law
-            _put(edit.chains, name, value)
-            for target, tie in edit.ties.items():
-                if tie.source == name:
-                    _put(edit.chains, target, tie.factor * value)
+        free = FreeParameters(edit.chains, len(self.bench.micron), edit.ties)
+        vector = free.start()
+        for parameter, law in self._laws:
+            value = parameter.canonical_neutral + self.amplitude * law
+            vector[free.by_name[parameter.name].slice] = value
+        free.put_back(vector)
         return edit.chains
 
     def detected(self, dataset, flux):
@@ -190,6 +189,8 @@ class Fault:
             beams = {"right": (1, 0), "left": (0, 1)}.get(told.get("beam"), (1, 1))
             added = size * bench.glow(dataset, told["kind"], flux)
             return flux + np.array(beams)[:, None, None] * added
+        if told.get("what") == "ghost":
+            return flux + self.amplitude * bench.path(dataset, skip=told["optic"])
         if told["type"] != "frame" or dataset != self.place or "angle" in told["what"]:
             return flux
         flux, i, j = flux.copy(), told["frame"], told["with"]
@@ -201,16 +202,9 @@ class Fault:
         return seen / bench.bright[dataset]
 
 
-def _carriers(chains, name):
-    """Return the optics that have a parameter, and its key."""
-    optic, key = name.split(".")
-    return [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic], key
-
-
-def _law(parameter, chains, rng):
-    """Return a random law, in canonical units and of the parameter's usual size."""
-    found, key = _carriers(chains, parameter.name)
-    n, scale = np.size(getattr(found[0], key).value), parameter.canonical_scale
+def _law(parameter, n, rng):
+    """Return a random law of n values, canonical and of the parameter's usual size."""
+    scale = parameter.canonical_scale
     if n == 1:
         return scale * rng.normal()
     basis = np.eye(n) if parameter.basis is None else parameter.basis
@@ -225,12 +219,3 @@ def _law(parameter, chains, rng):
         # no optic gives more polarization than there is
         law = -(law - law.min() + 0.3 * (np.ptp(law) + 0.1))
     return scale * law
-
-
-def _put(chains, name, value):
-    found, key = _carriers(chains, name)
-    for leaf in found:
-        parameter = getattr(leaf, key)
-        unit = 1 if parameter.unit is None else parameter.unit
-        factor = 1.0 if parameter.unit is None else canonical_factor(unit)
-        setattr(leaf, key, np.broadcast_to(value / factor, parameter.shape) * unit)

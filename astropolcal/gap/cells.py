@@ -128,6 +128,20 @@ _KINDS = {
 }
 
 
+# after the stage, or what else follows the first colon, and how often a harmonic comes
+_PATTERNS = {
+    "time": " that drifts through the run",
+    "time2": " that bends through the run",
+    "step": " that changes at frame {0}",
+    "frame": " in frame {0} alone",
+    "harmonic": " that changes {1} in a turn of the {0}",
+    "direction": " that depends on the direction of the last move of the {0}",
+    "state": " where {0}",
+    "move": " that grows with the last move of the {0}",
+}
+_TIMES = {"1": "once", "2": "twice", "4": "four times"}
+
+
 def _kind_words(cell):
     if cell.kind in _KINDS:
         return _KINDS[cell.kind]
@@ -135,12 +149,15 @@ def _kind_words(cell):
     return f"{word} along the axes" if axis == "h" else f"{word} at 45 deg to the axes"
 
 
+def _own_name(optic):
+    return "half-wave plate" if optic == "hwp" else optic
+
+
 def _place_words(place):
     head, _, optic = place.partition(":")
-    if head in ("in", "after"):
-        own = {"hwp": "half-wave plate"}.get(optic, optic)
-        return f"of the {own}" if head == "in" else f"downstream of the {own}"
     return {
+        "in": f"of the {_own_name(optic)}",
+        "after": f"downstream of the {_own_name(optic)}",
         "source": "of the source, or upstream of the first optic that turns",
         "telescope": "upstream of the half-wave plate",
         "detector": "at the detector",
@@ -149,25 +166,10 @@ def _place_words(place):
 
 def _when(dependence):
     text, run = split_run(dependence)
-    return _pattern(text) + (f' in "{run}" only' if run is not None else "")
-
-
-def _pattern(text):
-    parts = text.split(":")
-    stage = {"hwp": "half-wave plate"}.get(parts[1], parts[1]) if len(parts) > 1 else ""
-    times = {"1": "once", "2": "twice", "4": "four times"}
-    return {
-        "time": lambda: " that drifts through the run",
-        "time2": lambda: " that bends through the run",
-        "step": lambda: f" that changes at frame {stage}",
-        "frame": lambda: f" in frame {stage} alone",
-        "harmonic": lambda: (
-            f" that changes {times.get(parts[-1], parts[-1] + ' times')} in a turn of the {stage}"
-        ),
-        "direction": lambda: f" that depends on the direction of the last move of the {stage}",
-        "state": lambda: f" where {' is '.join(stage.split('='))}",
-        "move": lambda: f" that grows with the last move of the {stage}",
-    }.get(parts[0], lambda: "")()
+    kind, where, count, *_ = (*text.split(":"), "", "")
+    where = _own_name(where).replace("=", " is ")
+    words = _PATTERNS.get(kind, "").format(where, _TIMES.get(count, f"{count} times"))
+    return words + (f' in "{run}" only' if run is not None else "")
 
 
 # ---- places ------------------------------------------------------------------------------------
@@ -202,6 +204,9 @@ class Place:
         return insert_optic(chain, optic, **where)
 
 
+_KEEPS = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)
+
+
 def places(chain):
     """Return the places of a chain, in the order in which the light meets them."""
     found = [o for o in leaves(chain) if not (o.name or "").startswith("gap_")]
@@ -215,24 +220,16 @@ def places(chain):
     own = [o for o in turning if o.stage not in _SKY and not o.rotates_frame]
     if own and own[0] is not first:
         out.append(Place("telescope", before=own[0].name))
+    between = [o for o in found[found.index(own[0]) : -1] if not o.splits_light] if own else []
     for optic in found:
         if optic in own:
             theta = float(np.deg2rad(np.mean(optic.theta.value)))
             out.append(Place(f"in:{optic.name}", None, optic.name, optic.mount, theta))
             out.append(Place(f"after:{optic.name}", None, optic.name))
-        elif own and optic is not found[-1] and _mixes(optic) and _behind(optic, own[0], found):
+        # one that is static and mixes what it gets makes the place downstream of it another one
+        elif optic.stage is None and not isinstance(optic, _KEEPS) and optic in between:
             out.append(Place(f"after:{optic.name}", None, optic.name))
     return out
-
-
-def _mixes(optic):
-    """Whether an optic that is static makes the place downstream of it another one."""
-    kinds = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)
-    return optic.stage is None and not optic.splits_light and not isinstance(optic, kinds)
-
-
-def _behind(optic, other, found):
-    return found.index(optic) > found.index(other)
 
 
 # ---- dependences -------------------------------------------------------------------------------
@@ -487,15 +484,15 @@ class Probes:
         if seen[1] is None:
             return
         # differences see the flicker of the lamp, sums do not
-        by_channel = [list(self._detected(channel, sweep, fluxes)) for fluxes in seen]
+        by_channel = [self._detected(channel, sweep, fluxes) for fluxes in seen]
         weights = channel.slopes(sweep)
-        for (kind, first), (_, second) in zip(*by_channel, strict=True):
-            pairs = zip(weights, (first, second), strict=True)
+        for kind in by_channel[0]:
+            pairs = zip(weights, (changes[kind] for changes in by_channel), strict=True)
             yield kind, np.stack([a * one + b * other for (a, b), (one, other) in pairs])
 
     @staticmethod
     def _detected(channel, sweep, fluxes):
-        """Yield each kind, and what it adds to the fluxes of both beams."""
+        """Return what each kind adds to the fluxes of both beams."""
         right, left = sweep.fluxes
         single = channel.groups is not None
         # half the usual flux of both beams, whether both have light or one
@@ -515,10 +512,8 @@ class Probes:
             "persistence": (right * afterglow[0], left * afterglow[1]),
             "crosstalk": (half, -half),
         }
-        for kind, (one, other) in changes.items():
-            if single and kind not in ("background", "nonlinearity"):
-                continue
-            yield kind, (one, other)
+        kinds = ("background", "nonlinearity") if single else changes
+        return {kind: changes[kind] for kind in kinds}
 
 
 def _frames_first(basis, shape):

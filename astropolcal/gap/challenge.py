@@ -173,14 +173,6 @@ def _carried(fault, cause):
     return max(_share(fault, one) for one in [cause, *(cause.get("aliases") or [])])
 
 
-def _probability(cause):
-    # a tool that gives no probabilities is sure
-    given = 1.0 if cause.get("probability") is None else float(cause["probability"])
-    if not 0 <= given <= 1:
-        raise ValueError(f"probability = {given}")
-    return given
-
-
 def score_answer(case, answer):
     """
     Score an answer.
@@ -223,7 +215,12 @@ def _score(case, answer):
     verdict, causes = answer.get("verdict"), answer.get("causes") or []
     faults = [fault for fault in case["faults"] if not fault["absorbed"]]
     best = [max((_carried(fault, cause) for fault in faults), default=0.0) for cause in causes]
-    claims = [[_probability(c), s >= _ENOUGH] for c, s in zip(causes, best, strict=True)]
+    # a tool that gives no probabilities is sure
+    given = [cause.get("probability") for cause in causes]
+    given = [1.0 if p is None else float(p) for p in given]
+    if not all(0 <= p <= 1 for p in given):
+        raise ValueError(f"probabilities = {given}")
+    claims = [[p, share >= _ENOUGH] for p, share in zip(given, best, strict=True)]
     if not faults:
         return {"none": "right", None: "silent"}.get(verdict, "wrong"), claims
     if faults[0]["type"] == "frame":
@@ -232,7 +229,7 @@ def _score(case, answer):
         return "wrong" if causes else "right" if right else "silent", claims
     if faults[0]["type"] == "mechanism" and verdict == "unexplained":
         return "right", claims
-    if any(p >= _HALF > share for (p, _), share in zip(claims, best, strict=True)):
+    if any(p >= _HALF > share for p, share in zip(given, best, strict=True)):
         return "wrong", claims
     found = all(any(_carried(fault, c) >= _ENOUGH for c in causes) for fault in faults)
     return "right" if found and best[0] >= _ENOUGH else "silent", claims
@@ -407,35 +404,28 @@ def _settings(n, seed, snr, kinds, setup):
 
 def _each(function, todo, n, settings, client, progress):
     """Yield what a function gives for each number, as it is ready, and say how far it is."""
-    with shown(progress):
-        found = _outcomes(function, todo, settings, client)
-        yield from steps(found, "challenges", n, n - len(todo))
-
-
-def _outcomes(function, todo, settings, client):
     if client is None:
-        for index in todo:
-            yield function(index, settings)
-        return
-    # in any order: each record carries its number
-    futures = [client.submit(function, index, settings) for index in todo]
-    if type(client).__module__.startswith("distributed"):
-        from distributed import as_completed
+        found = (function(index, settings) for index in todo)
     else:
-        from concurrent.futures import as_completed
-    for future in as_completed(futures):
-        yield future.result()
+        if type(client).__module__.startswith("distributed"):
+            from distributed import as_completed
+        else:
+            from concurrent.futures import as_completed
+        # in any order: each record carries its number
+        futures = [client.submit(function, index, settings) for index in todo]
+        found = (future.result() for future in as_completed(futures))
+    with shown(progress):
+        yield from steps(found, "challenges", n, n - len(todo))
 
 
 def _journal(path, settings):
     """Return the records of a checkpoint; the first line of the file holds the settings."""
     if path is None:
         return {}
-    path = Path(path)
     text = b""
     if os.path.exists(path):
         with understood(path, GapError, "cannot be read"):
-            text = path.read_bytes()
+            text = Path(path).read_bytes()
     if not text:
         _append(path, {"settings": settings})
         return {}
@@ -443,9 +433,7 @@ def _journal(path, settings):
     try:
         first, *others = [json.loads(line) for line in whole.splitlines()]
         known = dict(first["settings"])
-        records = {record["index"]: record for record in others}
-        for record in others:
-            check_record(record)
+        records = {record["index"]: _checked(record) for record in others}
     except Exception:  # a damaged line may hold anything
         raise GapError(f"{path}: is not a checkpoint of challenges") from None
     wrong = [key for key in settings if known.get(key) != settings[key]]
@@ -453,10 +441,8 @@ def _journal(path, settings):
         raise GapError(f"{path}: is of other settings ({', '.join(wrong)}); remove it")
     # a run that was killed may have left half a line
     if len(whole) < len(text):
-        try:
+        with understood(path, GapError, "cannot be written", reads=False):
             os.truncate(path, len(whole))
-        except OSError as problem:
-            raise GapError(f"{path}: cannot be written: {problem.strerror}") from problem
     return records
 
 
@@ -529,7 +515,7 @@ class ChallengeResult:
         for name, kinds, limits in groups:
             rates = [self.rate(result, *kinds, **limits) for result in RESULTS]
             if n := rates[0][3]:
-                rows.append((name, n, *(x for rate in rates for x in rate[:3])))
+                rows.append((name, n, *np.ravel([rate[:3] for rate in rates])))
         names = [result + end for result in RESULTS for end in ("", "_low", "_high")]
         dtype = [str, int, *[float] * len(names)]
         return QTable(rows=rows or None, names=("challenges", "n", *names), dtype=dtype)
@@ -570,18 +556,16 @@ class ChallengeResult:
         lines = [f"{counted(len(self.records), 'challenge')}; rates with intervals at 68 %, in %"]
         lines.append(f"{'':14}{'n':>5}" + "".join(f"{_WORDS[name]:>20}" for name in RESULTS))
         for row in rates:
-            cells = [
-                _percent(*(row[name + key] for key in ("", "_low", "_high"))) for name in RESULTS
-            ]
-            lines.append(f"{row['challenges']:14}{row['n']:5}" + "".join(f"{c:>20}" for c in cells))
+            cells = (_percent(row, name) for name in RESULTS)
+            lines.append(f"{row['challenges']:14}{row['n']:5}" + "".join(cells))
         if len(claims):
             lines += [
                 "",
                 "causes by the probability that was given, and how many of them are right",
             ]
         for row in claims:
-            right = _percent(row["right"], row["right_low"], row["right_high"])
-            lines.append(f"{100 * row['probability']:13.1f} {row['n']:5}{right:>20}")
+            given = f"{100 * row['probability']:13.1f}"
+            lines.append(f"{given} {row['n']:5}{_percent(row, 'right')}")
         return "\n".join(lines)
 
     def plot(self, figure=None):
@@ -673,8 +657,9 @@ def _rows(table):
     return [dict(zip(table.colnames, row, strict=True)) for row in table.as_array().tolist()]
 
 
-def _percent(value, low, high):
-    return f"{100 * value:.0f} ({100 * low:.0f} to {100 * high:.0f})"
+def _percent(row, name):
+    value, low, high = (100 * row[name + end] for end in ("", "_low", "_high"))
+    return f"{f'{value:.0f} ({low:.0f} to {high:.0f})':>20}"
 
 
 def _wilson(right, n):
@@ -684,8 +669,8 @@ def _wilson(right, n):
     return right / n, *map(float, binom_conf_interval(right, n, interval="wilson"))
 
 
-def check_record(record):
-    """Raise unless a record of a file has what a record has."""
+def _checked(record):
+    """Return a record of a file, or raise where it lacks what a record has."""
     texts = ("kind", "verdict", "result")
     good = type(record["index"]) is int and record["result"] in RESULTS
     good &= all(isinstance(record[key], str) for key in texts)
@@ -697,3 +682,4 @@ def check_record(record):
         good &= isinstance(record[key], list) and all(isinstance(x, str) for x in record[key])
     if not good:
         raise TypeError("no record of a challenge")
+    return record

@@ -98,12 +98,18 @@ class Channels:
         could do to the sum of a frame, columns (F, k), is taken away first, lest a missing optic be
         taken for a restless lamp.
         """
-        weight = np.where(self.valid, 1 / sigma, 0.0)
-        self.sigma = sigma
         if self.groups is None:
-            self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+            weight = np.where(self.valid, 1 / sigma[1], 0.0)
+            self.lamp = _Lamp(residual[1], weight, self.sequence, saturating)
         else:
-            self.lamp, weight[0] = _GroupLamp(self.groups), 0.0
+            self.lamp = _GroupLamp(self.groups)
+        self.settle(sigma)
+
+    def settle(self, sigma):
+        """Note how data of some noise, (2, W, F), are whitened beside the lamp."""
+        self.sigma, weight = sigma, np.where(self.valid, 1 / sigma, 0.0)
+        if self.groups is not None:
+            weight[0] = 0.0
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
         design = self._sum_whitened(self.lamp.design(self.valid))

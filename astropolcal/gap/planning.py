@@ -9,6 +9,7 @@ doi:10.1080/00401706.1967.10490441). An exposure is proposed only where it raise
 that the true cause is expected to have.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import astropy.units as u
@@ -71,10 +72,9 @@ class Exposure:
 
     #: The dataset whose set-up it repeats.
     dataset: int
-    #: Half-wave-plate angles in degree, one per frame; empty where there is no such plate.
-    hwp: tuple
-    #: Other stages and their angle in degree, or state, one per frame where it changes.
-    positions: tuple = ()
+    #: Angle in degree, or state, of each stage, ``"hwp"`` first if there is such a plate; one per
+    #: frame where it changes.
+    positions: dict
     #: Degrees by which the calibration polarizer is turned.
     polarizer_turned: float = 0.0
     #: Brightness of the lamp, relative to that of the dataset.
@@ -89,22 +89,28 @@ class Exposure:
     setup: str = ""
 
     @property
+    def n_angles(self):
+        """Number of frames, those in several states counted once."""
+        return max(map(np.size, self.positions.values()), default=0)
+
+    @property
     def n_frames(self):
         """Number of frames: each angle in each state."""
-        return len(next(iter(self.angles.values()), ()))
+        return self.n_angles * max(len(self.states), 1)
 
     @property
     def angles(self):
         """Angle of every stage in every frame, degree, or its state, by name."""
-        found = {"hwp": self.hwp} if self.hwp else {}
-        found |= dict(self.positions)
-        n, each = max(map(np.size, found.values()), default=0), max(len(self.states), 1)
-        return {name: np.repeat(np.broadcast_to(a, n), each) for name, a in found.items()}
+        each = max(len(self.states), 1)
+        return {
+            name: np.repeat(np.broadcast_to(angle, self.n_angles), each)
+            for name, angle in self.positions.items()
+        }
 
     @property
     def modulator(self):
         """State of the modulator in every frame, A or B."""
-        return np.tile(self.states, len(self.hwp))
+        return np.tile(self.states, self.n_angles)
 
     @property
     def effort(self):
@@ -116,19 +122,20 @@ class Exposure:
         """The exposure in words."""
         parts = [self.what]
         if not self.what:
-            span = f"from {min(self.hwp):.4g} to {max(self.hwp):.4g} deg"
-            parts = [f"{len(self.hwp)} half-wave-plate angles {span}"]
+            rest = dict(self.positions)
+            plate = rest.pop("hwp")
+            span = f"from {min(plate):.4g} to {max(plate):.4g} deg"
+            parts = [f"{len(plate)} half-wave-plate angles {span}"]
             if self.states:
-                plural = "s" * (len(self.states) > 1)
-                parts[0] += f" in state{plural} {' and '.join(self.states)} of the modulator"
-            parts += [f"{name} at {angle:g} deg" for name, angle in self.positions]
+                parts[0] += f" in states {' and '.join(self.states)} of the modulator"
+            parts += [f"{name} at {angle:g} deg" for name, angle in rest.items()]
             parts += [f"set up as {self.setup}"] * bool(self.setup)
         if self.polarizer_turned:
             parts.append(f"the polarizer turned by {self.polarizer_turned:g} deg")
         parts += [f"{name} taken out" for name in self.without]
         if self.lamp != 1:
             level = "half" if self.lamp == 0.5 else f"{self.lamp:g} times"
-            source = "a star" if "parallactic" in dict(self.positions) else "the lamp"
+            source = "a star" if "parallactic" in self.positions else "the lamp"
             parts.append(f"{source} {level} as bright")
         return ", ".join(parts)
 
@@ -147,8 +154,8 @@ def exposures(model, *, flux_matters=False):
         run = _run(i, train, observations)
         # of several datasets it has to be said whose source and lamp it is
         run = replace(run, setup=observations.name) if len(trains) > 1 else run
-        plain = bool(run.hwp) and not observations.single_beam
-        blocks = _blocks(run, train) if plain else _turned(run, observations.name)
+        plain = "hwp" in run.positions and not observations.single_beam
+        blocks = _blocks(run) if plain else _turned(run, observations.name)
         found += [*blocks, *_runs(run, train, observations.name)]
         if not blocks:
             continue
@@ -173,13 +180,13 @@ def _run(i, train, observations):
     names = dict.fromkeys(stage.partition("=")[0] for stage in ("hwp", *stages(train)))
     known = set(observations.frames.colnames)
     where = {
-        name: tuple(_column(observations, name)[take][:_LONGEST])
+        name: _column(observations, name)[take][:_LONGEST]
         for name in names
         if name in known and name not in COORDINATES
     }
     if observations.single_beam:
-        where[GROUP] = tuple(observations.brightness_groups[take][:_LONGEST].tolist())
-    return Exposure(i, where.pop("hwp", ()), tuple(where.items()), states=states)
+        where[GROUP] = observations.brightness_groups[take][:_LONGEST]
+    return Exposure(i, where, states=states)
 
 
 def _column(observations, name):
@@ -191,38 +198,39 @@ def _column(observations, name):
 
 def _turned(run, name):
     """Return the run with each of its stages turned, those of the sky aside."""
-    found = []
-    for stage, angles in run.angles.items():
-        if stage not in (*_SKY, GROUP) and angles.dtype.kind == "f":
-            for by in _TURNED_BY:
-                where = dict(run.positions) | {"hwp": run.hwp} | {stage: tuple(angles + by)}
-                what = f"the run of {name} with {stage} turned by {by:g} deg"
-                plate = where.pop("hwp")
-                found.append(replace(run, hwp=plate, positions=tuple(where.items()), what=what))
-    return found
+    return [
+        replace(
+            run,
+            positions=run.positions | {stage: angles + by},
+            what=f"the run of {name} with {stage} turned by {by:g} deg",
+        )
+        for stage, angles in run.positions.items()
+        if stage not in (*_SKY, GROUP) and angles.dtype.kind == "f"
+        for by in _TURNED_BY
+    ]
 
 
-def _blocks(run, train):
+def _blocks(run):
     """Return blocks of plate angles at new positions, and a full turn at an old one."""
-    cycle = tuple(float(a) for a in np.unique(np.round(run.hwp, 2))[:8])
+    plate = np.unique(np.round(run.positions["hwp"], 2))
     # a plate that follows the sky has been everywhere
-    cycle = _CYCLE if len(set(np.round(run.hwp, 2))) > len(_TURN) else cycle
-    usual = {name: float(np.median(angles)) for name, angles in run.positions}
+    cycle = _CYCLE if len(plate) > len(_TURN) else tuple(map(float, plate[:8]))
+    usual = {name: float(np.median(angles)) for name, angles in run.positions.items()}
+    del usual["hwp"]
     moved = next((name for name in ("altitude", "derotator", *usual) if name in usual), None)
     if moved is None:
-        return [replace(run, hwp=angles) for angles in (cycle, _TURN)]
-    taken = np.unique(np.round(dict(run.positions)[moved], 1))
+        return [replace(run, positions={"hwp": angles}) for angles in (cycle, _TURN)]
+    taken = np.unique(np.round(run.positions[moved], 1))
     new, rest = [], list(_ALTITUDE if moved == "altitude" else _DEROTATOR)
     for _ in range(min(_NEW_ANGLES, len(rest))):
         # the one that is farthest from all others, modulo half a turn
         far = [np.min(np.abs((a - np.array([*taken, *new]) + 90) % 180 - 90)) for a in rest]
         new.append(rest.pop(int(np.argmax(np.round(far, 6)))))
-    blocks = [replace(run, hwp=cycle, positions=_at(usual | {moved: a})) for a in sorted(new)]
-    return [*blocks, replace(run, hwp=_TURN, positions=_at(usual | {moved: float(taken[0])}))]
-
-
-def _at(where):
-    return tuple((name, float(angle)) for name, angle in where.items())
+    frames = [*((cycle, angle) for angle in sorted(new)), (_TURN, taken[0])]
+    return [
+        replace(run, positions={"hwp": angles} | usual | {moved: float(angle)})
+        for angles, angle in frames
+    ]
 
 
 def _runs(run, train, name):
@@ -232,24 +240,18 @@ def _runs(run, train, name):
         # the sky moves on by itself
         return [same]
     # frames that share their brightness stay together
-    group = dict(run.positions).get(GROUP, np.arange(run.n_frames // max(len(run.states), 1)))
-    group = np.unique(group, return_inverse=True)[1]
+    group = np.unique(run.positions.get(GROUP, np.arange(run.n_angles)), return_inverse=True)[1]
     n = group.max(initial=-1) + 1
     # the same for all runs of a length: the proposal can be repeated
-    shuffled = np.random.default_rng(n).permutation(n)
-    return [
-        same,
-        _in_order(same, shuffled[group], f"the frames of {name} in shuffled order"),
-        _in_order(same, n - group, f"the run of {name} backwards, from its last frame"),
-    ]
-
-
-def _in_order(run, rank, what):
-    """Return a run with its frames in the order of a rank each."""
-    order = np.argsort(rank, kind="stable")
-    positions = tuple((name, tuple(np.array(a)[order])) for name, a in run.positions)
-    plate = tuple(np.array(run.hwp)[order]) if run.hwp else ()
-    return replace(run, hwp=plate, positions=positions, what=what)
+    shuffled, found = np.random.default_rng(n).permutation(n), [same]
+    for rank, what in (
+        (shuffled[group], f"the frames of {name} in shuffled order"),
+        (n - group, f"the run of {name} backwards, from its last frame"),
+    ):
+        order = np.argsort(rank, kind="stable")
+        positions = {stage: angles[order] for stage, angles in run.positions.items()}
+        found.append(replace(same, positions=positions, what=what))
+    return found
 
 
 # ---- the plan ----------------------------------------------------------------------------------
@@ -329,8 +331,6 @@ def _telling_apart(forecast, group, foreseen):
         worth = after + _CHANGE * (clear - exposure.effort) - _FRAME * exposure.n_frames
         if worth > value:
             best, value = (exposure, after, factors, sigmas), worth
-    entry = {"question": "cause", "separates": list(names), "gain": 0.0}
-    entry |= {"probability_now": now, "probability_after": now}
     first = titles[names[0]]
     if best is not None:
         exposure, after, factors, sigmas = best
@@ -346,11 +346,19 @@ def _telling_apart(forecast, group, foreseen):
                 f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
             )
             told = [names[0], *(names[j] for j in other)]
-            more = {"separates": told, "gain": float(gain), "probability_after": after}
-            return entry | more | {"words": words}
+            return _line(words, "cause", told, float(gain), now, after)
     few = listed([titles[name] for name in names[1:]], most=2)
-    words = f"No exposure that was tried tells {first} from {few}: other angles and orders"
-    return entry | {"words": f"{words}, polarizer and lamp do to both the same"}
+    words = (
+        f"No exposure that was tried tells {first} from {few}: other angles and orders, polarizer "
+        "and lamp do to both the same"
+    )
+    return _line(words, "cause", list(names), 0.0, now, now)
+
+
+def _line(words, question, separates, gain, now=None, after=None):
+    """Return an entry of the plan; of causes, also how probable the true one is expected to be."""
+    found = {"question": question, "separates": separates, "gain": gain}
+    return found | {"probability_now": now, "probability_after": after, "words": words}
 
 
 def _repetitions(diagnosis):
@@ -358,12 +366,10 @@ def _repetitions(diagnosis):
     if diagnosis.remainder_p_value >= REMAINDER:
         return []
     problem, model = diagnosis.improved.problem, diagnosis.improved
-    squares = model.residual**2
-    worst = max(
-        range(len(problem.segments)), key=lambda i: float(np.mean(squares[problem.segments[i]]))
-    )
+    squares = [model.residual[rows] ** 2 for rows in problem.segments]
+    worst = int(np.argmax([np.mean(one) for one in squares]))
     n = problem.channels[worst].count * int(problem.channels[worst].valid.sum())
-    excess = float(np.sum(squares[problem.segments[worst]])) / n
+    excess = float(np.sum(squares[worst])) / n
     # the scatter of repetitions has a variance that is known to this share
     gain = np.log(max(excess, 1.0)) / np.sqrt(2 / n + 2 / (n * (_REPEATS - 1)))
     name = model.observations[worst].name
@@ -372,9 +378,8 @@ def _repetitions(diagnosis):
         f"noise larger than stated, at {_sigmas(gain)} standard deviations"
     )
     after = float(stats.norm.cdf(gain))
-    chances = {"probability_now": 0.5, "probability_after": after}
-    entry = {"words": words, "question": "structure", "separates": [], "gain": float(gain)}
-    return [entry | chances] if gain > LEAST_GAIN else []
+    found = _line(words, "structure", [], float(gain), 0.5, after)
+    return [found] if gain > LEAST_GAIN else []
 
 
 def _fixing(forecast, directions, foreseen):
@@ -392,8 +397,7 @@ def _fixing(forecast, directions, foreseen):
         f"Take {exposure.words}: fixes {count} of {n_open} open directions of the parameters, the "
         f"clearest that of {' with '.join(names)}, at {_sigmas(gain)} standard deviations"
     )
-    entry = {"words": words, "question": "parameters", "separates": names, "gain": gain}
-    return [entry | {"probability_now": None, "probability_after": None}]
+    return [_line(words, "parameters", names, gain)]
 
 
 def _merged(lines):
@@ -423,33 +427,21 @@ class Forecast:
     """
 
     def __init__(self, model, recipes):
-        self.model, base = model, model.problem
-        chains, ties, laws, added = model.trains, dict(base.ties), dict(base.laws), {}
-        for effect, context in recipes:
-            if effect.name in model.added:
-                added[effect.name] = model.added[effect.name]
-            elif effect.name not in added and effect.applies(chains):
-                edit = effect.edit(chains, context or model.context)
-                chains, ties, laws = edit.chains, ties | edit.ties, laws | edit.laws
-                added[effect.name] = edit.parameters
-        self.chains, self.ties, self.laws = chains, ties, laws
-        self.problem = GapProblem(chains, model.observations, ties=ties, laws=laws, like=base)
-        problem, q = self.problem, self.problem.start
-        every = np.arange(problem.size)
+        wanted = {effect.name: (effect, context) for effect, context in recipes}
+        edited = model.edited(*(wanted[name] for name in wanted if name not in model.added))
+        self.model, self.chains, self.problem = model, edited.trains, edited.problem
+        problem, q = edited.problem, edited.fit.coefficients
+        every, tight = np.arange(problem.size), problem.tight**2
         #: Coefficients of each cause that has a place.
         self.own = {}
-        for name, some in added.items():
-            rows = [every[problem.slices[p.name]] for p in some if p.name in problem.slices]
+        for name, parameters in edited.added.items():
+            rows = [np.empty(0, dtype=int)]
+            for one in (p for p in parameters if p.name in problem.slices):
+                rows.append(every[problem.slices[one.name]])
+                tight[rows[-1]] = 1 / (_WIDE * one.canonical_scale) ** 2
             if sum(map(len, rows)):
                 self.own[name] = np.concatenate(rows)
-        slopes, residual = problem.jacobian(q), problem.residual(q)
-        tight = np.zeros(problem.size)
-        for name, sigma in base.priors.items():
-            tight[problem.slices[name]] = 1 / sigma**2
-        absent = np.zeros(problem.free.size)
-        for one in (p for some in added.values() for p in some if p.name in problem.slices):
-            tight[problem.slices[one.name]] = 1 / (_WIDE * one.canonical_scale) ** 2
-            absent[problem.free.by_name[one.name].slice] = one.canonical_neutral
+        slopes, self.residual = problem.jacobian(q), problem.residual(q)
         self.causes = np.zeros(problem.size, dtype=bool)
         for own in self.own.values():
             self.causes[own] = True
@@ -458,11 +450,10 @@ class Forecast:
         self.live = self.causes | ~at_bound
         norm = np.linalg.norm(slopes, axis=0)
         self.scale = np.where(norm > 0, norm, 1.0)
-        slopes = slopes / self.scale
-        self.gram = slopes.T @ slopes + np.diag(tight / self.scale**2 + _HOLD)
-        self.slopes, self.residual = slopes, residual
+        self.slopes = slopes / self.scale
+        self.gram = self.slopes.T @ self.slopes + np.diag(tight / self.scale**2 + _HOLD)
         #: By how much each coefficient is off the value at which its cause is absent.
-        self.value = (q - problem.coefficients(absent)) * self.scale
+        self.value = (q - problem.coefficients(problem._absent())) * self.scale
 
     def foreseen(self, names):
         """
@@ -496,19 +487,17 @@ class Forecast:
         own = {leaf.name for leaf in leaves(chain)}
         ties = {
             name: tie
-            for name, tie in self.ties.items()
+            for name, tie in self.problem.ties.items()
             if {name.split(".")[0], tie.source.split(".")[0]} <= own
         }
-        problem = GapProblem([chain], [observations], ties=ties, laws=self.laws)
-        channel = problem.channels[0]
-        slopes = problem.jacobian(problem.start, whitened=False).T.reshape(-1, *channel.shape)
-        white = _whitened(slopes, self.model.problem.channels[exposure.dataset], exposure, channel)
-        out = np.zeros((white[0].size, self.problem.size))
+        problem = GapProblem([chain], [observations], ties=ties, laws=self.problem.laws)
+        _settle_noise(problem.channels[0], self.model.problem.channels[exposure.dataset], exposure)
+        slopes = problem.jacobian(problem.start)[problem.segments[0]]
+        out = np.zeros((len(slopes), self.problem.size))
         for name, where in problem.slices.items():
             # a parameter that the set-up alone has is none of those fitted
             if name in self.problem.slices:
-                rows = white[where].reshape(where.stop - where.start, -1)
-                out[:, self.problem.slices[name]] = rows.T
+                out[:, self.problem.slices[name]] = slopes[:, where]
         return out / self.scale
 
     def open_directions(self):
@@ -624,27 +613,12 @@ def _middle(channel, values):
     return found
 
 
-def _whitened(array, old, exposure, new):
-    """
-    Divide by the noise of a dataset, and take out what its lamp may do.
-
-    That is the brightness at each wavelength, a drift common to them, and flicker.
-    """
-    sigma = _middle(old, old.sigma)[..., None]
-    weight = np.where(np.isfinite(sigma), np.sqrt(exposure.lamp) / sigma, 0.0)
-    out = array * weight
+def _settle_noise(new, old, exposure):
+    """Give channels the noise and the lamp of a dataset, whose colour does not drift."""
+    sigma = np.nan_to_num(_middle(old, old.sigma)[..., None], nan=np.inf) / np.sqrt(exposure.lamp)
+    new.lamp = copy(old.lamp)
+    new.lamp.color = 0
     if new.groups is not None:
-        # of a single beam nothing is known but that a group shares its brightness
-        member = np.eye(new.groups.max() + 1)[new.groups]
-        out[..., 0, :, :] = 0.0
-        out[..., 1, :, :] -= out[..., 1, :, :] @ (member / member.sum(axis=0)) @ member.T
-        return out
-    sums = out[..., 1, :, :] - out[..., 1, :, :].mean(axis=-1, keepdims=True)
-    norm = np.sqrt(np.sum(weight[1] ** 2))
-    direction = weight[1] / (norm if norm > 0 else 1.0)
-    common = np.sum(sums * direction, axis=-2)
-    kept = common / np.sqrt(1 + (old.lamp.flicker * norm) ** 2)
-    drift = orthonormal(np.vander(2 * new.sequence - 1, old.lamp.degree + 1))
-    kept = kept - (kept @ drift) @ drift.T
-    out[..., 1, :, :] = sums + direction * (kept - common)[..., None, :]
-    return out
+        new.lamp = type(old.lamp)(new.groups)
+    new.lamp.sequence = 2 * new.sequence - 1
+    new.settle(np.broadcast_to(sigma, new.shape))

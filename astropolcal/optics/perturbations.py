@@ -106,10 +106,11 @@ class Dependence:
             angle = int(self.parts[2]) * x
             return np.stack([np.cos(angle), np.sin(angle)])
         if self.kind in ("step", "frame"):
-            frame = int(self.parts[1])
-            return (x >= frame if self.kind == "step" else x == frame).astype(float)[None]
-        t, one = 2 * x - 1, np.ones_like(x)
+            at = int(self.parts[1])
+            return np.array([x >= at if self.kind == "step" else x == at], dtype=float)
+        one, t = np.ones_like(x), 2 * x - 1
         known = {"constant": one, "dataset": one, "time": t, "time2": t**2 - 1 / 3}
+        # direction, move and state are what they follow
         return known.get(self.kind, x)[None]
 
 

@@ -70,10 +70,9 @@ def test_what_is_the_same_everywhere_is_said_to_be(full):
 
 
 def test_a_brighter_lamp_tells_more(full):
-    base = Exposure(0, CYCLE, (("derotator", 150.0),))
+    where = {"hwp": CYCLE, "derotator": 150.0}
     gains = [
-        plan(even(full, *PAIR), candidates=[Exposure(0, CYCLE, base.positions, lamp=lamp)])
-        for lamp in (1.0, 4.0)
+        plan(even(full, *PAIR), candidates=[Exposure(0, where, lamp=lamp)]) for lamp in (1.0, 4.0)
     ]
     one, four = (entries[0]["gain"] for entries in gains)
     assert 1.2 * one < four < 2.01 * one
@@ -137,7 +136,7 @@ def test_open_directions_are_fixed_by_another_derotator_angle():
     assert found["question"] == "parameters"
     assert "open directions" in found["words"]
     assert all(name.startswith("derotator.") for name in found["separates"])
-    same = Exposure(0, CYCLE, (("derotator", 60.0),))
+    same = Exposure(0, {"hwp": CYCLE, "derotator": 60.0})
     assert plan(open_only(elliptical([60])), candidates=[same]) == []
 
 
@@ -151,7 +150,7 @@ def test_exposures_are_what_can_be_changed(model):
     assert {one.polarizer_turned for one in found} == {0.0, 45.0}
     assert {one.lamp for one in found} == {0.5, 1.0, 2.0}
     assert {one.without for one in found} == {(), ("calibration_polarizer",)}
-    assert any(max(one.hwp) > 300 for one in found)
+    assert any(max(one.positions["hwp"]) > 300 for one in found)
     words = " ".join(one.words for one in found)
     assert "again" in words
     assert "shuffled order" in words
@@ -171,7 +170,7 @@ def test_a_modulator_has_both_states():
     found = exposures(modulated)
     assert {one.states for one in found} == {("A", "B")}
     one = found[0]
-    assert one.n_frames == 2 * len(one.hwp)
+    assert one.n_frames == 2 * len(one.positions["hwp"])
     assert one.angles["hwp"][:4].tolist() == [0, 0, 11.25, 11.25]
     assert one.modulator[:4].tolist() == ["A", "B", "A", "B"]
     entries = plan(even(modulated.with_effect(get_effect(PAIR[0])), *PAIR), candidates=found)

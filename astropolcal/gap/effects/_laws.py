@@ -271,17 +271,13 @@ class Recoating(Effect):
 
     def edit(self, chains, context):
         """Return the chains with a diattenuator in all but the first; see `Effect.edit`."""
-        edited, names, seen = [], [], 0
-        for chain in chains:
-            roles = self.roles(chain)
-            if self.applies_to(roles):
-                # the first dataset keeps the nominal mirror
-                if seen:
-                    label = f"{self.label}_{seen}"
-                    chain, _, _ = self.put(chain, roles, context, label)
-                    names += [f"{label}.{key}" for key in self.free]
-                seen += 1
-            edited.append(chain)
+        edited, names = list(chains), []
+        stars = [i for i, chain in enumerate(chains) if self.applies_to(self.roles(chain))]
+        # the first dataset keeps the nominal mirror
+        for number, i in enumerate(stars[1:], 1):
+            label = f"{self.label}_{number}"
+            edited[i], _, _ = self.put(chains[i], self.roles(chains[i]), context, label)
+            names += [f"{label}.{key}" for key in self.free]
         return Edit(edited, self.parameters(names, chains, context))
 
 

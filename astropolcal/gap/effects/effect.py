@@ -471,7 +471,7 @@ class Effect:
             for r in every
             if self.where.optic is None or self.where.anchor(r) is not None or self.where.otherwise
         ]
-        roles = next((one for one in there if self.applies_to(one)), next(iter(there), None))
+        roles = max(there, key=self.applies_to, default=None)
         if roles is None or not (self.kinds or self.near):
             return ()
         where, kinds, text, *_ = (*(self.near or (self.where, self.kinds)), None)
@@ -566,14 +566,12 @@ class Effect:
         if self.around:
             # equal and opposite: what turns the light in front is turned back behind
             for part in parts:
-                chain = insert_optic(chain, part, before=anchor.name)
                 back = part.copy()
                 back.name = f"{part.name}_back"
+                chain = insert_optic(chain, part, before=anchor.name)
                 chain = insert_optic(chain, back, after=anchor.name)
-                ties |= {
-                    f"{back.name}.{key}": Tie(f"{part.name}.{key}", factor=-1.0)
-                    for key in self.free_of(part)
-                }
+                for key in self.free_of(part):
+                    ties[f"{back.name}.{key}"] = Tie(f"{part.name}.{key}", factor=-1.0)
             return chain, parts, ties
         for one in added if place.after is None else reversed(added):
             chain = place.insert(chain, one)
@@ -608,19 +606,17 @@ class Effect:
         text = self._dependence(roles)
         keys = ("amplitude", "quadrature")[: Dependence(text).count]
         zero = 0.0 if self.degree is NUMBER else np.zeros(len(context.wavelength))
-        found = []
-        for kind in self.kinds:
-            one = optics.Perturbation(
+        return [
+            optics.Perturbation(
                 **dict.fromkeys(keys, zero),
                 kind=kind,
                 dependence=text,
                 theta=place.theta * u.rad,
                 name=label if len(self.kinds) == 1 else f"{label}_{kind}",
+                fixed={key: key not in keys for key in optics.Perturbation.param_names},
             )
-            for key in one.param_names:
-                getattr(one, key).fixed = key not in keys
-            found.append(one)
-        return found
+            for kind in self.kinds
+        ]
 
     def __repr__(self):
         return f"<Effect {self.name}: {self.title}>"
@@ -639,11 +635,9 @@ def _has_axes(optic):
 def _in_frame(place, parts, label):
     """Return optics between a rotator into the frame of a stage and one back."""
     back = place.mount[1:] if place.mount.startswith("-") else f"-{place.mount}"
-    ends = [optics.Rotator(mount=m, name=f"{label}_{n}") for m, n in
-            ((place.mount, "in"), (back, "out"))]  # fmt: skip
-    for one in ends:
-        one.theta.fixed = True
-    return [ends[0], *parts, ends[1]]
+    fixed = {"theta": True}
+    inwards = optics.Rotator(mount=place.mount, name=f"{label}_in", fixed=fixed)
+    return [inwards, *parts, optics.Rotator(mount=back, name=f"{label}_out", fixed=fixed)]
 
 
 #: What only a detector does: the optic, what of it is free, and other settings of an `Effect`.

@@ -16,6 +16,10 @@ __all__ = []
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
 _NO_STAGES = (None, "parallactic", "altitude")
+_RETARDERS = (
+    *(optics.LinearRetarder, optics.EllipticalRetarder, optics.TwoLayerWaveplate),
+    *(optics.DiattenuatorRetarder, optics.KMirror),
+)
 _BEHIND, _BEHIND_PLATE = "downstream of the derotator", "downstream of the half-wave plate"
 
 
@@ -145,9 +149,12 @@ class Roles:
         self.leaves = leaves(chain)
         # what an effect has added stands for nothing else
         self._own = [o for o in self.leaves if o.name and not o.name.startswith("gap_")]
+        # what stands in the place of the polarizer for unpolarized light
+        first = self.leaves[0]
+        is_mirror = isinstance(first, (optics.Diattenuator, optics.DiattenuatorRetarder))
         self._kinds = {
             "polarizer": [o for o in self._own if isinstance(o, optics.LinearPolarizer)],
-            "mirror": self._source_mirrors(),
+            "mirror": [first] if is_mirror and first.stage is None else [],
             **self._turning(),
         }
         front = self._in_front()
@@ -156,39 +163,28 @@ class Roles:
             name = chosen.get(role)
             own = (o for o in found if name in (None, o.name))
             setattr(self, role, next(own, None))
+        turns = [o for o in self.leaves if isinstance(o, optics.Rotator)]
+        names = [o.stage for o in turns]
+        # without a rotation by the parallactic angle the light is that of an internal source
+        sky = turns[names.index("parallactic") :] if "parallactic" in names else []
+        stars = self.leaves[: self.leaves.index(sky[0])] if sky else []
         #: Rotations by the parallactic angle and the altitude, and the star in front of them.
-        self.parallactic = self.altitude = self.star = None
-        self._look_at_the_sky()
+        self.parallactic = next(iter(sky), None)
+        self.altitude = next((o for o in sky if o.stage == "altitude"), None)
+        self.star = next((o for o in stars if isinstance(o, optics.PolarizedSource)), None)
         self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
         #: What static optics of the relay stand behind.
         self.relay = self.derotator or self.plate
         #: The plate, where the model has nothing in front of it that could polarize.
         self.entrance = self.plate if self._is_entrance() else None
 
-    def _look_at_the_sky(self):
-        turns = [o if isinstance(o, optics.Rotator) else None for o in self.leaves]
-        first = next((i for i, o in enumerate(turns) if o and o.stage == "parallactic"), None)
-        # without a rotation by the parallactic angle the light is that of an internal source
-        if first is None:
-            return
-        self.parallactic = turns[first]
-        self.altitude = next((o for o in turns[first:] if o and o.stage == "altitude"), None)
-        stars = (o for o in self.leaves[:first] if isinstance(o, optics.PolarizedSource))
-        self.star = next(stars, None)
-
     def all(self, role):
         """Return all optics of a role, in the order in which light meets them."""
         return self._kinds.get(role, [])
 
-    def _source_mirrors(self):
-        """Return what stands in the place of the polarizer for unpolarized light."""
-        first = self.leaves[0]
-        kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
-        return [first] if isinstance(first, kinds) and first.stage is None else []
-
     def _turning(self):
         """Return plates and derotators."""
-        found = [o for o in self._own if _retards(o) and o.stage not in _NO_STAGES]
+        found = [o for o in self._own if isinstance(o, _RETARDERS) and o.stage not in _NO_STAGES]
         found = [o for o in found if o.stage not in COORDINATES]
         names = [o.stage for o in found]
         plates = [o for o in found if o.stage == "hwp"]
@@ -218,17 +214,6 @@ class Roles:
             return False
         # the sky turns, and the instrument with the telescope
         return all(is_held(getattr(o, key)) for o in self._in_front() for key in o.param_names)
-
-
-def _retards(optic):
-    kinds = (
-        optics.LinearRetarder,
-        optics.EllipticalRetarder,
-        optics.TwoLayerWaveplate,
-        optics.DiattenuatorRetarder,
-        optics.KMirror,
-    )
-    return isinstance(optic, kinds)
 
 
 def adapted(effects, chains):
