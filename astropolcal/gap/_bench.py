@@ -120,7 +120,10 @@ class Bench:
         # over the range of the wavelengths, from -1 to 1
         x = 2 * (x - x.min()) / np.ptp(x) - 1
         self.law = legvander(x, min(_DEGREE, len(wavelength) - 1))
-        self.chains = _varied(setup.chains(), self.law, rng)
+        self.chains = setup.chains()
+        self._free = FreeParameters(self.chains, len(wavelength))
+        self._start = _varied(self._free, self.law, rng)
+        self._free.put_back(self._start)
         self.shuffled = bool(rng.random() < 0.5)
         order = rng.permutation(setup.n_derotator) if self.shuffled else None
         frames = setup.frames(order)
@@ -146,8 +149,6 @@ class Bench:
             for chain, source in zip(self.chains, setup.sources, strict=True)
         ]
         self.optics = [self.split(chain) for chain in self.chains]
-        self._free = FreeParameters(self.chains, len(wavelength))
-        self._start = self._free.start()
         every = (leaf for chain in self.chains for leaf in leaves(chain))
         self._known = {leaf.name: leaf.canonical_values() for leaf in every}
         ideal = self.expose()
@@ -501,38 +502,29 @@ def _channels(flux, bright):
     return np.stack([(flux[0] - flux[1]) / total, np.log(total * bright)])
 
 
-def _varied(chains, law, rng):
-    """Return the chains with other values of all free parameters, the same in all chains."""
-    known = {}
-    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
-        for key in leaf.param_names:
-            # a mounting that is known within its error is where it should be
-            if not getattr(leaf, key).fixed and getattr(leaf, key).prior is None:
-                name = f"{leaf.name}.{key}"
-                if name not in known:
-                    known[name] = _vary(leaf, key, law, rng, known)
-                setattr(leaf, key, known[name])
-    return chains
+def _varied(free, law, rng):
+    """Return other values of all free parameters, the same in all chains."""
+    vector, cut = free.start(), {}
+    known = {slot.name for slot, _ in free.priors}
+    # a mounting that is known within its error is where it should be
+    for slot in (slot for slot in free.slots if slot.name not in known):
+        vector[slot.slice] = _vary(slot, vector[slot.slice], law, rng, cut)
+    return vector
 
 
-def _vary(leaf, key, law, rng, known):
-    parameter = getattr(leaf, key)
-    unit = u.dimensionless_unscaled if parameter.unit is None else parameter.unit
-    value = np.array(parameter.value, dtype=float)
-    if unit.is_equivalent(u.m):
+def _vary(slot, value, law, rng, cut):
+    angle = slot.unit is not None
+    if angle and slot.unit.is_equivalent(u.m):
         # two layers that compensate each other are cut together
-        common = known.setdefault(f"{leaf.name} thickness", rng.normal(0, 0.01))
-        return value * (1 + common + rng.normal(0, 5e-4)) * unit
-    angle = unit.is_equivalent(u.deg)
-    if not value.ndim:
-        return (value * unit) + (rng.normal(0, 0.3) * u.deg if angle else rng.normal(0, 0.003))
+        common = cut.setdefault(slot.name.partition(".")[0], rng.normal(0, 0.01))
+        return value * (1 + common + rng.normal(0, 5e-4))
+    if not slot.per_wavelength:
+        return value + (np.deg2rad(rng.normal(0, 0.3)) if angle else rng.normal(0, 0.003))
     # smooth in wavelength, and a little that is not, so that a stiff law alone does not fit
     smooth = law @ (rng.normal(0, 1, law.shape[1]) / np.arange(1, law.shape[1] + 1))
     rough = smooth + rng.normal(0, 0.2, value.shape)
-    new = (value * unit + (2 * u.deg if angle else 0.005) * rough).to_value(unit)
-    low, high = (
-        s * np.inf if b is None else b for s, b in zip((-1, 1), parameter.bounds, strict=True)
-    )
+    new = value + (np.deg2rad(2) if angle else 0.005) * rough
+    low, high = slot.canonical_bounds()
     # a truth at its bound could be fitted from one side only
     margin = 0.0 if angle else 0.002
-    return np.clip(new, low + margin, high - margin) * unit
+    return np.clip(new, low + margin, high - margin)

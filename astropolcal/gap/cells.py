@@ -235,24 +235,20 @@ def places(chain):
 # ---- dependences -------------------------------------------------------------------------------
 
 
-def dependences(problem, most_steps=_MOST_STEPS):
+def dependences(problem):
     """Return the functions of the frame that the data of a problem can tell."""
-    stages = dict.fromkeys(
-        stage
-        for dataset in problem.datasets
-        for stage in dataset._given
-        if stage not in COORDINATES and stage not in _SKY
-    )
+    given = dict.fromkeys(stage for dataset in problem.datasets for stage in dataset._given)
+    stages = [stage for stage in given if stage not in COORDINATES and stage not in _SKY]
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
-    names += [
-        f"state:{stage}"
-        for stage in dict.fromkeys(s for d in problem.datasets for s in d._given if "=" in s)
-    ]
+    names += [f"state:{stage}" for stage in given if "=" in stage]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
-    steps = [f"step:{n}" for n in _steps(problem, most_steps // max(len(runs), 1))]
+    n = min(d.observations.n_frames for d in problem.datasets)
+    # frames at which something may have changed: all, or as many as are looked at
+    most = min(_MOST_STEPS // max(len(runs), 1), n - 3) if n >= 8 else 0
+    steps = [f"step:{at:.0f}" for at in np.unique(np.linspace(2, n - 2, most).round())]
     # a frame of one run has nothing to do with that of the same number in another
     alone = [*names[1:], *steps]
     if len(several) > 1:
@@ -292,14 +288,6 @@ def _waves(dependence, dataset):
     return dependence.waves(given.mean(axis=0) if given.ndim == 2 else given)
 
 
-def _steps(problem, most):
-    """Return frames at which something may have changed: all, or as many as are looked at."""
-    n = min(d.observations.n_frames for d in problem.datasets)
-    if n < 8 or not most:
-        return []
-    return sorted({int(x) for x in np.linspace(2, n - 2, min(most, n - 3)).round()})
-
-
 # ---- derivatives -------------------------------------------------------------------------------
 
 
@@ -315,11 +303,9 @@ class Probes:
         Names of effects of the model that are taken out, to first order.
     like : Probes, optional
         Those of the same model, whose derivatives are taken over.
-    most_steps : int
-        Steps are looked for at so many frames.
     """
 
-    def __init__(self, model, without=(), like=None, most_steps=_MOST_STEPS):
+    def __init__(self, model, without=(), like=None):
         self.model, self.problem = model, model.problem
         problem, linear = model.problem, model.without(without)
         self.tangent, self.residual = linear.tangent, linear.residual
@@ -328,7 +314,7 @@ class Probes:
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
-        self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
+        self.waves = problem.waves = problem.waves or dependences(problem)
         self._groups, self._asked = {}, len(self.waves)
         #: Second derivatives over the size that is tried, where they outdo the first ones.
         self.bends = {} if like is None else like.bends
@@ -423,14 +409,11 @@ class Probes:
                     theta=place.theta * u.rad,
                     mount=place.mount,
                     name=_PROBE + place.name,
+                    fixed={"theta": True, "retardance": True},
                 )
                 chain = place.insert(chain, probe)
                 where.setdefault(place.name, None)
             chains.append(chain)
-        for chain in chains:
-            for leaf in leaves(chain):
-                for key in leaf.param_names:
-                    getattr(leaf, key).fixed = True
         observations = self.model.observations
         problem = GapProblem(chains, observations, like=self.problem, copy=False)
         found = {}

@@ -51,6 +51,8 @@ _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
 _TIMED = ("time", "time2", "step", "frame")
 # log Bayes factor at which two causes are told apart
 _APART = np.log(10)
+# entries of a plan
+_MOST_LINES = 4
 # a dataset is repeated so many times to know its noise
 _REPEATS = 3
 MODULATOR, STATES = "flc_state", ("A", "B")
@@ -179,21 +181,15 @@ def _run(i, train, observations):
     # "filter=CLEAR" is a state of the column filter
     names = dict.fromkeys(stage.partition("=")[0] for stage in ("hwp", *stages(train)))
     known = set(observations.frames.colnames)
-    where = {
-        name: _column(observations, name)[take][:_LONGEST]
-        for name in names
-        if name in known and name not in COORDINATES
-    }
+    where = {}
+    for name in (name for name in names if name in known and name not in COORDINATES):
+        column = np.asarray(observations.frames[name])
+        if column.dtype.kind not in "US":
+            column = np.round(np.rad2deg(observations.position(name)), 6)
+        where[name] = column[take][:_LONGEST]
     if observations.single_beam:
         where[GROUP] = observations.brightness_groups[take][:_LONGEST]
     return Exposure(i, where, states=states)
-
-
-def _column(observations, name):
-    """Return the angles (degree) or the states of a stage, (F,)."""
-    if observations.frames[name].dtype.kind in "US":
-        return np.asarray(observations.frames[name])
-    return np.round(np.rad2deg(observations.position(name)), 6)
 
 
 def _turned(run, name):
@@ -257,7 +253,7 @@ def _runs(run, train, name):
 # ---- the plan ----------------------------------------------------------------------------------
 
 
-def plan(diagnosis, candidates=None, limit=4):
+def plan(diagnosis, candidates=None):
     """
     Return exposures that answer the questions that a diagnosis cannot answer, a list of dict.
 
@@ -275,7 +271,7 @@ def plan(diagnosis, candidates=None, limit=4):
     groups = [group for group in groups if len(group) > 1]
     directions = forecast.open_directions()
     if not groups and not directions[2].shape[1]:
-        return lines[:limit]
+        return lines[:_MOST_LINES]
     if candidates is None:
         used = {s for chain in forecast.chains for s in stages(chain)}
         candidates = exposures(model, flux_matters=bool(used & {"flux", "total_flux"}))
@@ -292,7 +288,7 @@ def plan(diagnosis, candidates=None, limit=4):
         lines.append(_telling_apart(forecast, group, foreseen))
     if directions[2].shape[1]:
         lines += _fixing(forecast, directions, foreseen)
-    return _merged(lines)[:limit]
+    return _merged(lines)[:_MOST_LINES]
 
 
 def _groups(diagnosis):

@@ -8,7 +8,7 @@ from scipy.linalg import helmert
 from astropolcal import optics
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
-from astropolcal.gap.effects.effect import Edit, Effect, EffectParameter, label_of
+from astropolcal.gap.effects.effect import Edit, Effect, EffectParameter
 from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
@@ -189,15 +189,11 @@ class BandAverage(Effect):
         """Return the derotator, or the steepest retarder downstream of it that is static."""
         if self.where.relation == "in" or roles.derotator is None:
             return roles.derotator
-        names = [leaf.name for leaf in roles.leaves]
-        behind = roles.leaves[names.index(roles.derotator.name) + 1 :]
-        # a dict by slope: the steepest one is where the average over a bin matters most
-        steep = {
-            np.abs(slopes).max(): leaf
-            for leaf in behind
-            if leaf.stage is None and (slopes := retardance_slopes(leaf)) is not None
-        }
-        return steep[max(steep)] if steep else None
+        behind = roles.leaves[roles.leaves.index(roles.derotator) + 1 :]
+        static = [leaf for leaf in behind if leaf.stage is None]
+        found = [leaf for leaf in static if retardance_slopes(leaf) is not None]
+        # the steepest one is where the average over a bin matters most
+        return max(found, key=lambda o: np.abs(retardance_slopes(o)).max(), default=None)
 
     def applies_to(self, roles):
         """Return whether there is a retarder whose retardance depends on the wavelength."""
@@ -423,11 +419,10 @@ class Alternative(Effect):
         for chain, law in zip(chains, laws, strict=True):
             roles = self.roles(chain)
             if self.applies_to(roles):
-                optic = self.where.anchor(roles)
-                index = next(i for i, leaf in enumerate(roles.leaves) if leaf is optic)
+                index = roles.leaves.index(self.where.anchor(roles))
                 chain = chain.copy()
                 own = leaves(chain)[index]
-                chain = self.change(chain, own, roles=roles, law=law, label=label_of(self.name))
+                chain = self.change(chain, own, roles=roles, law=law, label=self.label)
             edited.append(chain)
         return Edit(edited, [])
 

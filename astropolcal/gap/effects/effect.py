@@ -471,7 +471,8 @@ class Effect:
             for r in every
             if self.where.optic is None or self.where.anchor(r) is not None or self.where.otherwise
         ]
-        roles = max(there, key=self.applies_to, default=None)
+        # the first that lacks it, else the first
+        roles = next((r for r in there if self.applies_to(r)), there[0] if there else None)
         if roles is None or not (self.kinds or self.near):
             return ()
         where, kinds, text, *_ = (*(self.near or (self.where, self.kinds)), None)
@@ -492,9 +493,11 @@ class Effect:
     def edit(self, chains, context):
         """Return the `Edit` of chains, which stay as they are, with the effect at zero."""
         edited, ties, keys = [], {}, {}
+        name = split_run(self.dependence)[1]
         for i, chain in enumerate(chains):
             roles = self.roles(chain)
-            if self.applies_to(roles) and self._in_dataset(context, i):
+            is_in = name is None or context.datasets[i : i + 1] in ((), (name,))
+            if is_in and self.applies_to(roles):
                 chain, parts, more = self.put(chain, roles, context, self.label)
                 ties |= more
                 keys |= dict.fromkeys(
@@ -502,11 +505,6 @@ class Effect:
                 )
             edited.append(chain)
         return Edit(edited, self.parameters(keys, chains, context), ties)
-
-    def _in_dataset(self, context, i):
-        """Return whether a dataset is that of the dependence, where this names one."""
-        name = split_run(self.dependence)[1]
-        return name is None or context.datasets[i : i + 1] in ((), (name,))
 
     def parameters(self, names, chains, context):
         """Return the parameters of these names, with their sizes and laws."""
@@ -549,8 +547,14 @@ class Effect:
         place = self.where.find(roles, self.optic)
         anchor = self.where.anchor(roles)
         if self.inserted is None:
-            parts = self._perturbations(place, roles, context, label)
-            added = parts if place.mount is None or self.around else _in_frame(place, parts, label)
+            parts = added = self._perturbations(place, roles, context, label)
+            if place.mount is not None and not self.around:
+                # between a rotator into the frame of a stage and one back
+                back = place.mount[1:] if place.mount.startswith("-") else f"-{place.mount}"
+                fixed = {"theta": True}
+                into = optics.Rotator(mount=place.mount, name=f"{label}_in", fixed=fixed)
+                out_of = optics.Rotator(mount=back, name=f"{label}_out", fixed=fixed)
+                added = [into, *parts, out_of]
         else:
             parts = added = [self._own_optic(place, anchor, context, label)]
         ties = {
@@ -630,14 +634,6 @@ def _plain(size):
 def _has_axes(optic):
     """Return whether an optic turns with its mount, and has axes."""
     return not isinstance(optic, optics.FrameOptic) or optic.turns
-
-
-def _in_frame(place, parts, label):
-    """Return optics between a rotator into the frame of a stage and one back."""
-    back = place.mount[1:] if place.mount.startswith("-") else f"-{place.mount}"
-    fixed = {"theta": True}
-    inwards = optics.Rotator(mount=place.mount, name=f"{label}_in", fixed=fixed)
-    return [inwards, *parts, optics.Rotator(mount=back, name=f"{label}_out", fixed=fixed)]
 
 
 #: What only a detector does: the optic, what of it is free, and other settings of an `Effect`.

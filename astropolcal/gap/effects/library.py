@@ -451,14 +451,24 @@ _TURNED = "everywhere: the polarization turns the other way"
 _BY_DEROTATOR = "everywhere that depends on the derotator angle"
 _SIGN = "angle of the {} with the wrong sign"
 _OFFSET = "angle of the {} from another zero or keyword, off by 45 deg"
-_PLATE_WORDS, _DEROTATOR_WORDS = "stage of the half-wave plate", "stage of the derotator"
-_QUARTER = laws.turned_by(45)
+_AXES = {
+    "plate": "stage of the half-wave plate",
+    "derotator": "stage of the derotator",
+    "splitter": "detector",
+    "parallactic": "sky",
+    "altitude": "telescope",
+}
+
+
+def _turned(name, title, role, change, shows, **more):
+    """Return an optic, by its role, that turns otherwise than the model says."""
+    return laws.Alternative(name, title, _AXES[role], role, change, shows, **more)
 
 
 def _followed(name, title, shows, *factors, needs="parallactic"):
     """Return a plate that follows the sky by another law than its instrument says."""
-    return laws.Alternative(
-        name, f"half-wave plate that {title}", _PLATE_WORDS, "plate", laws.following(*factors),
+    return _turned(
+        name, f"half-wave plate that {title}", "plate", laws.following(*factors),
         f"everywhere on sky: the polarization turns with {shows}", reference=_SIGNS,
         when=lambda roles: getattr(roles, needs) is not None,
     )  # fmt: skip
@@ -477,36 +487,22 @@ _ALTERNATIVES = [
         "odd number of reflections upstream of the half-wave plate that the model lacks",
         _ENTRANCE.said, Where("before", "plate"), laws.flipped_before, _TURNED,
     ),
-    laws.Alternative(
-        "hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", laws.other_sign, _TURNED
-    ),
-    laws.Alternative(
-        "derotator_sign", _SIGN.format("derotator"), _DEROTATOR_WORDS, "derotator",
-        laws.other_sign, _BY_DEROTATOR,
-    ),
+    _turned("hwp_sign", _SIGN.format("half-wave plate"), "plate", laws.other_sign, _TURNED),
+    _turned("derotator_sign", _SIGN.format("derotator"), "derotator", laws.other_sign,
+            _BY_DEROTATOR),
     # T(-90) exchanges the axes of the prism, and with them the beams
-    laws.Alternative(
-        "beams_swapped", "right and left beam exchanged", "detector", "splitter",
-        laws.turned_by(90), "everywhere: the differences have the wrong sign",
-    ),
+    _turned("beams_swapped", "right and left beam exchanged", "splitter", laws.turned_by(90),
+            "everywhere: the differences have the wrong sign"),
     # two plates 45 deg apart differ by the sign of Q and U: polarization turned by 90 deg
-    laws.Alternative(
-        "hwp_offset", _OFFSET.format("half-wave plate"), _PLATE_WORDS, "plate", _QUARTER,
-        "everywhere: the polarization is turned by 90 deg",
-    ),
-    laws.Alternative(
-        "derotator_offset", _OFFSET.format("derotator"), _DEROTATOR_WORDS, "derotator", _QUARTER,
-        _BY_DEROTATOR,
-    ),
-    laws.Alternative(
-        "parallactic_sign", "parallactic angle with the wrong sign", "sky", "parallactic",
-        laws.other_sign, "polarization of stars that turns with the parallactic angle",
-        reference=_SIGNS,
-    ),
-    laws.Alternative(
-        "altitude_sign", "altitude with the wrong sign", "telescope", "altitude", laws.other_sign,
-        "everywhere on sky: the polarization turns with twice the altitude", reference=_SIGNS,
-    ),
+    _turned("hwp_offset", _OFFSET.format("half-wave plate"), "plate", laws.turned_by(45),
+            "everywhere: the polarization is turned by 90 deg"),
+    _turned("derotator_offset", _OFFSET.format("derotator"), "derotator", laws.turned_by(45),
+            _BY_DEROTATOR),
+    _turned("parallactic_sign", "parallactic angle with the wrong sign", "parallactic",
+            laws.other_sign, "polarization of stars that turns with the parallactic angle",
+            reference=_SIGNS),
+    _turned("altitude_sign", "altitude with the wrong sign", "altitude", laws.other_sign,
+            "everywhere on sky: the polarization turns with twice the altitude", reference=_SIGNS),
     _followed("hwp_tracking_parallactic_sign", "follows the parallactic angle with the wrong sign",
               "the parallactic angle", -1.0, 1.0),
     _followed("hwp_tracking_altitude_sign", "follows the altitude with the wrong sign",
