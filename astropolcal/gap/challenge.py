@@ -590,13 +590,11 @@ class ChallengeResult:
             left = np.zeros(len(rows))
             for name in RESULTS:
                 width = 100 * np.asarray(rows[name])
-                ax.barh(
-                    range(len(rows)), width, 0.75, left, color=_COLORS[name], label=_WORDS[name]
-                )
+                looks = {"color": _COLORS[name], "label": _WORDS[name]}
+                bars = ax.barh(range(len(rows)), width, 0.75, left, **looks)
+                numbers = [f"{w:.0f}" if w > 6 else "" for w in width]
                 dark = "black" if name == "silent" else "white"
-                for y, (x, w) in enumerate(zip(left, width, strict=True)):
-                    if w > 6:
-                        ax.text(x + w / 2, y, f"{w:.0f}", ha="center", va="center", color=dark)
+                ax.bar_label(bars, numbers, label_type="center", color=dark)
                 left += width
             labels = [f"{row['challenges']} ({row['n']})" for row in rows]
             ax.set_yticks(range(len(rows)), labels)
@@ -634,10 +632,8 @@ class ChallengeResult:
         top.set(ylim=(-3, 103), ylabel="of them right (%)")
         top.legend(loc="upper left", frameon=False)
         left, right = 100 * np.asarray(table["from"]), 100 * np.asarray(table["to"])
-        width = right - left
-        below.bar(left, table["n"], width, align="edge", color="0.8", edgecolor="0.4")
-        for a, w, n in zip(left, width, table["n"], strict=True):
-            below.annotate(str(n), (a + w / 2, n), (0, 2), textcoords="offset points", ha="center")
+        looks = {"align": "edge", "color": "0.8", "edgecolor": "0.4"}
+        below.bar_label(below.bar(left, table["n"], right - left, **looks), padding=2)
         below.set(xlim=(-3, 103), xlabel="probability that was given (%)", ylabel="causes")
         below.margins(y=0.25)
         for ax in (top, below):

@@ -461,7 +461,7 @@ _AXES = {
 
 
 def _turned(name, title, role, change, shows, **more):
-    """Return an optic, by its role, that turns otherwise than the model says."""
+    """Return an optic, by its role, that turns differently from what the model says."""
     return laws.Alternative(name, title, _AXES[role], role, change, shows, **more)
 
 
