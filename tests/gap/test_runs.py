@@ -195,26 +195,26 @@ def test_cells_of_runs_are_put_into_their_chains_only():
 
 def test_probes_have_every_dependence_in_each_run():
     model = data.fitted(pair())
-    waves = dependences(model.problem, 4)
+    waves = dependences(model.problem)
     assert f"dataset:{JULY}" in waves
     assert f"time/dataset:{OCTOBER}" in waves
     assert not any(name.startswith("step") and "dataset" not in name for name in waves)
     np.testing.assert_array_equal(waves[f"time/dataset:{OCTOBER}"][0], 0)
     assert np.ptp(waves[f"time/dataset:{OCTOBER}"][1]) == pytest.approx(2)
-    probes = Probes(model, most_steps=0)
+    probes = Probes(model)
     assert Cell("detector", "background", f"dataset:{JULY}") in probes.cells
     assert probes.run_of(Cell("in:hwp", "rotation", f"dataset:{JULY}")) == JULY
     assert probes.run_of(Cell("in:hwp", "rotation", "time")) is None
 
 
 def test_one_run_has_no_cells_of_its_own():
-    waves = dependences(data.clean_model().problem, 4)
+    waves = dependences(data.clean_model().problem)
     assert not any("dataset:" in name for name in waves)
 
 
 def test_the_derivative_of_a_cell_in_one_run_is_that_of_its_optic():
     model = data.fitted(pair())
-    probes = Probes(model, most_steps=0)
+    probes = Probes(model)
     cell = Cell("in:derotator", "retardance_h", f"time/dataset:{OCTOBER}")
     edited = model.edited((CellEffect(cell, 0), None))
     problem, (parameters,) = edited.problem, edited.added.values()
