@@ -12,7 +12,7 @@ by a scan statistic (Kulldorff 1997, doi:10.1080/03610929708831995), and the nul
 holds several patterns.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -23,6 +23,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import false_discovery
 from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.problem import law_basis
+from astropolcal.observations.grid import SAME_ANGLE, derotator_runs
 
 __all__ = []
 
@@ -39,15 +40,18 @@ _DOUBT = 0.5
 _LEAST_SHARE = 0.01
 _OF = {"difference": "differences", "sum": "sums"}
 # harmonics in the order of who gives a name to what the angles cannot tell apart
-_PLATE = (0, 4, 2, 8, 1, 3, 5, 6, 7, 12)
-_DEROTATOR = (2, 4, 1)
+_ORDERS = {
+    "hwp": (0, 4, 2, 8, 1, 3, 5, 6, 7, 12),
+    "derotator": (2, 4, 1),
+    "altitude": (2, 4),
+    "parallactic": (2, 4),
+}
+_PLATE = "harmonic {} of the half-wave-plate angle"
 # condition number of a constant, harmonic 4 and another one, beyond which they are hardly told
 _POOR = 10.0
 _ORDER = "the order of frames within a block at one derotator angle"
 _SAME_ORDER = "the plate angles come in the same order in every block"
 _NOTE = "these angles hardly tell it from a constant and harmonic 4"
-#: Angles closer than this (radian) are the same.
-SAME_ANGLE = np.deg2rad(0.5)
 # chi-square tables drawn under the null; fewer than _RELIABLE beyond a value tell no probability
 _DRAWS = 1000
 _RELIABLE = 20
@@ -96,12 +100,8 @@ class _Whitened:
                 "nothing to look for a gap in; more frames are needed"
             )
         self.total = float(self.residual @ self.residual)
-        self.excess = self.total - self.n_freedom
         # a gap within the noise has no shares worth the name
-        self.scale = max(self.excess, np.sqrt(2 * self.n_freedom))
-        self.valid = np.concatenate(
-            [np.broadcast_to(c.valid, c.shape).ravel() for c in problem.channels]
-        )
+        self.scale = max(self.total - self.n_freedom, np.sqrt(2 * self.n_freedom))
 
     def freedom(self, label, count):
         """Return the expected sum of squares of the rows of each label."""
@@ -110,8 +110,8 @@ class _Whitened:
         for segment, channel in zip(self.segments, self.problem.channels, strict=True):
             rows = np.arange(segment.start, segment.stop).reshape(channel.shape)[1].ravel()
             taken[rows] += np.sum(channel.nuisance**2, axis=1)
-        keep = self.valid & (label >= 0)
-        return np.bincount(label[keep], (1 - taken)[keep], minlength=count)
+        valid = [np.broadcast_to(c.valid, c.shape).ravel() for c in self.problem.channels]
+        return np.bincount(label, (1 - taken) * np.concatenate(valid), minlength=count)
 
 
 # ---- patterns ------------------------------------------------------------------------------
@@ -119,19 +119,13 @@ class _Whitened:
 
 @dataclass
 class _Term:
-    """A pattern: its columns of each dataset, arrays (k, 2, W, F)."""
+    """A pattern of a channel: its columns of each dataset, arrays (k, W, F)."""
 
     axis: str
     detail: str
     channel: int
-    parts: list = field(default_factory=list)
+    parts: list
     doubtful: bool = False
-
-    def columns(self, i, shape):
-        part = self.parts[i]
-        out = np.zeros((len(part), *shape))
-        out[:, self.channel] = part
-        return out
 
 
 def _terms(model):
@@ -145,16 +139,16 @@ def _terms(model):
     notes = badly_separated(model.observations)
     terms = []
     for channel, name in enumerate(CHANNELS):
+        where = f"in the {_OF[name]}"
         for axis, words in keys:
             parts = [table.get((axis, words)) for table in tables]
             note = f" ({notes[words]})" if words in notes else ""
-            detail = f"{words}, in the {_OF[name]}{note}"
-            parts_smooth = _outer(parts, smooth, problem)
-            terms.append(_Term(axis, detail, channel, parts_smooth, bool(note)))
+            columns = _outer(parts, smooth, problem)
+            terms.append(_Term(axis, f"{words}, {where}{note}", channel, columns, bool(note)))
             if rough.shape[1] and " x " not in axis and not note:
-                sharp = f"{words}, sharp in wavelength, in the {_OF[name]}"
-                pair = f"wavelength x {axis}"
-                terms.append(_Term(pair, sharp, channel, _outer(parts, rough, problem)))
+                sharp = f"{words}, sharp in wavelength, {where}"
+                columns = _outer(parts, rough, problem)
+                terms.append(_Term(f"wavelength x {axis}", sharp, channel, columns))
     return [*terms, _flux(problem)], _null_channel(model, smooth)
 
 
@@ -250,18 +244,16 @@ def _normal_equations(data, terms):
     block by block and the columns are never all there at once.
     """
     edges = np.cumsum([0] + [sum(len(p) for p in term.parts) for term in terms])
-    slices = [slice(a, b) for a, b in pairwise(edges)]
     gram, target = np.zeros((edges[-1],) * 2), np.zeros(edges[-1])
     seen = np.zeros((data.tangent.shape[1], edges[-1]))
     for i, (rows, channel) in enumerate(zip(data.segments, data.problem.channels, strict=True)):
         for c in range(2):
             here, where = [], []
-            for term, place in zip(terms, slices, strict=True):
+            for term, start in zip(terms, edges, strict=False):
                 if term.channel == c and len(term.parts[i]):
-                    start = place.start + sum(len(p) for p in term.parts[:i])
+                    start += sum(len(p) for p in term.parts[:i])
                     where.append(np.arange(start, start + len(term.parts[i])))
-                    raw = term.columns(i, channel.shape) * channel.valid
-                    here.append(_unit(channel, raw)[:, c].reshape(len(raw), -1))
+                    here.append(_unit(channel, c, term.parts[i]))
             if not here:
                 continue
             columns, where = np.concatenate(here), np.concatenate(where)
@@ -269,14 +261,17 @@ def _normal_equations(data, terms):
             gram[np.ix_(where, where)] = columns @ columns.T
             target[where] = columns @ data.residual[own]
             seen[:, where] = data.tangent[own].T @ columns.T
-    return gram - seen.T @ seen, target, slices
+    return gram - seen.T @ seen, target, [slice(*pair) for pair in pairwise(edges)]
 
 
-def _unit(channel, raw):
-    """Whiten columns, and divide by the length that they had before the lamp was taken out."""
-    weight = np.where(channel.valid, 1 / channel.sigma, 0.0)
-    norm = np.sqrt(np.sum((raw * weight) ** 2, axis=(1, 2, 3), keepdims=True))
-    return channel.whiten(raw / np.where(norm > 0, norm, 1.0))
+def _unit(channel, c, part):
+    """Whiten columns of a channel, over the length that they had with the lamp in them, (k, n)."""
+    raw = np.zeros((len(part), *channel.shape))
+    raw[:, c] = part * channel.valid
+    weight = np.where(channel.valid, 1 / channel.sigma[c], 0.0)
+    norm = np.sqrt(np.sum((raw[:, c] * weight) ** 2, axis=(1, 2)))
+    raw /= np.where(norm > 0, norm, 1.0)[:, None, None, None]
+    return channel.whiten(raw)[:, c].reshape(len(raw), -1)
 
 
 @dataclass
@@ -329,24 +324,23 @@ def frame_patterns(observations):
     What the angles taken cannot tell from an earlier pattern is left out.
     """
     found, known = {}, observations.frames.colnames
-    if "hwp" in known:
-        found |= _harmonics(observations.position("hwp"), "hwp", "half-wave-plate", _PLATE)
-    if "derotator" in known:
-        angle = observations.position("derotator")
-        found |= _harmonics(angle, "derotator", "derotator", _DEROTATOR)
-    for name in ("altitude", "parallactic"):
-        if name in known:
-            found |= _harmonics(observations.position(name), name, name, (2, 4))
-    found |= _products(found)
+    for axis, orders in _ORDERS.items():
+        if axis in known:
+            found |= _harmonics(observations.position(axis), axis, orders)
+    single = list(found.items())
+    for k in (2, 4):
+        plate = found.get(("hwp", _PLATE.format(k)))
+        for (axis, words), other in single:
+            if plate is not None and axis != "hwp" and "harmonic 1 " not in words:
+                both = (plate[:, None] * other[None]).reshape(-1, plate.shape[1])
+                found[f"hwp x {axis}", f"{_PLATE.format(k)} times {words}"] = both
     time = 2 * observations.position("sequence") - 1
     found["time", "a trend through the run"] = _legendre(time)
-    plate4 = found.get(("hwp", "harmonic 4 of the half-wave-plate angle"))
-    if plate4 is not None:
-        words = "harmonic 4 of the half-wave-plate angle with a trend through the run"
-        found["time x hwp", words] = plate4 * time
-    order = _order(observations)
-    if order is not None:
-        found["time", _ORDER] = order
+    if plate is not None:
+        found["time x hwp", f"{_PLATE.format(4)} with a trend through the run"] = plate * time
+    place, size = _within_blocks(observations)
+    if size.max() >= 3:
+        found["time", _ORDER] = _legendre(2 * place / np.maximum(size - 1, 1) - 1) * (size > 1)
     return {
         key: columns
         for key, columns in found.items()
@@ -354,30 +348,28 @@ def frame_patterns(observations):
     }
 
 
-def _harmonics(angle, axis, title, orders):
+def _harmonics(angle, axis, orders):
     """Return the harmonics of an angle that differ from one another where it was sampled."""
-    found, spans = {}, []
+    found, title = {}, "half-wave-plate" if axis == "hwp" else axis
+    spans = [np.ones((1, angle.size))]
     for k in orders:
-        waves = [np.cos(k * angle), np.sin(k * angle)] if k else [np.ones_like(angle)]
-        columns = np.array([w for w in waves if np.abs(w).max() > 1e-6])
+        columns = np.array([wave for wave in _waves(angle, k) if np.abs(wave).max() > 1e-6])
         # the simpler name was given already: at steps of 22.5 deg harmonic 12 is harmonic 4
-        if k and _within(columns, spans, angle.size):
+        left = [columns - columns @ np.linalg.pinv(other) @ other for other in spans if k]
+        if any(np.abs(one).max() < 1e-6 for one in left):
             continue
-        words = (
-            f"harmonic {k} of the {title} angle" if k else f"what is constant in the {title} angle"
-        )
-        found[axis, words] = columns
+        what = f"harmonic {k} of the" if k else "what is constant in the"
+        found[axis, f"{what} {title} angle"] = columns
         spans.append(columns)
     return found
 
 
-def _within(columns, spans, n):
-    """Whether all columns are constant or lie in the span of one of the others."""
-    for other in [np.ones((1, n)), *spans]:
-        left = columns - columns @ np.linalg.pinv(other) @ other
-        if np.abs(left).max() < 1e-6:
-            return True
-    return False
+def _waves(angle, k):
+    return [np.cos(k * angle), np.sin(k * angle)] if k else [np.ones_like(angle)]
+
+
+def _legendre(values):
+    return np.polynomial.legendre.legvander(values, 2)[:, 1:].T
 
 
 def badly_separated(observations):
@@ -388,143 +380,76 @@ def badly_separated(observations):
     of frames where the angles always come in the same one. The dataset with the better angles
     counts.
     """
-    angles = [o.position("hwp") for o in observations if "hwp" in o.frames.colnames]
-    found = {}
-    for k in _PLATE[2:] if angles else ():
-        poor = min(_condition(angle, (0, 4, k)) for angle in angles)
-        if poor > _POOR:
-            found[f"harmonic {k} of the half-wave-plate angle"] = _NOTE
-    if angles and all(map(_same_order, observations)):
+    found, mine = {}, [o for o in observations if "hwp" in o.frames.colnames]
+    angles = [o.position("hwp") for o in mine]
+    for k in _ORDERS["hwp"][2:] if mine else ():
+        waves = [np.concatenate([_waves(angle, n) for n in (0, 4, k)]) for angle in angles]
+        if min(map(np.linalg.cond, waves)) > _POOR:
+            found[_PLATE.format(k)] = _NOTE
+    if mine and all(map(_same_order, mine)):
         found[_ORDER] = _SAME_ORDER
     return found
 
 
 def _same_order(observations):
     """Whether the place of a frame in its block tells the plate angle."""
-    if "hwp" not in observations.frames.colnames:
-        return True
-    angle, place = observations.position("hwp"), _places(observations)
-    first = np.array([angle[place == p][0] for p in range(place.max() + 1)])
+    angle, place = observations.position("hwp"), _within_blocks(observations)[0]
+    first = angle[np.unique(place, return_index=True)[1]]
     # the sine, for a plate turned by half a turn is the same plate
     return bool(np.all(np.abs(np.sin(angle - first[place])) < SAME_ANGLE))
-
-
-def _condition(angle, orders):
-    columns = [part(k * angle) for k in sorted(orders) if k for part in (np.cos, np.sin)]
-    singular = np.linalg.svd(np.array([np.ones_like(angle), *columns]), compute_uv=False)
-    return singular[0] / max(singular[-1], 1e-12 * singular[0])
-
-
-def _products(found):
-    """Return the products of the harmonics of two angles."""
-    out = {}
-    for k in (2, 4):
-        one = next((v for (a, w), v in found.items() if a == "hwp" and f"ic {k} " in w), None)
-        for (axis, words), other in found.items():
-            if one is None or axis == "hwp" or "harmonic 1 " in words:
-                continue
-            both = (one[:, None] * other[None]).reshape(-1, one.shape[1])
-            title = f"harmonic {k} of the half-wave-plate angle times {words}"
-            out[f"hwp x {axis}", title] = both
-    return out
-
-
-def _legendre(values):
-    return np.polynomial.legendre.legvander(values, 2)[:, 1:].T
-
-
-def _order(observations):
-    """Return the place of each frame in its block, None if blocks are single frames."""
-    blocks = frame_blocks(observations)
-    size = np.bincount(blocks)[blocks]
-    if size.max() < 3:
-        return None
-    place = _places(observations)
-    return _legendre(2 * place / np.maximum(size - 1, 1) - 1) * (size > 1)
-
-
-def _places(observations):
-    """Return the place of each frame in its block, from 0."""
-    blocks = frame_blocks(observations)
-    return np.arange(blocks.size) - np.searchsorted(blocks, blocks)
 
 
 def frame_blocks(observations):
     """Return the number of the run of frames at one derotator angle of each frame, (F,), from 0."""
     if "derotator" not in observations.frames.colnames:
         return np.arange(observations.n_frames)
-    # the first frame begins a run but is no step
-    step = np.abs(np.diff(observations.position("derotator"), prepend=np.nan)) > SAME_ANGLE
-    step[0] = False
-    return np.cumsum(step)
+    return derotator_runs(observations)
+
+
+def _within_blocks(observations):
+    """Return the place of each frame in its block, from 0, and the size of the block, (F,) each."""
+    blocks = frame_blocks(observations)
+    place = np.arange(blocks.size) - np.searchsorted(blocks, blocks)
+    return place, np.bincount(blocks)[blocks]
+
+
+# ---- places --------------------------------------------------------------------------------
 
 
 def places(model):
     """Yield axis, label of every row, names of intervals of labels, and whether these are runs."""
-    problem = model.problem
+    problem, observations = model.problem, model.observations
+
+    def labels(values):
+        shaped = zip(values, problem.channels, strict=True)
+        return np.concatenate([np.broadcast_to(v, c.shape).ravel() for v, c in shaped])
+
     nm = np.round(1000 * problem.wavelength).astype(int)
     order = np.argsort(nm)
-    yield (
-        "wavelength",
-        _labels(problem, lambda d, s: _on(np.argsort(order)[d.bins], s, 0)),
-        nm[order],
-        "{} nm",
-    )
-    if len(problem.datasets) > 1:
-        names = [f'dataset "{o.name}"' for o in model.observations]
-        numbers = iter(range(len(names)))
-        label = _labels(problem, lambda d, s: np.full(s, next(numbers)))
-        yield "dataset", label, names, None
+    rank = np.argsort(order)
+    label = labels([rank[d.bins][:, None] for d in problem.datasets])
+    yield "wavelength", label, nm[order], "{} nm"
+    if len(observations) > 1:
+        names = [f'dataset "{o.name}"' for o in observations]
+        yield "dataset", labels(range(len(names))), names, None
     beams = ["the differences of the beams", "the sums of the beams"]
-    yield (
-        "beam",
-        _labels(problem, lambda d, s: np.arange(2)[:, None, None] + np.zeros(s, int)),
-        beams,
-        None,
-    )
-    if all("derotator" in o.frames.colnames for o in model.observations):
-        every = np.concatenate([o.position("derotator") for o in model.observations])
-        kinds = np.unique(np.round(every / SAME_ANGLE))
+    yield "beam", labels([np.arange(2)[:, None, None]] * len(observations)), beams, None
+    if all("derotator" in o.frames.colnames for o in observations):
+        turned = [np.round(o.position("derotator") / SAME_ANGLE) for o in observations]
+        kinds = np.unique(np.concatenate(turned))
         if 2 < len(kinds) <= _MOST_BLOCKS:
-            label = _labels(problem, lambda d, s: _on(_angle_number(d.observations, kinds), s, 1))
             angles = [f"{a:g}" for a in np.round(np.rad2deg(kinds * SAME_ANGLE), 1)]
+            label = labels([np.searchsorted(kinds, one) for one in turned])
             yield "derotator", label, angles, "derotator at {} deg"
-    shortest = min(o.n_frames for o in model.observations)
-    if shortest > 5 and len(model.observations) == 1:
-        edges = _time_edges(model.observations[0])
-        label = _labels(
-            problem, lambda o, s: _on(np.searchsorted(edges, np.arange(s[2]), "right") - 1, s, 1)
-        )
-        yield ("time", label, [(a, b - 1) for a, b in pairwise(edges)], "frames")
-
-
-def _labels(problem, rule):
-    return np.concatenate(
-        [
-            np.asarray(rule(d, c.shape)).ravel()
-            for d, c in zip(problem.datasets, problem.channels, strict=True)
-        ]
-    )
-
-
-def _on(values, shape, axis):
-    """Return a function of wavelength (0) or frame (1), on the shape of both channels."""
-    values = values[:, None] if axis == 0 else values[None]
-    return np.broadcast_to(values, shape)
-
-
-def _angle_number(observations, kinds):
-    rounded = np.round(observations.position("derotator") / SAME_ANGLE)
-    return np.searchsorted(kinds, rounded)
-
-
-def _time_edges(observations):
-    """Return the first frames of the blocks that are looked at together, and the end."""
-    blocks = frame_blocks(observations)
-    count, n = blocks.max() + 1, blocks.size
-    if 2 < count <= _MOST_BLOCKS:
-        return np.append(np.searchsorted(blocks, np.unique(blocks)), n)
-    return np.unique(np.linspace(0, n, min(_MOST_BLOCKS, n // 2) + 1).astype(int))
+    n = observations[0].n_frames
+    if n > 5 and len(observations) == 1:
+        blocks = frame_blocks(observations[0])
+        count = blocks[-1] + 1
+        edges = np.searchsorted(blocks, np.arange(count + 1))
+        if not 2 < count <= _MOST_BLOCKS:
+            edges = np.linspace(0, n, min(_MOST_BLOCKS, n // 2) + 1).astype(int)
+        label = labels([np.searchsorted(edges, np.arange(n), "right") - 1])
+        yield "time", label, [(a, b - 1) for a, b in pairwise(edges)], "frames"
 
 
 def most_uneven(data, axis, label, names, template):
@@ -534,10 +459,9 @@ def most_uneven(data, axis, label, names, template):
         return []
     squares = np.bincount(label, data.residual**2, minlength=count)
     freedom = np.maximum(data.freedom(label, count), 1e-9)
-    runs = template is not None
-    pairs = [(a, b) for a in range(count) for b in range(a + 1, count + 1)]
     # a run of more than half is rather the rest that is too quiet
-    pairs = [(a, b) for a, b in pairs if b - a <= max(count // 2, 1) and (runs or b - a == 1)]
+    longest = 1 if template is None else max(count // 2, 1)
+    pairs = [(a, b) for a in range(count) for b in range(a + 1, min(a + longest, count) + 1)]
     ratio = _unevenness(squares[None], freedom, pairs)[0]
     best = int(np.argmax(ratio))
     # the same draws for the same number of looks, so that a diagnosis can be repeated
@@ -557,15 +481,15 @@ def most_uneven(data, axis, label, names, template):
 
 def _unevenness(squares, freedom, pairs):
     """Return the log likelihood ratio of a larger variance inside each interval."""
-    total, start, stop = freedom.sum(), *np.array(pairs).T
-    sums = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
+    start, stop = np.array(pairs).T
     # sums over runs as differences of cumulative sums, shape (n_draws, n_pairs)
-    edges = np.concatenate([[0], np.cumsum(freedom)])
+    sums = np.pad(np.cumsum(squares, axis=1), ((0, 0), (1, 0)))
+    edges = np.pad(np.cumsum(freedom), (1, 0))
     inside, n_in = sums[:, stop] - sums[:, start], edges[stop] - edges[start]
-    outside, n_out = sums[:, -1:] - inside, total - n_in
-    tiny = 1e-300
+    whole, n, tiny = sums[:, -1:], freedom.sum(), 1e-300
+    outside, n_out = whole - inside, n - n_in
     ratio = 0.5 * (
-        total * np.log(np.maximum(sums[:, -1:], tiny) / total)
+        n * np.log(np.maximum(whole, tiny) / n)
         - n_in * np.log(np.maximum(inside, tiny) / n_in)
         - n_out * np.log(np.maximum(outside, tiny) / n_out)
     )
