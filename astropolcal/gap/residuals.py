@@ -21,7 +21,6 @@ from scipy import stats
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import false_discovery
-from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.problem import law_basis
 from astropolcal.observations.grid import SAME_ANGLE, derotator_runs
 
@@ -38,7 +37,9 @@ _MOST_TERMS = 12
 _DOUBT = 0.5
 # a pattern with a smaller share than this is not worth a sentence
 _LEAST_SHARE = 0.01
-_OF = {"difference": "differences", "sum": "sums"}
+_CHANNELS = ("differences", "sums")
+# what double sums see: all that is the same a quarter of a turn further on
+_NULL = ("beam", "what is equal at plate angles 45 deg apart (null channel)")
 # harmonics in the order of who gives a name to what the angles cannot tell apart
 _ORDERS = {
     "hwp": (0, 4, 2, 8, 1, 3, 5, 6, 7, 12),
@@ -135,57 +136,39 @@ def _terms(model):
     # what is not smooth
     rough = np.linalg.svd(smooth)[0][:, smooth.shape[1] :]
     tables = [frame_patterns(o) for o in model.observations]
-    keys = dict.fromkeys(key for table in tables for key in table)
-    notes = badly_separated(model.observations)
-    terms = []
-    for channel, name in enumerate(CHANNELS):
-        where = f"in the {_OF[name]}"
-        for axis, words in keys:
-            parts = [table.get((axis, words)) for table in tables]
+    nothing = [np.zeros((0, o.n_frames)) for o in model.observations]
+    known = {
+        key: [table.get(key, none) for table, none in zip(tables, nothing, strict=True)]
+        for key in dict.fromkeys([_NULL, *(key for table in tables for key in table)])
+    }
+    columns = _outer(known.pop(_NULL), smooth, problem)
+    null = _Term(_NULL[0], f"{_NULL[1]}, in the differences", 0, columns)
+    notes, terms = badly_separated(model.observations), []
+    for channel, name in enumerate(_CHANNELS):
+        for (axis, words), parts in known.items():
             note = f" ({notes[words]})" if words in notes else ""
             columns = _outer(parts, smooth, problem)
-            terms.append(_Term(axis, f"{words}, {where}{note}", channel, columns, bool(note)))
+            detail = f"{words}, in the {name}{note}"
+            terms.append(_Term(axis, detail, channel, columns, bool(note)))
             if rough.shape[1] and " x " not in axis and not note:
-                sharp = f"{words}, sharp in wavelength, {where}"
+                detail = f"{words}, sharp in wavelength, in the {name}"
                 columns = _outer(parts, rough, problem)
-                terms.append(_Term(f"wavelength x {axis}", sharp, channel, columns))
-    return [*terms, _flux(problem)], _null_channel(model, smooth)
+                terms.append(_Term(f"wavelength x {axis}", detail, channel, columns))
+    return [*terms, _flux(problem)], null
 
 
 def _outer(parts, law, problem):
     """Return the products of a law and patterns, arrays (k, W, F)."""
-    out = []
-    for part, channel, dataset in zip(parts, problem.channels, problem.datasets, strict=True):
-        shape = channel.shape[1:]
-        if part is None:
-            out.append(np.zeros((0, *shape)))
-            continue
-        # a dataset may have some of the wavelengths only
-        product = law[dataset.bins].T[:, None, :, None] * part[None, :, None, :]
-        out.append(product.reshape(-1, *shape))
-    return out
-
-
-def _null_channel(model, law):
-    """Return what double sums see: all that is the same a quarter of a turn further on."""
-    parts = []
-    for observations in model.observations:
-        if "hwp" not in observations.frames.colnames:
-            parts.append(None)
-            continue
-        angle = np.mod(observations.position("hwp") + 1e-9, np.pi / 4)
-        kinds = np.unique(np.round(angle, 4))[:8]
-        parts.append((np.abs(angle - kinds[:, None]) < 1e-3).astype(float))
-    detail = "what is equal at plate angles 45 deg apart (null channel), in the differences"
-    return _Term("beam", detail, 0, _outer(parts, law, model.problem))
+    # a dataset may have some of the wavelengths only
+    laws = [law[dataset.bins].T[:, None, :, None] for dataset in problem.datasets]
+    return [np.concatenate(one * part[:, None]) for one, part in zip(laws, parts, strict=True)]
 
 
 def _flux(problem):
     """Return the logarithm and the inverse of the flux, at each wavelength."""
     parts = []
     for channel, flux in zip(problem.channels, problem.fluxes, strict=True):
-        level = np.asarray(flux).sum(axis=0) if flux is not None else np.exp(channel.observed[1])
-        level = np.where(channel.valid, level, np.nan)
+        level = np.where(channel.valid, flux.sum(axis=0), np.nan)
         level = np.nan_to_num(level / np.nanmedian(level), nan=1.0).clip(1e-6)
         parts.append(np.stack([np.log(level), 1 / level - 1]))
     return _Term("flux", "the flux, in the differences", 0, parts)
@@ -226,14 +209,15 @@ def _simplest(terms, tested, best):
     """Return the simplest pattern of the plate angle that may be what a doubtful one shows."""
     if not terms[best].doubtful:
         return best
-    axes = ("hwp", terms[best].axis)
+    axes, channel = ("hwp", terms[best].axis), terms[best].channel
     most = tested[best].evidence
     enough = min(_DOUBT * most, most)
-    rivals = [
-        i for i in tested if terms[i].axis in axes and terms[i].channel == terms[best].channel
-    ]
     # in the order of their simplicity
-    return min(i for i in rivals if tested[i].evidence >= enough)
+    return min(
+        i
+        for i, one in tested.items()
+        if terms[i].axis in axes and terms[i].channel == channel and one.evidence >= enough
+    )
 
 
 def _normal_equations(data, terms):
@@ -338,13 +322,17 @@ def frame_patterns(observations):
     found["time", "a trend through the run"] = _legendre(time)
     if plate is not None:
         found["time x hwp", f"{_PLATE.format(4)} with a trend through the run"] = plate * time
+    if "hwp" in known:
+        angle = np.mod(observations.position("hwp") + 1e-9, np.pi / 4)
+        kinds = np.unique(np.round(angle, 4))[:8]
+        found[_NULL] = (np.abs(angle - kinds[:, None]) < 1e-3).astype(float)
     place, size = _within_blocks(observations)
     if size.max() >= 3:
         found["time", _ORDER] = _legendre(2 * place / np.maximum(size - 1, 1) - 1) * (size > 1)
     return {
         key: columns
         for key, columns in found.items()
-        if np.ptp(columns, axis=1).any() or key[1].startswith("what is constant")
+        if np.ptp(columns, axis=1).any() or key[1].startswith("what is")
     }
 
 
