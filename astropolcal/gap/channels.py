@@ -22,8 +22,6 @@ from astropolcal.calibration.noise.estimates import by_state, frame_noise
 
 __all__ = []
 
-#: Names of the channels, in the order of the first axis of all arrays.
-CHANNELS = ("difference", "sum")
 _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
 # a flicker below this is not told to what depends on the flux
@@ -37,18 +35,14 @@ class Channels:
 
     def __init__(self, dataset):
         obs = dataset.observations
-        right, left = obs.flux_right.T, obs.flux_left.T
+        beams = SimpleNamespace(fluxes=(obs.flux_right.T, obs.flux_left.T))
         var_right, var_left, cov = obs.variance_right.T, obs.variance_left.T, obs.covariance.T
-        total = right + left
         with np.errstate(divide="ignore", invalid="ignore"):
-            self.observed = np.stack([(right - left) / total, np.log(total)])
-            # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2,
-            # d ln(R + L) = (dR + dL) / (R + L)
-            to_right, to_left = 2 * left / total**2, -2 * right / total**2
+            self.observed = self.predicted(beams)
             self.variance = np.stack(
                 [
-                    to_right**2 * var_right + to_left**2 * var_left + 2 * cov * to_right * to_left,
-                    (var_right + var_left + 2 * cov) / total**2,
+                    right**2 * var_right + left**2 * var_left + 2 * cov * right * left
+                    for right, left in self.slopes(beams)
                 ]
             )
         #: Index of the channel that tells the gap, and how many channels have data.
@@ -64,7 +58,6 @@ class Channels:
         #: Whether the table states errors.
         self.stated = bool(np.any(np.isfinite(self.variance) & (self.variance > 0) & self.valid))
         self.sequence = obs.position("sequence")
-        self._whitening = None
 
     @property
     def shape(self):
@@ -75,7 +68,7 @@ class Channels:
 
     @staticmethod
     def predicted(sweep):
-        """Return what a forward sweep predicts of both channels, shape (2, W, F)."""
+        """Return both channels of the fluxes of a forward sweep, (2, W, F)."""
         right, left = sweep.fluxes
         total = right + left
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,6 +79,8 @@ class Channels:
         """Return the derivative of each channel to the two fluxes."""
         right, left = sweep.fluxes
         total = right + left
+        # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2,
+        # d ln(R + L) = (dR + dL) / (R + L)
         return (2 * left / total**2, -2 * right / total**2), (1 / total, 1 / total)
 
     # ---- noise and lamp -----------------------------------------------------------------
@@ -127,8 +122,7 @@ class Channels:
         out = self.whiten_frames(array)
         sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
-        flat = flat - (flat @ self.nuisance) @ self.nuisance.T
-        out[..., 1, :, :] = flat.reshape(sums.shape)
+        sums -= (flat @ self.nuisance @ self.nuisance.T).reshape(sums.shape)
         return out
 
     def whiten_frames(self, array):
@@ -172,8 +166,10 @@ class _Lamp:
         seen = (weight > 0).any(axis=0)
         self.sequence = 2 * sequence - 1
         self.degree = _best_degree(self.sequence, common, seen)
-        left, freedom = _left_over(self._curve(self.degree), saturating, common, seen)
-        scatter = left @ left / freedom if freedom > 0 else 0.0
+        columns = np.concatenate([self._curve(self.degree), saturating], axis=1)
+        square, rank = _left_over(columns[seen], common[seen])
+        freedom = int(seen.sum()) - rank
+        scatter = square / freedom if freedom > 0 else 0.0
         #: Standard deviation of the flicker, in the logarithm of the flux.
         self.flicker = float(np.sqrt(max(scatter - np.mean(var[seen]), 0.0)))
         self.color = self._best_color(centred - common, weight)
@@ -183,17 +179,15 @@ class _Lamp:
 
     def _best_color(self, residual, weight):
         """Return the degree of a drift of its own for each wavelength, 0 for none."""
-        best, degree, n = np.inf, 0, (weight > 0).sum()
-        for trial in range(_LARGEST_COLOR + 1):
-            curve = self._curve(trial)
-            rss = sum(
-                _residual_square(curve * w[:, None], r * w)
-                for r, w in zip(residual, weight, strict=True)
+        scores, n = [], (weight > 0).sum()
+        for degree in range(_LARGEST_COLOR + 1):
+            curve = self._curve(degree)
+            fits = (
+                _left_over(curve * w[:, None], r * w) for r, w in zip(residual, weight, strict=True)
             )
-            score = rss + len(weight) * (trial + 1) * np.log(max(n, 2))
-            if score < best:
-                best, degree = score, trial
-        return degree
+            freedom = len(weight) * (degree + 1)
+            scores.append(sum(square for square, _ in fits) + freedom * np.log(max(n, 2)))
+        return int(np.argmin(scores))
 
     def shrink(self, weight):
         """Return, for each frame, the direction of the flicker and how much it is shrunk."""
@@ -220,13 +214,9 @@ class _Lamp:
 
     def design(self, valid):
         """Return the columns of the lamp, shape (k, W, F)."""
-        n = len(valid)
         curve = self._curve(max(self.degree, self.color)).T
-        own = np.eye(n)[:, None, :, None] * curve[None, : self.color + 1, None, :]
-        common = np.broadcast_to(
-            curve[self.color + 1 : self.degree + 1, None],
-            (max(self.degree - self.color, 0), *valid.shape),
-        )
+        own = np.eye(len(valid))[:, None, :, None] * curve[: self.color + 1, None]
+        common = np.ones((len(valid), 1)) * curve[self.color + 1 :, None]
         return np.concatenate([own.reshape(-1, *valid.shape), common]) * valid
 
 
@@ -264,33 +254,23 @@ def _mean(values, weight, axis):
     return (values * weight**2).sum(axis=axis) / np.where(norm > 0, norm, 1.0)
 
 
-def _residual_square(columns, values):
-    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
-    left = values - columns @ solution
-    return left @ left
-
-
-def _left_over(curve, saturating, values, seen):
-    columns = np.concatenate([curve, saturating], axis=1)[seen]
-    solution, _, rank, _ = np.linalg.lstsq(columns, values[seen], rcond=1e-9)
-    left = values[seen] - columns @ solution
-    return left, int(seen.sum()) - int(rank)
+def _left_over(columns, values):
+    """Return the sum of squares that columns leave of values, and their rank."""
+    solution, _, rank, _ = np.linalg.lstsq(columns, values, rcond=1e-9)
+    return float(np.sum((values - columns @ solution) ** 2)), int(rank)
 
 
 def _best_degree(sequence, values, seen):
     """Return the degree of the drift by the Bayesian information criterion."""
-    best, degree, n = np.inf, 0, int(seen.sum())
-    nothing = np.zeros((len(sequence), 0))
-    for trial in range(_LARGEST_DEGREE + 1):
-        curve = np.polynomial.legendre.legvander(sequence, trial)
-        left, freedom = _left_over(curve, nothing, values, seen)
+    scores, n = [], int(seen.sum())
+    for degree in range(_LARGEST_DEGREE + 1):
+        curve = np.polynomial.legendre.legvander(sequence, degree)
+        square, rank = _left_over(curve[seen], values[seen])
         # a curve through all frames would leave no flicker to be seen
-        if freedom < 3:
+        if n - rank < 3:
             break
-        score = n * np.log(max(left @ left / n, 1e-24)) + (n - freedom) * np.log(n)
-        if score < best:
-            best, degree = score, trial
-    return degree
+        scores.append(n * np.log(max(square / n, 1e-24)) + rank * np.log(n))
+    return int(np.argmin(scores)) if scores else 0
 
 
 def settings(angles, n):
@@ -314,15 +294,28 @@ def settings(angles, n):
     return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
 
 
-def noise(channel, residual, angles):
-    """Return the noise of every datum, see `frame_noise`; of a single beam less its groups."""
+def noise(channel, residual, angles, without=None):
+    """
+    Return the noise of every datum, see `frame_noise`; of a single beam less its groups.
+
+    That of frames ``without``, (F,), which tell none, follows from their stated errors.
+    """
+    valid = channel.valid if without is None else channel.valid & ~without
+    seen = SimpleNamespace(variance=channel.variance, valid=valid)
     if channel.groups is None:
-        return frame_noise(channel, residual, angles)
-    lamp = _GroupLamp(channel.groups)
-    level = residual[1] - lamp.mean(residual[1], channel.valid * 1.0)
-    sums = SimpleNamespace(variance=channel.variance[1:], valid=channel.valid)
-    (sigma,) = frame_noise(sums, np.where(channel.valid, level, 0.0)[None], angles)
-    return np.stack([np.ones_like(sigma), sigma])
+        sigma = frame_noise(seen, residual, angles)
+    else:
+        lamp = _GroupLamp(channel.groups)
+        level = residual[1] - lamp.mean(residual[1], valid * 1.0)
+        seen.variance = channel.variance[1:]
+        sigma = frame_noise(seen, np.where(valid, level, 0.0)[None], angles)
+        sigma = np.stack([np.ones_like(sigma[0]), sigma[0]])
+    for own, told in zip(sigma, np.sqrt(channel.variance), strict=True):
+        stated = np.isfinite(told) & (told > 0) & channel.valid
+        if without is not None and (stated & valid).any():
+            wanted = stated & without
+            own[wanted] = told[wanted] * np.median((own / told)[stated & valid])
+    return sigma
 
 
 def expected_fluxes(channel, sweep):

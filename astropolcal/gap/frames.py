@@ -10,7 +10,6 @@ on. A gap that is in all frames is none of theirs: without the few frames that a
 must be down to the noise, or have lost nearly all of its excess.
 """
 
-import copy
 import warnings
 from dataclasses import dataclass, field
 
@@ -18,7 +17,6 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.gap._frame_looks import Frame, Group, Look, Trial, angle_stages
-from astropolcal.gap.channels import noise, settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
@@ -448,12 +446,7 @@ class Search:
         known = {key: getattr(old, key) for key in keys}
         problem = GapProblem(chains, self.model.observations, **known)
         q = problem.start if look.chance < _NOISE else look.coefficients
-        for channel, dataset, residual, without in zip(
-            problem.channels, problem.datasets, problem.differences(q), out, strict=True
-        ):
-            angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
-            sigma = _noise_of_others(channel, residual, angles, without)
-            channel.set_noise(sigma, residual, settings(angles, dataset.observations.n_frames))
+        problem.settle_noise(q, out)
         self.model, self.problem = Model(problem, self.model.fit), problem
 
     def _is_hopeless(self, look, n):
@@ -477,19 +470,6 @@ class Search:
         falls = [look.deleted(i)[0] for i in range(len(look.out))]
         left = max(np.max(fall, where=look.kept(i), initial=0.0) for i, fall in enumerate(falls))
         return all(falls[i][f] > _APART * left for i, f in places)
-
-
-def _noise_of_others(channel, residual, angles, without):
-    """Return the noise of every datum, as it is where some frames take no part."""
-    others = copy.copy(channel)
-    others.valid = channel.valid & ~without
-    sigma, stated = noise(others, residual, angles), np.sqrt(channel.variance)
-    for own, told in zip(sigma, stated, strict=True):
-        known = others.valid & np.isfinite(told) & (told > 0)
-        if known.any():
-            wanted = without & channel.valid & np.isfinite(told) & (told > 0)
-            own[wanted] = told[wanted] * np.median(own[known] / told[known])
-    return sigma
 
 
 def _marked(problem, places):

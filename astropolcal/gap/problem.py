@@ -286,15 +286,16 @@ class GapProblem:
 
     # ---- noise -----------------------------------------------------------------------
 
-    def settle_noise(self, coefficients=None):
-        """Measure noise and lamp from the residuals at some coefficients."""
+    def settle_noise(self, coefficients=None, without=None):
+        """Measure noise and lamp from residuals, those of frames ``without``, (F,) each, aside."""
         q = self.start if coefficients is None else coefficients
-        for channel, dataset, residual in zip(
-            self.channels, self.datasets, self.differences(q), strict=True
+        without = without or [None] * len(self.datasets)
+        for channel, dataset, residual, out in zip(
+            self.channels, self.datasets, self.differences(q), without, strict=True
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
-            channel.set_noise(noise(channel, residual, angles), residual, saturating)
+            channel.set_noise(noise(channel, residual, angles, out), residual, saturating)
         found = [
             expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)
