@@ -8,6 +8,7 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.chain import leaves
+from astropolcal.gap.model import NOISE
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
@@ -52,6 +53,10 @@ class Look:
         self.model, self.problem, self.chains = model, model.problem, model.chains
         self.coefficients, self.out = coefficients, out
         self.vector = self.problem.vector(coefficients)
+        numbers = range(len(out))
+        self._datasets = list(
+            zip(numbers, self.problem.channels, self.problem.segments, strict=True)
+        )
         rows = self.problem.rows([~o for o in out])
         columns = np.concatenate([self.problem.open_slopes(coefficients), self._of_flux()], axis=1)
         #: Share of each datum, (2, W, F), that goes to the brightness of the group of a single
@@ -72,17 +77,20 @@ class Look:
         )
         self.freedom = max(self.problem.n_data - lost - self.tangent.shape[1], 1)
 
+    @property
+    def excess(self):
+        """Sum of squares beyond that of noise, in units of it."""
+        return self.chi2 / self.freedom - 1
+
     @cached_property
-    def chance(self):
-        """Probability that noise gives as large a sum of squares."""
-        return float(stats.chi2.sf(self.chi2, self.freedom))
+    def is_noise(self):
+        """Whether what is left may be noise."""
+        return stats.chi2.sf(self.chi2, self.freedom) > NOISE
 
     def _less_groups(self, columns):
         """Return columns, (n_rows, k), less the brightness of groups as frames that count say."""
         columns = columns.copy()
-        for i, (channel, rows) in enumerate(
-            zip(self.problem.channels, self.problem.segments, strict=True)
-        ):
+        for i, channel, rows in self._datasets:
             if channel.groups is None:
                 continue
             # a datum of unit brightness, in standard deviations
@@ -105,9 +113,7 @@ class Look:
         A lamp that is dim in a few frames must not make a background look like their fault.
         """
         blocks = []
-        for i, (channel, rows) in enumerate(
-            zip(self.problem.channels, self.problem.segments, strict=True)
-        ):
+        for i, channel, rows in self._datasets:
             right, left = self.sweeps[i].fluxes
             difference = (right - left) / (right + left)
             level = np.where(channel.valid, np.exp(channel.observed[1]), np.nan)
@@ -133,20 +139,14 @@ class Look:
 
     @cached_property
     def _parts(self):
-        """Residual (2 W, F), tangent (2 W, F, rank) and lamp (2 W, F, n) of each dataset."""
+        """Residual (2 W, F), and tangent with lamp (2 W, F, k), of each dataset."""
         parts = []
-        for channel, rows in zip(self.problem.channels, self.problem.segments, strict=True):
+        for _, channel, rows in self._datasets:
             _, n, f = channel.shape
-            lamp = np.zeros((2, n * f, channel.n_nuisance))
-            if channel.groups is None:
-                lamp[1] = channel.nuisance
-            parts.append(
-                (
-                    self.residual[rows].reshape(2 * n, f),
-                    self.tangent[rows].reshape(2 * n, f, -1),
-                    lamp.reshape(2 * n, f, -1),
-                )
-            )
+            lamp = channel.nuisance if channel.groups is None else channel.nuisance[:, :0]
+            taken = [self.tangent[rows], np.concatenate([np.zeros_like(lamp), lamp])]
+            taken = np.concatenate(taken, axis=1).reshape(2 * n, f, -1)
+            parts.append((self.residual[rows].reshape(2 * n, f), taken))
         return parts
 
     # ---- small errors, all frames at once -----------------------------------------------------
@@ -183,20 +183,18 @@ class Look:
 
     def lowering(self, i, columns):
         """Return by how much columns (k, 2 W, F) of one frame each lower chi-square, (F,)."""
-        residual, tangent, lamp = self._parts[i]
+        residual, taken = self._parts[i]
         inner = np.einsum("haf,gaf->fhg", columns, columns)
         full = np.einsum("fhh->fh", inner).copy()
-        for taken in (tangent, lamp):
-            part = np.einsum("afk,haf->fkh", taken, columns, optimize=True)
-            inner -= np.einsum("fkh,fkg->fhg", part, part)
+        part = np.einsum("afk,haf->fkh", taken, columns, optimize=True)
+        inner -= np.einsum("fkh,fkg->fhg", part, part)
         share = self.shares[i].reshape(residual.shape)
         inner -= np.einsum("af,haf,gaf->fhg", np.minimum(share, 1.0), columns, columns)
         scale = np.sqrt(np.where(full > 0, full, 1.0))
         values, vectors = np.linalg.eigh(inner / scale[:, :, None] / scale[:, None, :])
         along = np.einsum("haf,af->fh", columns, residual) / scale
         along = np.einsum("fhg,fh->fg", vectors, along)
-        seen = values > _SEEN
-        return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1)
+        return _fall(values, along)
 
     def deleted(self, i):
         """
@@ -210,19 +208,17 @@ class Look:
         values, vectors = np.linalg.eigh(taken)
         along = np.einsum("fab,fa->fb", vectors, residual)
         share = np.where(self.out[i][:, None], 1 + values, 1 - values)
-        seen = share > _SEEN
-        fall = np.where(seen, along**2 / np.where(seen, share, 1.0), 0.0).sum(axis=1)
-        return fall, channel.valid.sum(axis=0)
+        return _fall(share, along), channel.valid.sum(axis=0)
 
     def _told(self, i):
         """Return residual (F, W) of what tells the gap, and what the model absorbs, (F, W, W)."""
-        residual, tangent, _ = self._parts[i]
+        residual, taken = self._parts[i]
         channel = self.problem.channels[i]
         n, told = channel.shape[1], channel.told
         rows = slice(told * n, (told + 1) * n)
-        tangent = tangent[rows].transpose(1, 0, 2)
+        taken = taken[rows].transpose(1, 0, 2)
         own = self.shares[i][told].T[:, :, None] * np.eye(n)
-        return residual[rows].T, tangent @ tangent.swapaxes(1, 2) + own
+        return residual[rows].T, taken @ taken.swapaxes(1, 2) + own
 
     def kept(self, i):
         """Return which frames of a dataset take part and have data, (F,) of bool."""
@@ -252,13 +248,20 @@ class Look:
 
         The latter two are (W, W).
         """
-        residual, _, lamp = self._parts[i]
+        residual, taken = self._parts[i]
         channel = self.problem.channels[i]
         n = channel.shape[1]
-        left = np.eye(n) - lamp[n:, f] @ lamp[n:, f].T
+        lamp = taken[n:, f, self.tangent.shape[1] :]
+        left = np.eye(n) - lamp @ lamp.T
         single = np.zeros((n, 2, n, channel.shape[2]))
         single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
         return residual[n:, f], left, channel.whiten_frames(single)[:, 1, :, f].T
+
+
+def _fall(values, along):
+    """Return the sums over directions that are seen, of eigenvalues and residuals (F, k) along."""
+    seen = values > _SEEN
+    return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1)
 
 
 def _basis(columns, rows):

@@ -11,13 +11,13 @@ must be down to the noise, or have lost nearly all of its excess.
 """
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
 
 from astropolcal.gap._frame_looks import Frame, Group, Look, Trial, angle_stages
-from astropolcal.gap.model import Model, nominal_calibration
+from astropolcal.gap.model import NOISE, Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
 
@@ -37,9 +37,9 @@ _FAR, _LARGEST_DRIFT = 6.0, 4
 # chance of a false accusation in a run, and the share of the frames that may be accused
 _ALPHA = 1e-3
 _MOST, _LEAST_MOST = 0.05, 2
-# a fit is down to the noise at this chance; else so much of the excess has to be gone, and the
-# accused have to stand so far above the others
-_NOISE, _GONE, _APART = 1e-3, 0.8, 10.0
+# where a fit is not down to the noise so much of the excess has to be gone, and the accused have to
+# stand so far above the others
+_GONE, _APART = 0.8, 10.0
 # one angle of a group explains its frames if so little is left of them
 _LEFT = 0.01
 # of very many frames several are taken at once, those nearly as bad as the worst
@@ -73,8 +73,9 @@ class FrameFault:
     #: That it is this, and neither noise nor another of these faults.
     probability: float = 0.0
     words: str = ""
-    #: Index of the dataset and of the frame.
+    #: Index of the dataset and of the frame, and of that with which it was exchanged.
     place: tuple = field(default=(0, 0), repr=False)
+    partner_place: tuple | None = field(default=None, repr=False)
 
     def to_dict(self):
         """Return the fault as JSON holds it (dict)."""
@@ -94,7 +95,7 @@ def suspect_frames(model):
     """
     search = Search(model)
     accused, last = search.accused()
-    found = _Hearing(search).faults(accused, last) if accused else []
+    found = _faults(last, accused, search.n_frames) if accused else []
     if not search.is_settled([fault.place for fault in found], last):
         # where the fit does not find back from where they had bent it, others look bad, too
         found = [fault for fault in found if fault.place in search.worst]
@@ -118,132 +119,152 @@ def without_frames(observations, faults):
 # ---- hearing ---------------------------------------------------------------------------------
 
 
-class _Hearing:
-    """What each frame that was accused is accused of."""
-
-    def __init__(self, search):
-        self.model, self.problem, self.n_frames = search.model, search.problem, search.n_frames
-
-    def faults(self, accused, last):
-        """Return what each of the accused frames is accused of, those that are guilty."""
-        scatter = [usual(*last.deleted(i), last.kept(i)) for i in range(len(last.out))]
-        frames = {(i, f): Frame(last, i, f, scatter[i]) for i, f in accused}
-        trials = {place: [one.as_told(), *one.trials()] for place, one in frames.items()}
-        exchanged = {place: _exchanges(place, frames, trials) for place in accused}
-        found = []
-        for place in accused:
-            fault = self._verdict(place, trials[place], exchanged[place])
-            if fault is not None:
-                found.append(fault)
-        found = self._of_groups(self._with_partners(found), last, scatter)
-        return sorted(found, key=lambda fault: -fault.evidence)
-
-    def _verdict(self, place, trials, exchanged):
-        """Weigh the trials of a frame against each other (Bayes), or return None: no fault."""
-        i, _ = place
-        kinds = len(angle_stages(self.model.chains[i])) + 2
-        none, *rest = [*trials, *exchanged]
-        prior = 1 / (_RARE * self.n_frames * kinds)
-        log = [-none.total / 2]
-        for trial in rest:
-            share = prior * (_UNEXPLAINED if trial.what == "unknown" else 1.0)
-            log.append(np.log(share) - trial.total / 2)
-        weight = np.exp(np.array(log) - max(log))
-        weight /= weight.sum()
-        by_kind = {}
-        for trial, w in zip(rest, weight[1:], strict=True):
-            by_kind[trial.what] = by_kind.get(trial.what, 0.0) + float(w)
-        if weight[0] > 1 - _CERTAIN:
-            return None
-        what = max(by_kind, key=by_kind.get)
-        best = min((t for t in rest if t.what == what), key=lambda trial: trial.total)
-        evidence = none.total - best.total + 2 * np.log(prior)
-        sides = [w for t, w in zip(rest, weight[1:], strict=True) if t.beam == best.beam]
-        best.beam = best.beam if sum(sides) > _TELLS * by_kind[what] else ""
-        fault = self._fault(place, best, float(evidence), min(by_kind[what], 1.0))
-        rivals = {t.what: t for t in sorted(rest, key=lambda t: -t.total) if t.what in by_kind}
-        rivals = {kind: t for kind, t in rivals.items() if by_kind[kind] > 1 - _TELLS}
-        rivals = rivals if by_kind[what] < _DECIDED else {}
-        return self._of_design(fault, rivals, 1 - weight[0])
-
-    def _of_groups(self, found, last, scatter):
-        """Return the faults; of several in a group of a single beam, a stage of all its frames."""
-        several = {}
-        for fault in found:
-            i, f = fault.place
-            groups = self.problem.channels[i].groups
-            if groups is not None:
-                several.setdefault((i, int(groups[f])), []).append(fault)
-        for (i, _), faults in several.items():
-            group = Group(last, i, faults[0].place[1], scatter[i])
-            trials = group.trials() if len(faults) > 1 else []
-            if not trials:
-                continue
-            chi2, before = trials[0].chi2, group.as_told().chi2
-            # one angle explains all of them, down to the noise or to what the fit is uncertain by
-            if stats.chi2.sf(chi2, max(group.freedom, 1)) < _NOISE and chi2 > _LEFT * before:
-                continue
-            near = trials[0].total - 2 * np.log(1 - _TELLS)
-            rivals = {t.what: t for t in reversed(trials) if t.total < near}
-            worst = max(faults, key=lambda fault: fault.evidence)
-            found = [fault for fault in found if fault not in faults]
-            for f in group.frames:
-                fault = self._fault((i, int(f)), trials[0], worst.evidence, worst.probability)
-                found.append(self._of_design(fault, rivals, worst.probability))
-        return found
-
-    def _of_design(self, fault, rivals, probability):
-        """Return a fault with what the design of its observation cannot tell."""
-        i, f = fault.place
-        channel = self.problem.channels[i]
-        if len(rivals) > 1:
-            kinds = [self._fault(fault.place, t, 0.0, 0.0) for t in rivals.values()]
-            each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
-            fault.what, fault.value, fault.error, fault.with_ = "unknown", None, None, None
-            fault.partner_place, fault.probability = None, float(probability)
-            fault.words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
-        if channel.groups is None:
-            return fault
-        mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
-        if mates.sum() == 2:
-            numbers = self.problem.datasets[i].observations.frames["frame"]
-            one, other = (int(numbers[k]) for k in np.flatnonzero(mates))
-            fault.words += f"; or it is the other of the group: frames {one} and {other} alone"
-            fault.words += " cannot tell which of them is wrong"
-        return fault
-
-    def _fault(self, place, trial, evidence, probability):
-        i, f = place
-        observations = self.problem.datasets[i].observations
-        numbers = [int(n) for n in observations.frames["frame"]]
-        partner = None if trial.partner is None else numbers[trial.partner]
-        value, error, told = _as_told(trial, observations, f, self.problem.datasets[i])
-        fault = FrameFault(
-            observations.name,
-            numbers[f],
-            trial.what,
-            partner,
-            value,
-            error,
-            evidence,
-            probability,
-            place=place,
-        )
-        fault.words = _words(fault, told, trial.beam)
-        fault.partner_place = None if trial.partner is None else (i, trial.partner)
-        return fault
-
-    def _with_partners(self, found):
-        """Return the faults, with those frames that were exchanged with one of them."""
-        places = {fault.place: fault for fault in found}
-        for fault in found:
-            other = fault.partner_place
-            known = places.get(other)
-            if other is None or (known is not None and known.what == "exchanged"):
-                continue
+def _faults(look, accused, n_frames):
+    """Return what each of the accused frames is accused of, those that are guilty."""
+    scatter = [usual(*look.deleted(i), look.kept(i)) for i in range(len(look.out))]
+    frames = {(i, f): Frame(look, i, f, scatter[i]) for i, f in accused}
+    trials = {place: [one.as_told(), *one.trials()] for place, one in frames.items()}
+    found = {}
+    for place in accused:
+        every = [*trials[place], *_exchanges(place, frames, trials)]
+        fault = _verdict(look, place, every, n_frames)
+        if fault is not None:
+            found[place] = fault
+    for fault in list(found.values()):
+        # those frames, too, that were exchanged with one of them
+        other = fault.partner_place
+        if other is not None and (other not in found or found[other].what != "exchanged"):
             trial = Trial("exchanged", 0.0, 0.0, partner=fault.place[1])
-            places[other] = self._fault(other, trial, fault.evidence, fault.probability)
-        return list(places.values())
+            found[other] = _fault(look.problem, other, trial, fault.evidence, fault.probability)
+    found = _of_groups(look, list(found.values()), scatter)
+    return sorted(found, key=lambda fault: -fault.evidence)
+
+
+def _verdict(look, place, trials, n_frames):
+    """Weigh the trials of a frame against each other (Bayes), or return None: no fault."""
+    kinds = len(angle_stages(look.chains[place[0]])) + 2
+    none, *rest = trials
+    prior = 1 / (_RARE * n_frames * kinds)
+    shares = [prior * (_UNEXPLAINED if trial.what == "unknown" else 1.0) for trial in rest]
+    log = np.log([1.0, *shares]) - np.array([trial.total for trial in trials]) / 2
+    weight = np.exp(log - max(log))
+    weight /= weight.sum()
+    if weight[0] > 1 - _CERTAIN:
+        return None
+    by_kind = {}
+    for trial, w in zip(rest, weight[1:], strict=True):
+        by_kind[trial.what] = by_kind.get(trial.what, 0.0) + float(w)
+    what = max(by_kind, key=by_kind.get)
+    best = min((t for t in rest if t.what == what), key=lambda trial: trial.total)
+    evidence = none.total - best.total + 2 * np.log(prior)
+    sides = [w for t, w in zip(rest, weight[1:], strict=True) if t.beam == best.beam]
+    best.beam = best.beam if sum(sides) > _TELLS * by_kind[what] else ""
+    rivals = {}
+    if by_kind[what] < _DECIDED:
+        worst_first = sorted(rest, key=lambda trial: -trial.total)
+        rivals = {t.what: t for t in worst_first if by_kind[t.what] > 1 - _TELLS}
+    fault = _fault(look.problem, place, best, float(evidence), min(by_kind[what], 1.0))
+    return _of_design(look.problem, fault, rivals, 1 - weight[0])
+
+
+def _of_groups(look, found, scatter):
+    """Return the faults; of several in a group of a single beam, a stage of all its frames."""
+    several = {}
+    for fault in found:
+        i, f = fault.place
+        groups = look.problem.channels[i].groups
+        if groups is not None:
+            several.setdefault((i, int(groups[f])), []).append(fault)
+    for (i, _), faults in several.items():
+        group = Group(look, i, faults[0].place[1], scatter[i])
+        trials = group.trials() if len(faults) > 1 else []
+        if not trials:
+            continue
+        chi2, before = trials[0].chi2, group.as_told().chi2
+        # one angle explains all of them, down to the noise or to what the fit is uncertain by
+        if stats.chi2.sf(chi2, max(group.freedom, 1)) < NOISE and chi2 > _LEFT * before:
+            continue
+        near = trials[0].total - 2 * np.log(1 - _TELLS)
+        rivals = {t.what: t for t in reversed(trials) if t.total < near}
+        worst = max(faults, key=lambda fault: fault.evidence)
+        found = [fault for fault in found if fault not in faults]
+        for f in group.frames:
+            fault = _fault(look.problem, (i, int(f)), trials[0], worst.evidence, worst.probability)
+            found.append(_of_design(look.problem, fault, rivals, worst.probability))
+    return found
+
+
+def _of_design(problem, fault, rivals, probability):
+    """Return a fault with what the design of its observation cannot tell."""
+    i, f = fault.place
+    channel = problem.channels[i]
+    if len(rivals) > 1:
+        kinds = [_fault(problem, fault.place, trial, 0.0, 0.0) for trial in rivals.values()]
+        each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
+        words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
+        unknown = {"what": "unknown", "value": None, "error": None, "with_": None}
+        fault = replace(fault, **unknown, probability=float(probability), words=words)
+        fault.partner_place = None
+    if channel.groups is None:
+        return fault
+    mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
+    if mates.sum() == 2:
+        numbers = problem.datasets[i].observations.frames["frame"]
+        one, other = (int(numbers[k]) for k in np.flatnonzero(mates))
+        fault.words += f"; or it is the other of the group: frames {one} and {other} alone"
+        fault.words += " cannot tell which of them is wrong"
+    return fault
+
+
+def _fault(problem, place, trial, evidence, probability):
+    """Return the fault that a trial of a frame is, in the units of the user."""
+    (i, f), told = place, None
+    dataset = problem.datasets[i]
+    observations = dataset.observations
+    value, error = trial.value, trial.error
+    if trial.what.endswith(" angle"):
+        stage = trial.what.removesuffix(" angle")
+        stood = told = float(np.atleast_1d(dataset._given[stage])[f])
+        # where a law turns what the table says into the angle of the optic, its error is added
+        if stage in observations.frames.colnames:
+            told = float(observations.position(stage)[f])
+        value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
+    numbers = [int(number) for number in observations.frames["frame"]]
+    swapped = trial.partner is not None
+    fault = FrameFault(
+        observations.name,
+        numbers[f],
+        trial.what,
+        with_=numbers[trial.partner] if swapped else None,
+        value=value if np.isfinite(value) else None,
+        error=error if np.isfinite(value) else None,
+        evidence=evidence,
+        probability=probability,
+        place=place,
+        partner_place=(i, trial.partner) if swapped else None,
+    )
+    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam)}"
+    return fault
+
+
+def _words(fault, told, beam):
+    """Return what is wrong with a frame, of which the table told an angle, degree."""
+    if not fault.what.endswith(" angle"):
+        off = None if fault.value is None else f"{100 * abs(fault.value - 1):.2g} %"
+        return {
+            "exchanged": f"its data are those of frame {fault.with_}, and the other way round",
+            "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
+            "brightness": f"its brightness is off that of its group by {off}",
+            "lamp": f"the lamp is off its drift by {off}",
+            "unknown": "its differences fit no angle of a stage and no factor of a beam",
+        }[fault.what]
+    stage = fault.what.removesuffix(" angle")
+    name = _STAGES.get(stage, f"the stage {stage}")
+    # as many digits as tell the two angles apart, and no more than the error is worth
+    finest = max(fault.error, abs(fault.value - told) / 30)
+    digits = int(np.clip(np.ceil(1 - np.log10(finest)), 1, 4))
+    stood, told = (f"{angle:.{digits}f} deg" for angle in (fault.value, told))
+    return f"{name} stood at {stood}, not at {told} as the table says"
 
 
 def _exchanges(place, frames, trials):
@@ -271,75 +292,23 @@ def _exchanges(place, frames, trials):
     return found
 
 
-# ---- words and the lamp ------------------------------------------------------------------------
-
-
-def _as_told(trial, observations, f, dataset):
-    """Return value and error of a trial in the units of the user, and what the table says."""
-    if not np.isfinite(trial.value):
-        return None, None, None
-    if trial.what in ("one beam", "brightness"):
-        return trial.value, trial.error, None
-    stage = trial.what.removesuffix(" angle")
-    stood = float(np.atleast_1d(dataset._given[stage])[f])
-    # where a law turns what the table says into the angle of the optic, its error is added
-    told = stood
-    if stage in observations.frames.colnames:
-        told = float(observations.position(stage)[f])
-    return tuple(float(np.rad2deg(x)) for x in (told + trial.value - stood, trial.error, told))
-
-
-def _words(fault, told, beam=""):
-    head = f"frame {fault.frame}: "
-    if fault.what == "exchanged":
-        return f"{head}its data are those of frame {fault.with_}, and the other way round"
-    if fault.what == "one beam":
-        which = f"the {beam} beam" if beam else "one beam"
-        return f"{head}{which} is off by {100 * abs(fault.value - 1):.2g} %"
-    if fault.what == "brightness":
-        return (
-            f"{head}its brightness is off that of its group by {100 * abs(fault.value - 1):.2g} %"
-        )
-    if fault.what == "lamp":
-        return f"{head}the lamp is off its drift by {100 * abs(fault.value - 1):.2g} %"
-    if fault.what == "unknown":
-        return f"{head}its differences fit no angle of a stage and no factor of a beam"
-    stage = fault.what.removesuffix(" angle")
-    name = _STAGES.get(stage, f"the stage {stage}")
-    # as many digits as tell the two angles apart, and no more than the error is worth
-    digits = int(
-        np.clip(np.ceil(1 - np.log10(max(fault.error, abs(fault.value - told) / 30))), 1, 4)
-    )
-    return (
-        f"{head}{name} stood at {fault.value:.{digits}f} deg, not at {told:.{digits}f} deg as "
-        "the table says"
-    )
+# ---- the lamp --------------------------------------------------------------------------------
 
 
 def _lamp(model):
     """Return the frames of which the brightness is off the drift of the lamp."""
     found = []
     problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
-    for i, channel in enumerate(problem.channels):
+    for i, (channel, gap) in enumerate(zip(problem.channels, gaps, strict=True)):
         if channel.groups is not None:
             # its frames have no other brightness than that of their group
             continue
-        observations = problem.datasets[i].observations
-        deviation, score = _off_the_drift(channel, gaps[i][1])
-        far = np.flatnonzero(np.abs(np.nan_to_num(score)) > _FAR)
-        for f in far:
-            fault = FrameFault(
-                observations.name,
-                int(observations.frames["frame"][f]),
-                "lamp",
-                value=float(np.exp(deviation[f])),
-                error=float(abs(deviation[f] / score[f])),
-                evidence=float(score[f] ** 2),
-                probability=float(1 - 2 * score.size * stats.norm.sf(abs(score[f]))),
-                place=(i, int(f)),
-            )
-            fault.words = _words(fault, None)
-            found.append(fault)
+        deviation, score = _off_the_drift(channel, gap[1])
+        for f in np.flatnonzero(np.abs(np.nan_to_num(score)) > _FAR):
+            size, off = float(np.exp(deviation[f])), float(abs(score[f]))
+            trial = Trial("lamp", 0.0, 0.0, size, float(abs(deviation[f]) / off))
+            chance = float(1 - 2 * score.size * stats.norm.sf(off))
+            found.append(_fault(problem, (i, int(f)), trial, off**2, chance))
     return sorted(found, key=lambda fault: -fault.evidence)
 
 
@@ -380,8 +349,7 @@ class Search:
         self.model, self.problem = model, model.problem
         self.n_frames = int(sum(c.valid.any(axis=0).sum() for c in self.problem.channels))
         self.most = max(_LEAST_MOST, int(_MOST * self.n_frames))
-        nobody = _marked(self.problem, [])
-        self.first = Look(model, model.fit.coefficients, nobody)
+        self.first = Look(model, model.fit.coefficients, _marked(self.problem, []))
         #: The frames that bent the fit most.
         self.worst = set()
 
@@ -394,7 +362,8 @@ class Search:
         trail = self._trail([], self.first)
         # the first few, without which nearly all is gone: in a fit that they have bent, more
         # frames look bad than are
-        few = (one for one in trail if one[0] and self._is_nearly_gone(one[1]))
+        least = _NEARLY_GONE * self.first.excess
+        few = (one for one in trail if one[0] and (one[1].is_noise or one[1].excess < least))
         places, look = next(few, ([], self.first))
         if not places:
             return [], self.first
@@ -413,22 +382,22 @@ class Search:
             suspects = _worst(look, self.n_frames)[: max(1, self.most // _AT_ONCE)]
             if not suspects:
                 return
-            if len(places) >= 2 * self.most or self._is_hopeless(look, len(places)):
+            # so little went with those that no few will do
+            excess = [one.chi2 - one.freedom for one in (self.first, look)]
+            gone = 1 - excess[1] / excess[0] if excess[0] > 0 else 1.0
+            hopeless = len(places) > 2 and gone < 0.5 * len(places) / self.most
+            if len(places) >= 2 * self.most or (hopeless and not look.is_noise):
                 yield [], look
                 return
             places = places + suspects
             look = self._look(places, look.coefficients)
-
-    def _is_nearly_gone(self, look):
-        excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
-        return look.chance > _NOISE or excess[1] < _NEARLY_GONE * excess[0]
 
     def _look(self, places, coefficients):
         out = _marked(self.problem, places)
         rows = self.problem.rows([~o for o in out])
         fit = self.problem.fit(coefficients, rows=rows, steps=_STEPS, share=_SHARE)
         look = Look(self.model, fit.coefficients, out)
-        if look.chance > _NOISE:
+        if look.is_noise:
             return look
         # from where bad frames had bent it a fit need not find back
         other = self.problem.fit(self.problem.start, rows=rows, steps=_STEPS, share=_SHARE)
@@ -436,24 +405,15 @@ class Search:
 
     def _start_again(self, places, look):
         """Measure the noise without some frames, and find a start for the fit that has them not."""
-        old, out = self.problem, _marked(self.problem, places)
-        chains = self.model.chains
-        if look.chance < _NOISE and not self.model.added:
+        old, chains, out = self.problem, self.model.chains, _marked(self.problem, places)
+        if not look.is_noise and not self.model.added:
             seen = zip(self.model.observations, out, strict=True)
-            left = [o.with_mask(mask, "accused") if mask.any() else o for o, mask in seen]
+            left = [o.with_mask(mask, "accused") for o, mask in seen]
             chains = nominal_calibration(chains, left).chains
-        keys = ("ties", "laws", "priors", "neutral", "limits")
-        known = {key: getattr(old, key) for key in keys}
+        known = {key: getattr(old, key) for key in ("ties", "laws", "priors", "neutral", "limits")}
         problem = GapProblem(chains, self.model.observations, **known)
-        q = problem.start if look.chance < _NOISE else look.coefficients
-        problem.settle_noise(q, out)
+        problem.settle_noise(look.coefficients if look.is_noise else problem.start, out)
         self.model, self.problem = Model(problem, self.model.fit), problem
-
-    def _is_hopeless(self, look, n):
-        """Return whether so little went with the frames left out that no few of them will do."""
-        excess = [one.chi2 - one.freedom for one in (self.first, look)]
-        gone = 1 - excess[1] / excess[0] if excess[0] > 0 else 1.0
-        return look.chance < _NOISE and n > 2 and gone < 0.5 * n / self.most
 
     def is_settled(self, places, look):
         """Return whether what was wrong is removed without some frames."""
@@ -462,10 +422,9 @@ class Search:
         marked = {(i, int(f)) for i, out in enumerate(look.out) for f in np.flatnonzero(out)}
         if marked != set(places):
             look = self._look(places, look.coefficients)
-        if look.chance > _NOISE:
+        if look.is_noise:
             return True
-        excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
-        if excess[1] > (1 - _GONE) * excess[0]:
+        if look.excess > (1 - _GONE) * self.first.excess:
             return False
         falls = [look.deleted(i)[0] for i in range(len(look.out))]
         left = max(np.max(fall, where=look.kept(i), initial=0.0) for i, fall in enumerate(falls))
@@ -491,18 +450,17 @@ def _worst(look, n_frames):
             if kind.endswith("beam"):
                 tests.append((look.lowering(i, columns), np.full(len(keep), len(columns))))
         looks = max(looks, len(tests))
-        scores.append(np.max([_surprise(*test, keep) for test in tests], axis=0))
+        chances = []
+        for fall, freedom in tests:
+            fall = np.where(keep, fall, 0.0) / usual(fall, freedom, keep)
+            # far out the chance is no number any more
+            log = stats.chi2.logsf(fall, np.maximum(freedom, 1))
+            chances.append(np.minimum(-log, fall / 2))
+        scores.append(np.max(chances, axis=0))
     places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
     every = np.concatenate(scores)
     least = max(np.log(n_frames * looks / _ALPHA), _NEARLY * every.max())
     return [places[k] for k in np.argsort(-every, kind="stable") if every[k] > least]
-
-
-def _surprise(fall, freedom, keep):
-    """Return minus the logarithm of the chance of every frame's fall among the others, (F,)."""
-    fall = np.where(keep, fall, 0.0) / usual(fall, freedom, keep)
-    # far out the chance is no number any more
-    return np.minimum(-stats.chi2.logsf(fall, np.maximum(freedom, 1)), fall / 2)
 
 
 def usual(fall, freedom, keep):
