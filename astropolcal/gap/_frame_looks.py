@@ -117,15 +117,14 @@ class Look:
             right, left = self.sweeps[i].fluxes
             difference = (right - left) / (right + left)
             level = np.where(channel.valid, np.exp(channel.observed[1]), np.nan)
-            bright = level / np.nanmedian(level) if channel.valid.any() else np.ones(level.shape)
+            # of a dataset without data the median would warn
+            bright = level / np.nanmedian(level) if channel.valid.any() else level
             bright = np.where(channel.valid, bright, 1.0)
             shapes = (1 / bright, difference / bright, bright * difference * (1 - difference**2))
             shapes = shapes if channel.groups is None else (1 / bright, bright)
             law = self.law(i).T[:, :, None]
             table = np.zeros((len(shapes) * len(law), *channel.shape))
-            table[:, channel.told] = np.concatenate(
-                [law * shape * channel.valid for shape in shapes]
-            )
+            table[:, channel.told] = np.concatenate([law * one * channel.valid for one in shapes])
             block = np.zeros((self.problem.n_rows, len(table)))
             block[rows] = channel.whiten_frames(table).reshape(len(table), -1).T
             blocks.append(block)
@@ -165,14 +164,12 @@ class Look:
         """
         channel, sweep = self.problem.channels[i], self.sweeps[i]
         stages, weights = angle_stages(self.chains[i]), channel.slopes(sweep)
-        wanted = [(optic, 0) for optics in stages.values() for optic, _ in optics]
+        wanted = [(optic, 0) for turned in stages.values() for optic, _ in turned]
         slopes = [sweep.derivatives(wanted, weight) for weight in weights]
-        found = {
-            f"{stage} angle": np.stack(
-                [sum(sign * slope[optic, 0] for optic, sign in optics) for slope in slopes]
-            )[None]
-            for stage, optics in stages.items()
-        }
+        found = {}
+        for stage, turned in stages.items():
+            both = [sum(sign * slope[optic, 0] for optic, sign in turned) for slope in slopes]
+            found[f"{stage} angle"] = np.array([both])
         law = self.law(i).T[:, None, :, None]
         for beam, name in enumerate(("right beam", "left beam")[: channel.count]):
             found[name] = law * np.stack([weight[beam] * sweep.fluxes[beam] for weight in weights])
@@ -288,9 +285,8 @@ class Trial:
     chi2: float
     #: Minus twice the logarithm of the share of its prior that the data leave.
     cost: float
-    #: Angle in radian, or factor of the beam; NaN where there is none.
+    #: Angle in radian, or factor of the beam, and its error; NaN where there is none.
     value: float = np.nan
-    #: Angle in radian, or factor of the beam; NaN where there is none.
     error: float = np.nan
     #: Index of the other frame of an exchange.
     partner: int | None = None
@@ -320,27 +316,22 @@ class Frame:
         self._offset = np.where(self.valid, missed - (self.observed - plain), 0.0)
         self._plain, self._root = plain, _root(self._sight)
         missed, left, whiten = look.sums_of_frame(i, f)
-        root = _root(left) / np.sqrt(scatter)
-        self._sums = (
-            np.linalg.pinv(_root(left), rcond=_TINY) @ missed / np.sqrt(scatter),
-            whiten,
-            root,
-        )
+        root, narrow = _root(left), 1 / np.sqrt(scatter)
+        self._sums = narrow * np.linalg.pinv(root, rcond=_TINY) @ missed, narrow * root @ whiten
 
     # ---- predictions ------------------------------------------------------------------------
 
     def _positions(self, frames):
         """Return the positions of all stages in some frames."""
-        given = self.dataset._given
-        return {stage: np.atleast_1d(p)[..., frames] for stage, p in given.items()}
+        given = self.dataset._given.items()
+        return {stage: np.atleast_1d(position)[..., frames] for stage, position in given}
 
     def predicted(self, positions):
         """Return the differences, or log fluxes of a single beam, at some positions, (W, n)."""
-        chain = self.look.chains[self.i]
-        wavelength = self.dataset.propagator.wavelength
-        right, left = Propagator(chain, wavelength, positions).fluxes(
-            self.dataset.current_values(self.look.vector)
+        propagator = Propagator(
+            self.look.chains[self.i], self.dataset.propagator.wavelength, positions
         )
+        right, left = propagator.fluxes(self.dataset.current_values(self.look.vector))
         if self.single:
             return np.log(np.maximum(right, _TINY))
         return (right - left) / (right + left)
@@ -374,15 +365,13 @@ class Frame:
         lowest = lowest[np.argsort(chi2[lowest], kind="stable")][:_MINIMA]
         found = [self._refined(stage, grid[k]) for k in lowest]
         least = min(value for _, value in found)
-        offset, chi2 = min(
-            (one for one in found if one[1] < least + _ALIKE), key=lambda one: abs(one[0])
-        )
+        near = [one for one in found if one[1] < least + _ALIKE]
+        offset, chi2 = min(near, key=lambda one: abs(one[0]))
         h = np.deg2rad(0.02)
         low, middle, high = self._turned(stage, offset + np.array([-h, 0.0, h]))
         curvature = (low - 2 * middle + high) / h**2 / 2
         error = 1 / np.sqrt(max(curvature, 1.0))
-        cost = _occam(offset, error, _ANGLES)
-        return Trial(f"{stage} angle", chi2, cost, told + offset, error)
+        return Trial(f"{stage} angle", chi2, _occam(offset, error, _ANGLES), told + offset, error)
 
     def _turned(self, stage, offsets):
         positions = self._positions(np.full(len(offsets), self.f))
@@ -412,18 +401,16 @@ class Frame:
             inner = slopes.T @ slopes
             step = np.linalg.lstsq(inner, slopes.T @ left, rcond=1e-12)[0]
             size = size + np.clip(step, -1.0, 1.0)
-        before, after = (self._of_beam(law, x, side)[0] for x in (0 * size, size))
-        chi2 = self.as_told().chi2 - float(before @ before - after @ after)
+        before, after = (np.sum(self._of_beam(law, x, side)[0] ** 2) for x in (0 * size, size))
+        chi2 = self.as_told().chi2 - float(before - after)
         errors = np.sqrt(np.diag(np.linalg.pinv(inner, hermitian=True)))
         # the law is about its mean: other coefficients are of its size or below
         biggest = max(np.abs(size).max(), errors[0])
         cost = _occam(size[0], errors[0], _FACTORS)
         cost += sum(_share(error, 2 * biggest) for error in errors[1:])
         mean = float(np.exp(np.mean((law @ size)[self.valid])))
-        error = float(errors[0] * mean)
-        if self.single:
-            return Trial("brightness", chi2, cost, mean, error)
-        return Trial("one beam", chi2, cost, mean, error, beam=_BEAMS[side])
+        what, beam = ("brightness", "") if self.single else ("one beam", _BEAMS[side])
+        return Trial(what, chi2, cost, mean, float(errors[0] * mean), beam=beam)
 
     def _of_beam(self, law, size, side):
         """Return what a law leaves of differences and sums, and its derivatives; unit noise."""
@@ -431,20 +418,17 @@ class Frame:
         if self.single:
             left = (self.observed - self._plain - factor + self._offset) * self.weight
             return self._root @ left, self._root @ (law * self.weight[:, None])
-        shifted = _shifted(self._plain, side * factor)
+        # normalized differences where the ratio of the beams is changed
+        grown = np.tanh(side * factor / 2)
+        shifted = (self._plain + grown) / (1 + self._plain * grown)
         left = (self.observed - shifted + self._offset) * self.weight
         slopes = side * law * ((1 - shifted**2) / 2 * self.weight)[:, None]
         share = (1 + side * self._plain) / 2
         brighter = np.log1p(share * np.expm1(factor))
-        missed, whiten, root = self._sums
-        brighter, slope = (
-            root @ whiten @ x
-            for x in (brighter, law * (share * np.exp(factor - brighter))[:, None])
-        )
-        return (
-            np.concatenate([self._root @ left, missed - brighter]),
-            np.concatenate([self._root @ slopes, slope]),
-        )
+        slope = law * (share * np.exp(factor - brighter))[:, None]
+        missed, whiten = self._sums
+        left = np.concatenate([self._root @ left, missed - whiten @ brighter])
+        return left, np.concatenate([self._root @ slopes, whiten @ slope])
 
     def anything(self):
         """Return the trial in which every wavelength of the frame is off by its own amount."""
@@ -462,12 +446,11 @@ class Group(Frame):
     def __init__(self, look, i, f, scatter=1.0):
         self.look, self.i, self.f = look, i, f
         self.dataset, self.channel = look.problem.datasets[i], look.problem.channels[i]
-        channel = self.channel
-        mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
-        self.frames, self.single = np.flatnonzero(mates), True
-        valid, sigma = (a[:, self.frames] for a in (channel.valid, channel.sigma[channel.told]))
+        valid, groups, told = self.channel.valid, self.channel.groups, self.channel.told
+        self.frames, self.single = np.flatnonzero(valid.any(axis=0) & (groups == groups[f])), True
+        sigma, observed = self.channel.sigma[told], self.channel.observed[told]
+        valid, sigma, self.observed = (a[:, self.frames] for a in (valid, sigma, observed))
         self._weight = np.where(valid, 1 / np.square(sigma), 0.0)[:, None] / scatter
-        self.observed = channel.observed[channel.told][:, self.frames]
         #: Data less the brightness at each wavelength, and less an angle.
         self.freedom = int(valid.sum() - valid.any(axis=1).sum()) - 1
 
@@ -498,12 +481,6 @@ def _root(matrix):
     """Return the symmetric root of a symmetric matrix."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-
-
-def _shifted(difference, log_ratio):
-    """Return normalized differences whose beams' ratio is changed."""
-    grown = np.tanh(log_ratio / 2)
-    return (difference + grown) / (1 + difference * grown)
 
 
 def _occam(size, error, between):
