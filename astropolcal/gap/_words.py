@@ -28,6 +28,15 @@ _CANCELS = 0.02
 # so many targets on sky stand in the summary
 _TARGETS = 2
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
+# what the amplitude of a cell is, by its dependence
+_AMPLITUDES = {
+    "harmonic": "amplitude of the cosine",
+    "time": "change in half of the run",
+    "time2": "bend",
+    "step": "step",
+    "direction": "change after moves backwards",
+    "move": "change with a move of one radian",
+}
 
 
 # ---- numbers ---------------------------------------------------------------------------------
@@ -103,24 +112,12 @@ def labels(entry):
     """Return what the parameters of a cause are called."""
     keys = [name.split(".") for name in entry["size"]]
     single = len({key for _, key in keys}) == len(keys)
-    known = _of_cell(entry["cell"]) if entry["cell"] else {}
+    known = {}
+    if entry["cell"]:
+        kind = entry["cell"]["dependence"].partition(":")[0]
+        known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]
-
-
-def _of_cell(cell):
-    """Return what the sizes of a perturbation are."""
-    kind = cell["dependence"].partition(":")[0]
-    if kind == "harmonic":
-        return {"amplitude": "amplitude of the cosine", "quadrature": "amplitude of the sine"}
-    words = {
-        "time": "change in half of the run",
-        "time2": "bend",
-        "step": "step",
-        "direction": "change after moves backwards",
-        "move": "change with a move of one radian",
-    }
-    return {"amplitude": words.get(kind, "size")}
 
 
 def _size(value, std, unit, limit):
@@ -175,15 +172,14 @@ def _title(group):
     if len(group) == 1:
         return group[0]["title"]
     cell = Cell(**group[0]["cell"])
-    return f"{_kind_words(cell)} {_places(group)}{_when(cell.dependence)}"
+    return f"{_kind_words(cell)} {_places(group, 'of')}{_when(cell.dependence)}"
 
 
-def _places(group, of="of"):
-    words = [
-        "at the source" if place == "source" else re.sub("^of ", f"{of} ", _place_words(place))
-        for place in (one["cell"]["place"] for one in group)
-    ]
-    return listed(words, "or")
+def _places(group, of):
+    words = [_place_words(one["cell"]["place"]) for one in group]
+    sources = [one["cell"]["place"] == "source" for one in group]
+    pairs = zip(words, sources, strict=True)
+    return listed(["at the source" if s else re.sub("^of ", f"{of} ", w) for w, s in pairs], "or")
 
 
 def _alike(entry):
@@ -213,9 +209,9 @@ def others(entry, ranks):
     return [f"{words} ({share(chance)})" for words, chance in sorted(found, key=lambda x: -x[1])]
 
 
-def cause(entry, ranks):
+def cause(entry):
     """Return what is to be said of one cause, in a few sentences."""
-    return " ".join([_found(entry), *details(entry, ranks)])
+    return " ".join([_found(entry), *entry["details"]])
 
 
 def _found(entry):
@@ -238,7 +234,15 @@ def details(entry, ranks):
 
     ``ranks`` gives the rank of every cause by its name: an alias may be a cause too.
     """
-    texts = [_explains(entry)]
+    text = f"It explains {share(entry['explained'])} of what exceeds the noise"
+    errors = (entry["left_out_before_percent"], entry["left_out_after_percent"])
+    text += "" if None in errors else f" (left-out frames: {change(*errors, 3)} %)"
+    kept = entry["double_difference_share"]
+    if kept is not None and kept < _CANCELS:
+        text += "; it cancels in the double differences"
+    elif kept is not None:
+        text += f"; {share(kept)} of its signal is in the double differences"
+    texts = [f"{text}."]
     if alternatives := others(entry, ranks):
         texts.append(
             f"These data hardly tell it ({share(own_share(entry))}) from "
@@ -250,27 +254,9 @@ def details(entry, ranks):
             f"It resembles {listed(both)}: the data ask for both, "
             "but how much belongs to which is uncertain."
         )
-    return texts + _of_size(entry)
-
-
-def _explains(entry):
-    text = f"It explains {share(entry['explained'])} of what exceeds the noise"
-    errors = (entry["left_out_before_percent"], entry["left_out_after_percent"])
-    text += "" if None in errors else f" (left-out frames: {change(*errors, 3)} %)"
-    kept = entry["double_difference_share"]
-    if kept is None:
-        return f"{text}."
-    return text + (
-        "; it cancels in the double differences."
-        if kept < _CANCELS
-        else f"; {share(kept)} of its signal is in the double differences."
-    )
-
-
-def _of_size(entry):
     if entry["kind"] == "discrete":
-        return ["It is an alternative to the model and has no size."]
-    texts, strength = [], entry["significance"]
+        return [*texts, "It is an alternative to the model and has no size."]
+    strength, rest = entry["significance"], entry["trades_with"]
     if strength is not None:
         texts.append(f"Its size as a whole is {strength:.0f} standard errors from zero.")
     if not entry["physical"]:
@@ -278,12 +264,11 @@ def _of_size(entry):
     elif entry["at_bound"]:
         n = np.sum([np.size(one["value"]) for one in entry["size"].values()])
         texts.append(f"The size is at a bound of the optic at {entry['at_bound']} of {n} values.")
-    known, rest = has_sizes(entry), entry["trades_with"]
+    known = has_sizes(entry)
     if not all(known):
-        texts.append(
-            f"The data need it but do not tell {'all of ' if any(known) else ''}its size: a part "
-            + (f"can be exchanged for changes of {listed(rest)}." if rest else "hardly shows.")
-        )
+        what = "all of its size" if any(known) else "its size"
+        why = f"can be exchanged for changes of {listed(rest)}" if rest else "hardly shows"
+        texts.append(f"The data need it but do not tell {what}: a part {why}.")
     return texts
 
 
@@ -292,13 +277,10 @@ def _of_size(entry):
 
 def sentences(content):
     """Return frames to distrust, what causes the gap, how large it is, and what is left."""
-    parts = (_frames, _what, _how_large, _what_is_left, _on_sky)
-    return [words for words in (part(content) for part in parts) if words]
-
-
-def _frames(content):
     faults = [fault["words"].rstrip(".") for fault in content["frames"]]
-    return f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
+    first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
+    rest = (part(content) for part in (_what, _how_large, _what_is_left, _on_sky))
+    return [words for words in (first, *rest) if words]
 
 
 def _what(content):
@@ -307,23 +289,18 @@ def _what(content):
         return "The model agrees with the measurements: it lacks nothing that these data show."
     # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])
-    if verdict == "unexplained":
-        return _unknown(content, largest)
-    if len(causes) == 1:
-        return _found(causes[0])
-    nameless = "" if verdict == "named" else ", not all of which have a name"
     names = [f"{title(entry)} ({share(entry['probability'])})" for entry in largest]
-    return f"The model lacks {len(causes)} things{nameless}: {listed(names, most=_NAMED)}."
-
-
-def _unknown(content, causes):
-    where = content["where_left"] or content["where"]
+    if verdict != "unexplained":
+        nameless = "" if verdict == "named" else ", not all of which have a name"
+        many = f"The model lacks {len(causes)} things{nameless}: "
+        return _found(causes[0]) if len(causes) == 1 else f"{many}{listed(names, most=_NAMED)}."
     text = "I do not know what the model lacks: "
     if causes:
-        text += f"what helps most, {title(causes[0])} ({share(causes[0]['probability'])}), "
+        text += f"what helps most, {names[0]}, "
         text += "needs others beside it." if len(causes) > 1 else "is not probable enough."
     else:
         text += f"none of the {content['n_effects']} causes that were tried explains the gap."
+    where = content["where_left"] or content["where"]
     of = "what is left" if content["where_left"] else "the gap"
     return f"{text} {where_words(where[0], of)}." if where else text
 
@@ -419,7 +396,15 @@ def text(content, frames=(), written=()):
         if summary.count("\n") < _SUMMARY:
             break
     parts = [
-        *(_cause_lines(one) for one in causes if one["probability"] >= _UNLIKELY),
+        *(
+            [
+                f"Cause {one['rank']}: {title(one)} ({share(one['probability'])})",
+                *(f"  {sentence}" for sentence in one["details"]),
+                *(f"  - {line}" for line in sizes(one)),
+            ]
+            for one in causes
+            if one["probability"] >= _UNLIKELY
+        ),
         _numbered("Or observe", following[take:], take),
         _where_lines("Of the gap of the nominal model", content["where"]),
         _where_lines("Of what is left", content["where_left"]),
@@ -470,14 +455,6 @@ def _table_lines(causes, most):
     room = _WIDTH - sum(widths) - 2 * len(widths)
     lines = ["  ".join([*map(str.rjust, r, widths), shortened(r[-1], room)]) for r in rows]
     return lines + more
-
-
-def _cause_lines(entry):
-    return [
-        f"Cause {entry['rank']}: {title(entry)} ({share(entry['probability'])})",
-        *(f"  {sentence}" for sentence in entry["details"]),
-        *(f"  - {line}" for line in sizes(entry)),
-    ]
 
 
 def exposure(entry, causes):

@@ -90,7 +90,7 @@ def _worked_out(diagnosis):
     ranks = {cause["name"]: cause["rank"] for cause in causes}
     for cause in causes:
         cause["details"] = _words.details(cause, ranks)
-        cause["words"] = _words.cause(cause, ranks)
+        cause["words"] = _words.cause(cause)
     noisy = diagnosis.remainder_p_value > REMAINDER
     changed = runs.changes(diagnosis, causes)
     old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))

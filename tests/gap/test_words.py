@@ -83,6 +83,11 @@ def content(*causes, **changes):
     return one | {"sentences": _words.sentences(one)}
 
 
+def said(one, ranks=()):
+    """What is said of a cause beside others of some ranks."""
+    return _words.cause(one | {"details": _words.details(one, dict(ranks))})
+
+
 # ---- numbers and names ----------------------------------------------------------------------
 
 
@@ -167,15 +172,15 @@ def test_a_size_is_known_if_one_wavelength_tells_it():
         size = {"value": [1.0, 2.0], "std": std, "unit": "", "limit": 1.0}
         assert _words.has_sizes({"size": {"a.b": size}}) == [known]
     vague = entry(size={"a.b": size}, trades_with=["hwp.w_sio2"])
-    assert "do not tell its size: a part can be exchanged for" in _words.cause(vague, {})
+    assert "do not tell its size: a part can be exchanged for" in said(vague)
 
 
 # ---- causes and what they may be taken for -------------------------------------------------------
 
 
 def test_every_cause_has_its_probability_beside_it():
-    assert "title of beam_gain (97 %)." in _words.cause(entry(), {})
-    words = _words.cause(entry(cell("in:derotator", "retardance_h", "time")), {})
+    assert "title of beam_gain (97 %)." in said(entry())
+    words = said(entry(cell("in:derotator", "retardance_h", "time")))
     assert words.startswith("Something in the derotator causes retardance along the axes that")
     assert "(97 %); no name is known for it." in words
     two = content(entry(), entry(named("tilt"), probability=0.92, rank=2))
@@ -205,36 +210,34 @@ def test_the_same_kind_at_several_places_is_told_once():
 
 def test_long_groups_are_told_shortly():
     aliases = [named(f"e{i}", 0.05 - 0.001 * i) for i in range(12)]
-    words = _words.cause(entry(share=0.5, aliases=aliases), {})
+    words = said(entry(share=0.5, aliases=aliases))
     assert "title of e3" in words
     assert "title of e4" not in words
     assert "or 8 more" in words
     # none of them stands out
-    words = _words.cause(entry(share=0.2, aliases=aliases), {})
+    words = said(entry(share=0.2, aliases=aliases))
     assert words.startswith("The model lacks one of several things (97 %)")
 
 
 def test_an_alias_that_is_a_cause_itself_is_no_alternative():
-    words = _words.cause(entry(aliases=[named("tilt")]), {"beam_gain": 1, "tilt": 2})
+    words = said(entry(aliases=[named("tilt")]), {"beam_gain": 1, "tilt": 2})
     assert "It resembles cause 2: the data ask for both" in words
     assert "hardly tell" not in words
 
 
 def test_a_cause_says_which_differences_it_concerns():
     for kept, words in ((0.001, "it cancels in"), (0.4, "40 % of its signal is in")):
-        assert f"{words} the double differences" in _words.cause(
-            entry(double_difference_share=kept), {}
-        )
-    assert "double" not in _words.cause(entry(double_difference_share=None), {})
+        assert f"{words} the double differences" in said(entry(double_difference_share=kept))
+    assert "double" not in said(entry(double_difference_share=None))
 
 
 def test_what_is_not_known_of_a_cause_is_left_out():
-    words = _words.cause(entry(left_out_before_percent=None, significance=None), {})
+    words = said(entry(left_out_before_percent=None, significance=None))
     assert "left-out" not in words
     assert "standard errors" not in words
-    assert _words.cause(entry(kind="discrete", size={}), {}).endswith("has no size.")
-    assert "impossible" in _words.cause(entry(physical=False), {})
-    assert "at a bound of the optic at 1 of 1" in _words.cause(entry(at_bound=1), {})
+    assert said(entry(kind="discrete", size={})).endswith("has no size.")
+    assert "impossible" in said(entry(physical=False))
+    assert "at a bound of the optic at 1 of 1" in said(entry(at_bound=1))
 
 
 # ---- the summary ----------------------------------------------------------------------------
