@@ -327,37 +327,20 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None):
     """
     from astropolcal.pipeline.monitoring import write_page
 
-    names = ("number", "percent", "p", "short_share", "in_title", "shortened", "worth_reading")
+    known = {
+        "content": to_dict(diagnosis),
+        "datasets": diagnosis.nominal.observations,
+        "frames": _about_frames(diagnosis),
+        "figures": _images(figures),
+        "map_caption": MAP,
+        "size_figures": _images(size_figures),
+        "words": _words,
+        "accuracies": _numbers.ACCURACIES,
+    }
+    names = ("number", "percent", "p", "short_share", "in_title")
     filters = {name: getattr(_words, name) for name in names}
     filters |= {"title_of": _words.title, "zip": zip}
-    images = _images(figures)
-    known = dict(
-        content=to_dict(diagnosis),
-        datasets=_about(diagnosis),
-        frames=_about_frames(diagnosis),
-        figures={name: image for name, image in images.items() if name != MAP},
-        map_figure={MAP: images[MAP]} if MAP in images else {},
-        size_figures=_images(size_figures),
-        sizes=_words.sizes,
-        is_determined=_words.is_determined,
-        exposure=_words.exposure,
-        where_words=_words.where_words,
-        accuracies=_numbers.ACCURACIES,
-    )
     write_page(path, GapError, "astropolcal.gap", "report.html", known, filters)
-
-
-def _about(diagnosis):
-    return [
-        {
-            "name": o.name,
-            "instrument": o.instrument,
-            "source": o.source,
-            "n_frames": o.n_frames,
-            "hash": o.content_hash,
-        }
-        for o in diagnosis.nominal.observations
-    ]
 
 
 def _about_frames(diagnosis):
