@@ -35,6 +35,11 @@ _NARROW, _FINE, _TITLE = 4.2, 180, 42
 # pixels of a page to an inch
 _CSS = 96
 _MOST_SCORES = 8
+# what the JSON of a diagnosis, of its causes and of their effects has as it is
+_OWN = ("verdict", "seconds", "noise_floor_percent", "gap_p_value", "remainder_p_value")
+_GAPS = ("gap_before_percent", "gap_after_percent")
+_OF_CAUSE = ("probability", "share", "p_value", "explained", "evidence", "stability")
+_OF_EFFECT = ("place", "kind", "shows", "reference")
 
 
 # ---- for machines ------------------------------------------------------------------------
@@ -79,50 +84,43 @@ def to_dict(diagnosis):
 
 
 def _worked_out(diagnosis):
-    crossed = bool(diagnosis.held_out)
+    crossed, nominal, improved = bool(diagnosis.held_out), diagnosis.nominal, diagnosis.improved
     # a model with the wrong parity is not worth a fit, and so has no prediction
     exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
-    same = diagnosis.improved is diagnosis.nominal
-    before = _numbers.accuracies(diagnosis.nominal, crossed and not exchanged)
-    after = before if same else _numbers.accuracies(diagnosis.improved, crossed)
-    fitted = _numbers.Fitted(diagnosis.improved)
+    same = improved is nominal
+    before = _numbers.accuracies(nominal, crossed and not exchanged)
+    after = before if same else _numbers.accuracies(improved, crossed)
+    fitted = _numbers.Fitted(improved)
     causes = [_cause(diagnosis, i, fitted) for i in range(len(diagnosis.causes))]
     ranks = {cause["name"]: cause["rank"] for cause in causes}
     for cause in causes:
         cause["details"] = _words.details(cause, ranks)
         cause["words"] = _words.cause(cause)
     noisy = diagnosis.remainder_p_value > REMAINDER
-    changed = runs.changes(diagnosis, causes)
-    old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))
+    old, new = (m.fit.chi2 - m.problem.n_data for m in (nominal, improved))
     # the share of the excess over the noise that the improved model leaves
     left = float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
-    content = {
-        "verdict": diagnosis.verdict,
-        "nominal": _nominal(diagnosis.nominal),
-        "n_free": int(diagnosis.nominal.problem.size),
-        "n_data": int(diagnosis.nominal.problem.n_data),
-        "seconds": diagnosis.seconds,
+    scores = ("statistic", "rank", "evidence")
+    content = {key: getattr(diagnosis, key) for key in (*_OWN, *_GAPS)} | {
+        "nominal": _nominal(nominal),
+        "n_free": int(nominal.problem.size),
+        "n_data": int(nominal.problem.n_data),
         "exchanged": exchanged,
         # the model that an alternative has beaten is not fitted
-        "converged": bool(exchanged or diagnosis.nominal.fit.converged),
+        "converged": bool(exchanged or nominal.fit.converged),
         "cross_validated": crossed,
-        "noise_floor_percent": diagnosis.noise_floor_percent,
-        "gap_before_percent": diagnosis.gap_before_percent,
-        "gap_after_percent": diagnosis.gap_after_percent,
-        "shrinkage_percent": _shrinkage(diagnosis),
+        "shrinkage_percent": _shrinkage(diagnosis, exchanged),
         "double_difference": _double(fitted, before, after),
-        "gap_p_value": diagnosis.gap_p_value,
-        "remainder_p_value": diagnosis.remainder_p_value,
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
-        "where": locate(diagnosis.nominal),
-        "where_left": [] if same or noisy else locate(diagnosis.improved),
+        "where": locate(nominal),
+        "where_left": [] if same or noisy else locate(improved),
         "left_share": 0.0 if noisy else left,
         "causes": causes,
-        "changes": changed,
+        "changes": runs.changes(diagnosis, causes),
         "scores": [
-            _named(one) | {key: getattr(one, key) for key in ("statistic", "rank", "evidence")}
+            _named(one) | {key: getattr(one, key) for key in scores}
             for one in diagnosis.scan.candidates[:_MOST_SCORES]
         ],
         "n_effects": len(diagnosis.scan.candidates),
@@ -130,7 +128,7 @@ def _worked_out(diagnosis):
         "accuracy_after": after,
         "next_observations": plan(diagnosis),
     }
-    names = [o.name for o in diagnosis.improved.observations]
+    names = [o.name for o in improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
     return plain(content | {"sentences": words})
@@ -151,14 +149,13 @@ def _double(fitted, before, after):
     return gaps | {"noise_percent": fitted.doubles.noise_percent}
 
 
-def _shrinkage(diagnosis):
+def _shrinkage(diagnosis, exchanged):
     """Return by how much the mean square of the gap is lower, with its 68 % interval."""
     value = 100 * (1 - (diagnosis.gap_after_percent / diagnosis.gap_before_percent) ** 2)
-    found = {"value": value, "low": None, "high": None}
-    smooth = all(cause.effect.kind != "discrete" for cause in diagnosis.causes)
-    if len(diagnosis.held_out) > 1 and smooth:
-        _, found["low"], found["high"] = diagnosis.held_out[0].shrinkage(diagnosis.held_out[-1])
-    return found
+    low = high = None
+    if len(diagnosis.held_out) > 1 and not exchanged:
+        _, low, high = diagnosis.held_out[0].shrinkage(diagnosis.held_out[-1])
+    return {"value": value, "low": low, "high": high}
 
 
 def _cause(diagnosis, i, fitted):
@@ -167,27 +164,16 @@ def _cause(diagnosis, i, fitted):
     if cause.effect.kind == "discrete" and diagnosis.held_out:
         # what an exchanged optic leaves is what the next step begins with
         after = diagnosis.held_out[0]
-    entry = {
-        "rank": i + 1,
-        "probability": cause.probability,
-        **_named(cause),
-        "cell": cause.cell.to_dict() if cause.cell else None,
-        "place": cause.effect.place,
-        "kind": cause.effect.kind,
-        "shows": cause.effect.shows,
-        "reference": cause.effect.reference,
-        "share": cause.share,
+    entry = {"rank": i + 1, **_named(cause), "cell": _of_cell(cause)}
+    entry |= {key: getattr(cause.effect, key) for key in _OF_EFFECT}
+    entry |= {key: getattr(cause, key) for key in _OF_CAUSE} | {
         "aliases": [
-            _named(one) | {"cell": one.cell.to_dict() if one.cell else None, "probability": chance}
+            _named(one) | {"cell": _of_cell(one), "probability": chance}
             for one, chance in cause.aliases
         ],
-        "p_value": cause.p_value,
-        "explained": cause.explained,
         "double_difference_share": fitted.double_share(cause.name),
-        "evidence": cause.evidence,
         "left_out_before_percent": before.percent if before else None,
         "left_out_after_percent": after.percent if after else None,
-        "stability": cause.stability,
         "evidence_by_dataset": cause.by_dataset,
         "size": fitted.sizes(cause.name),
         "significance": fitted.significance(cause.name),
@@ -198,6 +184,10 @@ def _cause(diagnosis, i, fitted):
     # decomposition
     open_size = not all(_words.has_sizes(entry))
     return entry | {"trades_with": fitted.trades(cause.name) if open_size else []}
+
+
+def _of_cell(one):
+    return one.cell.to_dict() if one.cell else None
 
 
 def _named(one):
@@ -235,14 +225,13 @@ def causes_table(diagnosis):
     causes = diagnosis.causes
     percent = [[np.nan if h is None else h.percent for h in (c.before, c.after)] for c in causes]
     before, after = np.reshape(percent, (-1, 2)).T * u.percent
+    aliases = [", ".join(one.name for one, _ in c.aliases) for c in causes]
     return QTable(
         {
             "rank": np.arange(1, len(causes) + 1),
             "effect": np.array([c.name for c in causes], dtype=str),
             "place": np.array([c.effect.place for c in causes], dtype=str),
-            "cannot_be_told_from": np.array(
-                [", ".join(one.name for one, _ in c.aliases) for c in causes], dtype=str
-            ),
+            "cannot_be_told_from": np.array(aliases, dtype=str),
             "probability": np.array([c.probability for c in causes], dtype=float),
             "explained": np.array([c.explained for c in causes], dtype=float),
             "physical": np.array([c.physical for c in causes], dtype=bool),
@@ -387,7 +376,7 @@ def _images(figures):
 def _image(figure):
     """Return a figure as data URIs, wide and narrow, with its width and height in CSS pixels."""
     width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
-    found = {"source": _source(figure, _DPI), "width": width, "height": height}
+    found = {"width": width, "height": height, "source": _source(figure, _DPI)}
     with _narrow(figure):
         return found | {"narrow": _source(figure, _FINE)}
 

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Figures of a diagnosis: the gap by wavelength and frame, its maps, and its causes."""
 
+import re
 import textwrap
 
 import numpy as np
@@ -306,10 +307,9 @@ def plot_cause_map(diagnosis, *, figure=None):
         axes.tick_params(length=0, labelsize=9.5)
         axes.xaxis.tick_top()
         axes.grid(visible=False)
-        for edge in np.arange(0.5, len(rows) - 1):
-            axes.axhline(edge, color="0.8", linewidth=0.8)
-        for edge in np.arange(0.5, len(shown) - 1):
-            axes.axvline(edge, color="0.8", linewidth=0.8)
+        for draw, count in ((axes.axhline, len(rows)), (axes.axvline, len(shown))):
+            for edge in np.arange(0.5, count - 1):
+                draw(edge, color="0.8", linewidth=0.8)
         figure.suptitle("Probability that a cause is there", fontsize=11.5)
     return figure
 
@@ -327,18 +327,12 @@ _CELL = 8
 _LEAST, _DARK = 0.01, 0.65
 # words in the place of a named effect, and the place that they mean
 _PLACES = {
-    "detector": "detector",
-    "spectrograph": "detector",
+    "detector|spectrograph": "detector",
     "upstream of": "source",
     "downstream of the derotator": "after:derotator",
     "half-wave plate": "in:hwp",
     "derotator": "in:derotator",
-    "source": "source",
-    "polarizer": "source",
-    "star": "source",
-    "sky": "source",
-    "mirror": "source",
-    "telescope": "source",
+    "source|polarizer|star|sky|mirror|telescope": "source",
 }
 
 
@@ -366,7 +360,8 @@ def _on_map(effect, cell):
         known = family in _FAMILIES
         what = _AXES.get(axis, axis) if known else cell.kind.replace("_", " ")
         return cell.place, family if known else _FAMILIES[-2], what
-    place = next((own for words, own in _PLACES.items() if words in effect.place), effect.place)
+    known = (place for words, place in _PLACES.items() if re.search(words, effect.place))
+    place = next(known, effect.place)
     words = f"{effect.name} {effect.title}"
     family = next((family for family in _FAMILIES[:4] if family in words), _OTHER)
     return place, _FAMILIES[-2] if place == "detector" else family, "named"
@@ -387,19 +382,25 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
         sizes = diagnosis.content["causes"][names.index(effect)]["size"]
-    # a figure of a constant shows nothing
+    cause, model = diagnosis.causes[names.index(effect)], diagnosis.improved
     sizes = {name: size for name, size in sizes.items() if _varies(size["value"])}
-    dependence = _dependence(diagnosis, effect)
+    dependence = _curve(model, cause)
     panels = [None, *sizes] if dependence else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
+    entry = {"size": [p.name for p in model.added.get(effect) or ()], "cell": None}
+    entry["cell"] = cause.cell and cause.cell.to_dict()
+    words = dict(zip(entry["size"], labels(entry), strict=True))
     columns = min(len(panels), 2)
     with st.canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
         for axes, name in zip(st.grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
-                _draw_curve(axes, diagnosis, effect, dependence)
-            else:
-                _draw_size(axes, diagnosis, effect, name, sizes[name])
+                _curve_panel(axes, model, effect, dependence)
+                continue
+            (parameter,) = (p for p in model.added[effect] if p.name == name)
+            unit = _size_panel(axes, model.problem, sizes[name], parameter)
+            axes.set_ylabel(f"{textwrap.fill(words[name], _LABEL)} ({unit})")
+            st.wavelength_label(axes)
     return figure
 
 
@@ -408,15 +409,14 @@ def _varies(value):
     return bool(known) and max(value) - min(value) > 1e-6 * max(known)
 
 
-def _draw_size(axes, diagnosis, effect, name, size):
-    """Draw the size of a parameter of a cause, a share in percent, against wavelength."""
-    model, cause = diagnosis.improved, _cause(diagnosis, effect)
-    nm, scale = 1000 * diagnosis.nominal.problem.wavelength, 1 if size["unit"] else 100
-    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
+def _size_panel(axes, problem, size, parameter):
+    """Draw the size of a parameter over the wavelength; return its unit."""
+    nm, scale = 1000 * problem.wavelength, 1 if size["unit"] else 100
     value, error = (scale * np.array(size[key], dtype=float) for key in ("value", "std"))
+    known = is_determined(error, scale * size["limit"])
     # mostly zero; a share that is retained counts from one, what the model held from its value
-    (parameter,) = (p for p in model.added[effect] if p.name == name)
-    absent = scale * parameter.canonical_neutral / model.problem.free.by_name[name].factor
+    factor = problem.free.by_name[parameter.name].factor
+    absent = parameter.canonical_neutral / factor * scale
     look = {"color": st.BLACK, "linewidth": 0.8}
     axes.axhline(absent, **look) if np.ndim(absent) == 0 else st.draw_line(axes, nm, absent, **look)
     axes.errorbar(nm[known], value[known], error[known], fmt="o", color=st.BLUE, elinewidth=1.5)
@@ -427,11 +427,7 @@ def _draw_size(axes, diagnosis, effect, name, size):
         axes.set_title("crosses: not determined", loc="left", fontsize=10)
     if not known.any():
         axes.set_yticks([])
-    names = [p.name for p in model.added[effect]]
-    entry = {"size": names, "cell": cause.cell.to_dict() if cause.cell else None}
-    words = textwrap.fill(labels(entry)[names.index(name)], _LABEL)
-    axes.set_ylabel(f"{words} ({size['unit'] or '%'})")
-    st.wavelength_label(axes)
+    return size["unit"] or "%"
 
 
 # ---- what a cause depends on ------------------------------------------------------------------
@@ -439,33 +435,25 @@ def _draw_size(axes, diagnosis, effect, name, size):
 _DRIVERS = {"sequence": "share of the run", "frame": "frame"}
 
 
-def _cause(diagnosis, effect):
-    return next(one for one in diagnosis.causes if one.name == effect)
-
-
-def _dependence(diagnosis, effect):
+def _curve(model, cause):
     """Return the dependence of a cause that is a cell and changes from frame to frame."""
-    cell = _cause(diagnosis, effect).cell
-    keys = [p.name.partition(".")[2] for p in diagnosis.improved.added.get(effect) or ()]
-    if cell is None or cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
+    keys = [p.name.partition(".")[2] for p in model.added.get(cause.name) or ()]
+    if cause.cell is None or cause.cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
         return None
-    dependence = Dependence(cell.dependence)
+    dependence = Dependence(cause.cell.dependence)
     return dependence if dependence.driver else None
 
 
-def _draw_curve(axes, diagnosis, effect, dependence):
-    """Draw the size of a cause against what it depends on."""
-    model = diagnosis.improved
-    driver, problem = dependence.driver, model.problem
+def _curve_panel(axes, model, effect, dependence):
+    """Draw the size of a cell over what it depends on, at the middle wavelength."""
+    driver, problem, moved = dependence.driver, model.problem, dependence.kind == "direction"
     given = []
     for dataset in problem.datasets:
-        stood = dataset._given.get(driver)
-        stood = dataset.observations.position(driver) if stood is None else stood
-        given.append(stood.mean(axis=0) if stood.ndim == 2 else stood)
+        where = dataset._given.get(driver)
+        where = dataset.observations.position(driver) if where is None else where
+        given.append(where.mean(axis=0) if where.ndim == 2 else where)
     given = np.concatenate(given)
-    x = np.linspace(given.min(), given.max(), 400)
-    if dependence.kind == "direction":
-        x = np.array([0.0, 1.0])
+    x = np.array([0.0, 1.0]) if moved else np.linspace(given.min(), given.max(), 400)
     fitted, middle = Fitted(model), len(problem.wavelength) // 2
     own = np.zeros((problem.size, len(x)))
     for wave, parameter in zip(dependence.waves(x), model.added[effect], strict=False):
@@ -476,27 +464,24 @@ def _draw_curve(axes, diagnosis, effect, dependence):
     scale = 1 / factor if unit else 100
     value = scale * (model.fit.coefficients @ own)
     error = scale * np.sqrt(np.einsum("ij,ik,kj->j", own, fitted.covariance, own))
-    angle = driver not in _DRIVERS and dependence.kind != "direction"
-    x, given = (np.rad2deg(values) if angle else values for values in (x, given))
     axes.axhline(0, color=st.BLACK, linewidth=0.8)
-    if dependence.kind == "direction":
+    if moved:
         axes.errorbar(x, value, error, fmt="o", color=st.BLUE)
         axes.set_xticks(x, labels=["forwards", "backwards"])
         axes.set_xlim(-0.5, 1.5)
     else:
+        x, given = (x, given) if driver in _DRIVERS else (np.rad2deg(x), np.rad2deg(given))
         st.draw_band(axes, x, value, error, st.SKY, 0.5)
         axes.plot(x, value, color=st.BLUE)
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
     stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = _STAGES.get(stage, stage)
-    axes.set_xlabel(
-        {
-            "harmonic": f"angle of the {stage} (deg)",
-            "direction": f"last move of the {stage}",
-            "move": f"last move of the {stage} (deg)",
-        }.get(dependence.kind)
-        or _DRIVERS[dependence.driver]
-    )
+    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    known = {
+        "harmonic": f"angle of the {stage} (deg)",
+        "direction": f"last move of the {stage}",
+        "move": f"last move of the {stage} (deg)",
+    }
+    axes.set_xlabel(known.get(dependence.kind) or _DRIVERS[driver])
     nm = 1000 * problem.wavelength[middle]
     axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
