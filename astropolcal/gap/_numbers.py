@@ -44,20 +44,20 @@ class Fitted:
         ``unit`` and ``limit``, the largest size that is physical. The errors are those
         of the noise, or of the scatter of the residuals where it is larger.
         """
-        return {p.name: self._size(p) for p in self.model.added.get(name) or ()}
-
-    def _size(self, parameter):
-        slot = self.problem.free.by_name[parameter.name]
-        where = self.problem.slices[parameter.name]
-        unit, factor = self.unit_of(parameter.name)
-        block = parameter.basis if slot.per_wavelength else None
-        block = np.eye(where.stop - where.start) if block is None else block
-        value = block @ self.model.fit.coefficients[where] / factor
-        std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
-        # one open coefficient leaves every value of a law open
-        std = np.where(self.is_open[where].any(), np.nan, std / factor)
-        limit = parameter.canonical_limit / factor
-        return {"value": _number(value), "std": _number(std), "unit": unit, "limit": float(limit)}
+        found = {}
+        for parameter in self.model.added.get(name) or ():
+            slot = self.problem.free.by_name[parameter.name]
+            where = self.problem.slices[parameter.name]
+            unit, factor = self.unit_of(parameter.name)
+            block = parameter.basis if slot.per_wavelength else None
+            block = np.eye(where.stop - where.start) if block is None else block
+            value = block @ self.model.fit.coefficients[where] / factor
+            std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
+            # one open coefficient leaves every value of a law open
+            std = np.where(self.is_open[where].any(), np.nan, std / factor)
+            size = {"value": _number(value), "std": _number(std), "unit": unit}
+            found[parameter.name] = size | {"limit": float(parameter.canonical_limit / factor)}
+        return found
 
     def unit_of(self, name):
         """Return the unit of a parameter in words, and how much of it is canonical."""
@@ -129,49 +129,42 @@ class Fitted:
         strength = np.abs(self.covariance / np.outer(error, error))[rows].max(axis=0)
         if self.is_open[rows].any():
             # what the data leave open altogether is worse than what they know badly
-            touching = self.null[np.abs(self.null[:, rows]).max(axis=1) > TOUCHES]
+            null = self._directions[1]
+            touching = null[np.abs(null[:, rows]).max(axis=1) > TOUCHES]
             strength = np.linalg.norm(touching, axis=0)
         own = {p.name for p in self.model.added[name]}
         others = {
             other: float(strength[where].max())
             for other, where in self.problem.slices.items()
-            if other not in own
+            if other not in own and strength[where].max() > _STRONG
         }
-        found = [name for name, strength in others.items() if strength > _STRONG]
-        return [found[i] for i in ranked([others[name] for name in found])[:_MOST_TRADES]]
+        found = list(others)
+        return [found[i] for i in ranked(list(others.values()))[:_MOST_TRADES]]
 
     def _rows(self, name):
         slices = [self.problem.slices[p.name] for p in self.model.added.get(name) or ()]
         return np.concatenate([np.arange(s.start, s.stop) for s in slices])
 
     @cached_property
-    def _decomposed(self):
-        """Singular values and vectors of the slopes, of unit columns, and the length of these."""
-        return self.problem.decomposed(self.model.fit.coefficients)
+    def _directions(self):
+        """A root of the covariance for unit noise, and what data leave open, of unit columns."""
+        singular, right, scale = self.problem.decomposed(self.model.fit.coefficients)
+        good = singular > OPEN * singular[0]
+        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
+        return right[good] / singular[good, None] / scale, right[~good]
 
     @cached_property
     def covariance(self):
         """Covariance of the coefficients, without what the data do not determine."""
-        singular, right, scale = self._decomposed
-        good = singular > OPEN * singular[0]
-        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
-        half = right[good] / singular[good, None] / scale
-        problem = self.problem
+        half = self._directions[0]
         # residuals larger than the noise make the errors larger, smaller ones do not make them
         # smaller
-        scatter = self.model.fit.chi2 / max(problem.n_data - problem.size, 1)
-        return max(1.0, scatter) * (half.T @ half)
-
-    @property
-    def null(self):
-        """Directions of unit columns that the data do not determine, shape (n, n_coefficients)."""
-        singular, right, _ = self._decomposed
-        return right[singular <= OPEN * singular[0]]
+        return max(1.0, self.model.mean_square) * (half.T @ half)
 
     @property
     def is_open(self):
         """Which coefficients the data do not determine."""
-        return np.sum(self.null**2, axis=0) > TOUCHES**2
+        return np.sum(self._directions[1] ** 2, axis=0) > TOUCHES**2
 
 
 def _number(values):
