@@ -71,10 +71,7 @@ class Look:
         self.residual = residual - self.tangent @ (weight.T @ residual)
         #: Sum of squares and degrees of freedom of the frames that take part.
         self.chi2 = float(np.sum(self.residual[rows] ** 2))
-        lost = sum(
-            c.count * int(c.valid[:, o].sum())
-            for c, o in zip(self.problem.channels, out, strict=True)
-        )
+        lost = sum(c.count * int(c.valid[:, out[i]].sum()) for i, c, _ in self._datasets)
         self.freedom = max(self.problem.n_data - lost - self.tangent.shape[1], 1)
 
     @property
@@ -138,14 +135,13 @@ class Look:
 
     @cached_property
     def _parts(self):
-        """Residual (2 W, F), and tangent with lamp (2 W, F, k), of each dataset."""
+        """Residual (2, W, F), and tangent with lamp (2, W, F, k), of each dataset."""
         parts = []
         for _, channel, rows in self._datasets:
-            _, n, f = channel.shape
             lamp = channel.nuisance if channel.groups is None else channel.nuisance[:, :0]
             taken = [self.tangent[rows], np.concatenate([np.zeros_like(lamp), lamp])]
-            taken = np.concatenate(taken, axis=1).reshape(2 * n, f, -1)
-            parts.append((self.residual[rows].reshape(2 * n, f), taken))
+            taken = np.concatenate(taken, axis=1).reshape(*channel.shape, -1)
+            parts.append((self.residual[rows].reshape(channel.shape), taken))
         return parts
 
     # ---- small errors, all frames at once -----------------------------------------------------
@@ -157,7 +153,7 @@ class Look:
 
     def columns(self, i):
         """
-        Return what an error of each kind does to every frame of a dataset, (k, 2 W, F) each.
+        Return what an error of each kind does to every frame of a dataset, (k, 2, W, F) each.
 
         By kind: ``"STAGE angle"`` per radian, ``"right beam"`` and ``"left beam"`` for a law in
         wavelength of the logarithm of the beam's flux.
@@ -173,23 +169,20 @@ class Look:
         law = self.law(i).T[:, None, :, None]
         for beam, name in enumerate(("right beam", "left beam")[: channel.count]):
             found[name] = law * np.stack([weight[beam] * sweep.fluxes[beam] for weight in weights])
-        return {
-            kind: channel.whiten_frames(c * channel.valid).reshape(len(c), -1, channel.shape[2])
-            for kind, c in found.items()
-        }
+        return {kind: channel.whiten_frames(c * channel.valid) for kind, c in found.items()}
 
     def lowering(self, i, columns):
-        """Return by how much columns (k, 2 W, F) of one frame each lower chi-square, (F,)."""
+        """Return by how much columns (k, 2, W, F) of one frame each lower chi-square, (F,)."""
         residual, taken = self._parts[i]
-        inner = np.einsum("haf,gaf->fhg", columns, columns)
+        inner = np.einsum("hcaf,gcaf->fhg", columns, columns)
         full = np.einsum("fhh->fh", inner).copy()
-        part = np.einsum("afk,haf->fkh", taken, columns, optimize=True)
+        part = np.einsum("cafk,hcaf->fkh", taken, columns, optimize=True)
         inner -= np.einsum("fkh,fkg->fhg", part, part)
-        share = self.shares[i].reshape(residual.shape)
-        inner -= np.einsum("af,haf,gaf->fhg", np.minimum(share, 1.0), columns, columns)
+        share = np.minimum(self.shares[i], 1.0)
+        inner -= np.einsum("caf,hcaf,gcaf->fhg", share, columns, columns)
         scale = np.sqrt(np.where(full > 0, full, 1.0))
         values, vectors = np.linalg.eigh(inner / scale[:, :, None] / scale[:, None, :])
-        along = np.einsum("haf,af->fh", columns, residual) / scale
+        along = np.einsum("hcaf,caf->fh", columns, residual) / scale
         along = np.einsum("fhg,fh->fg", vectors, along)
         return _fall(values, along)
 
@@ -209,13 +202,10 @@ class Look:
 
     def _told(self, i):
         """Return residual (F, W) of what tells the gap, and what the model absorbs, (F, W, W)."""
-        residual, taken = self._parts[i]
-        channel = self.problem.channels[i]
-        n, told = channel.shape[1], channel.told
-        rows = slice(told * n, (told + 1) * n)
-        taken = taken[rows].transpose(1, 0, 2)
-        own = self.shares[i][told].T[:, :, None] * np.eye(n)
-        return residual[rows].T, taken @ taken.swapaxes(1, 2) + own
+        told, (residual, taken) = self.problem.channels[i].told, self._parts[i]
+        taken = taken[told].transpose(1, 0, 2)
+        own = self.shares[i][told].T[:, :, None] * np.eye(len(residual[told]))
+        return residual[told].T, taken @ taken.swapaxes(1, 2) + own
 
     def kept(self, i):
         """Return which frames of a dataset take part and have data, (F,) of bool."""
@@ -245,14 +235,12 @@ class Look:
 
         The latter two are (W, W).
         """
-        residual, taken = self._parts[i]
-        channel = self.problem.channels[i]
-        n = channel.shape[1]
-        lamp = taken[n:, f, self.tangent.shape[1] :]
-        left = np.eye(n) - lamp @ lamp.T
-        single = np.zeros((n, 2, n, channel.shape[2]))
+        channel, (residual, taken) = self.problem.channels[i], self._parts[i]
+        n, lamp = channel.shape[1], taken[1, :, f, self.tangent.shape[1] :]
+        single = np.zeros((n, *channel.shape))
         single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
-        return residual[n:, f], left, channel.whiten_frames(single)[:, 1, :, f].T
+        whiten = channel.whiten_frames(single)[:, 1, :, f].T
+        return residual[1, :, f], np.eye(n) - lamp @ lamp.T, whiten
 
 
 def _fall(values, along):
@@ -346,7 +334,7 @@ class Frame:
 
     def as_told(self):
         """Return the trial in which nothing is wrong."""
-        return Trial("none", float(self.chi2(self.predicted(self._positions([self.f])))[0]), 0.0)
+        return Trial("none", float(self.with_positions_of([self.f])[0]), 0.0)
 
     def trials(self):
         """Return all trials that need no other frame."""
@@ -354,7 +342,9 @@ class Frame:
         degrees = range(self.look.law(self.i).shape[1])
         sides = (1,) if self.single else _BEAMS
         beams = [self.beam(degree, side) for degree in degrees for side in sides]
-        return [*stages, *beams, self.anything()]
+        # every wavelength of the frame is off by its own amount
+        width = 1 + (_ANY * self.weight[self.valid]) ** 2
+        return [*stages, *beams, Trial("unknown", 0.0, float(np.log(width).sum()))]
 
     def angle(self, stage):
         """Return the trial in which a stage stood elsewhere."""
@@ -429,11 +419,6 @@ class Frame:
         missed, whiten = self._sums
         left = np.concatenate([self._root @ left, missed - whiten @ brighter])
         return left, np.concatenate([self._root @ slopes, whiten @ slope])
-
-    def anything(self):
-        """Return the trial in which every wavelength of the frame is off by its own amount."""
-        width = 1 + (_ANY * self.weight[self.valid]) ** 2
-        return Trial("unknown", 0.0, float(np.log(width).sum()))
 
     def with_positions_of(self, frames):
         """Return what is left of the frame if its stages stood as in others, (n,)."""
