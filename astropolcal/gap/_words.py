@@ -122,12 +122,12 @@ def labels(entry):
 
 def _size(value, std, unit, limit):
     several = isinstance(value, list)
-    pairs = list(zip(value, std, strict=True)) if several else [(value, std)]
-    good = [(v, s) for v, s in pairs if is_determined(s, limit)]
-    if not good:
+    values, errors = (np.array(one, dtype=float, ndmin=1) for one in (value, std))
+    known = is_determined(errors, limit)
+    if not known.any():
         return "not determined by these data" + (" at any wavelength" if several else "")
     # shares are given in percent
-    values, errors = np.array(good).T * (1 if unit else 100)
+    values, errors = (one[known] * (1 if unit else 100) for one in (values, errors))
     ends, digits = f" {unit or '%'}", decimals(np.median(errors))
     middle, low, high = (f"{f(values):.{digits}f}" for f in (np.median, np.min, np.max))
     least, most = (percent(f(errors), 2) for f in (np.min, np.max))
@@ -135,13 +135,15 @@ def _size(value, std, unit, limit):
     if low == high and least == most:
         text = f"{middle} +- {errors[0]:.{digits}f}{ends}"
         text += " at every wavelength" if several else ""
-    known = f"; determined at {len(good)} of {len(pairs)} wavelengths"
-    return text + known if len(good) < len(pairs) else text
+    if known.all():
+        return text
+    return f"{text}; determined at {known.sum()} of {known.size} wavelengths"
 
 
 def is_determined(std, limit):
     """Return whether the data narrow a size to a small part of what is possible."""
-    return std is not None and std <= _DETERMINED * limit
+    # what is not known is None, and NaN among numbers
+    return np.array(std, dtype=float) <= _DETERMINED * limit
 
 
 def decimals(std):
@@ -152,10 +154,7 @@ def decimals(std):
 
 def has_sizes(entry):
     """Return whether the data determine each parameter of a cause somewhere, a list."""
-    return [
-        any(is_determined(std, one["limit"]) for std in np.ravel(np.array(one["std"], object)))
-        for one in entry["size"].values()
-    ]
+    return [bool(np.any(is_determined(s["std"], s["limit"]))) for s in entry["size"].values()]
 
 
 # ---- what a cause is, and what else it may be ----------------------------------------------------
@@ -176,10 +175,9 @@ def _title(group):
 
 
 def _places(group, of):
-    words = [_place_words(one["cell"]["place"]) for one in group]
-    sources = [one["cell"]["place"] == "source" for one in group]
-    pairs = zip(words, sources, strict=True)
-    return listed(["at the source" if s else re.sub("^of ", f"{of} ", w) for w, s in pairs], "or")
+    places = (one["cell"]["place"] for one in group)
+    own = {"source": "at the source"}
+    return listed((own.get(p) or re.sub("^of ", f"{of} ", _place_words(p)) for p in places), "or")
 
 
 def _alike(entry):
@@ -395,22 +393,16 @@ def text(content, frames=(), written=()):
         summary = _joined([content["sentences"], table, first, files])
         if summary.count("\n") < _SUMMARY:
             break
-    parts = [
-        *(
-            [
-                f"Cause {one['rank']}: {title(one)} ({share(one['probability'])})",
-                *(f"  {sentence}" for sentence in one["details"]),
-                *(f"  - {line}" for line in sizes(one)),
-            ]
-            for one in causes
-            if one["probability"] >= _UNLIKELY
-        ),
-        _numbered("Or observe", following[take:], take),
-        _where_lines("Of the gap of the nominal model", content["where"]),
-        _where_lines("Of what is left", content["where_left"]),
-        [f"Nominal model: {content['nominal']}"],
-        list(frames),
-    ]
+    parts = []
+    for one in (one for one in causes if one["probability"] >= _UNLIKELY):
+        known = [*(f"  {line}" for line in one["details"]), *(f"  - {line}" for line in sizes(one))]
+        parts.append([f"Cause {one['rank']}: {title(one)} ({share(one['probability'])})", *known])
+    parts.append(_numbered("Or observe", following[take:], take))
+    for name, where in (("the gap of the nominal model", "where"), ("what is left", "where_left")):
+        worth = worth_reading(content[where])
+        lines = [f"{share(one['share']):>6}  {where_words(one)}" for one in worth]
+        parts.append([f"Of {name}", *lines] if lines else [])
+    parts += [[f"Nominal model: {content['nominal']}"], list(frames)]
     return f"{summary}\n\n{_joined(parts)}"
 
 
@@ -462,8 +454,8 @@ def exposure(entry, causes):
     ranks = {one["name"]: one["rank"] for one in causes}
     among = {alias["name"]: one["rank"] for one in causes for alias in one["aliases"]}
     known = [f"cause {ranks[name]}" for name in entry["separates"] if name in ranks]
-    others = [f"cause {among[n]}" for n in entry["separates"] if n in among and n not in ranks]
-    others = list(dict.fromkeys(others))
+    aliases = (name for name in entry["separates"] if name in among and name not in ranks)
+    others = list(dict.fromkeys(f"cause {among[name]}" for name in aliases))
     if not known and not others:
         return entry["words"]
     for_what = f"tells {listed(known)} " if known else f"tells apart what {listed(others)} may be "
@@ -483,8 +475,3 @@ def worth_reading(where):
     patterns = [one for one in where if one["kind"] == "pattern"]
     places = [one for one in where if one["kind"] != "pattern"]
     return (patterns[: max(_WHERE - len(places), (_WHERE + 1) // 2)] + places)[:_WHERE]
-
-
-def _where_lines(title, where):
-    lines = [f"{share(one['share']):>6}  {where_words(one)}" for one in worth_reading(where)]
-    return [title, *lines] if lines else []

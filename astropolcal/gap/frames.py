@@ -11,7 +11,7 @@ must be down to the noise, or have lost nearly all of its excess.
 """
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
@@ -201,10 +201,9 @@ def _of_design(problem, fault, rivals, probability):
     if len(rivals) > 1:
         kinds = [_fault(problem, fault.place, trial, 0.0, 0.0) for trial in rivals.values()]
         each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
-        words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
-        unknown = {"what": "unknown", "value": None, "error": None, "with_": None}
-        fault = replace(fault, **unknown, probability=float(probability), words=words)
-        fault.partner_place = None
+        unknown = Trial("unknown", 0.0, 0.0)
+        fault = _fault(problem, fault.place, unknown, fault.evidence, float(probability))
+        fault.words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
     if channel.groups is None:
         return fault
     mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
@@ -229,20 +228,13 @@ def _fault(problem, place, trial, evidence, probability):
         if stage in observations.frames.colnames:
             told = float(observations.position(stage)[f])
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
-    numbers = [int(number) for number in observations.frames["frame"]]
-    swapped = trial.partner is not None
-    fault = FrameFault(
-        observations.name,
-        numbers[f],
-        trial.what,
-        with_=numbers[trial.partner] if swapped else None,
-        value=value if np.isfinite(value) else None,
-        error=error if np.isfinite(value) else None,
-        evidence=evidence,
-        probability=probability,
-        place=place,
-        partner_place=(i, trial.partner) if swapped else None,
-    )
+    numbers = observations.frames["frame"]
+    fault = FrameFault(observations.name, int(numbers[f]), trial.what, place=place)
+    fault.evidence, fault.probability = evidence, probability
+    if np.isfinite(value):
+        fault.value, fault.error = value, error
+    if trial.partner is not None:
+        fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
     fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam)}"
     return fault
 
@@ -271,20 +263,16 @@ def _exchanges(place, frames, trials):
     """Return the trials in which the stages stood as in another frame, and there as in this."""
     i, f = place
     one, told = frames[place], trials[place][0].chi2
-    n = one.channel.shape[2]
-    left = one.with_positions_of(np.arange(n))
-    left[f] = np.inf
-    left[~one.channel.valid.any(axis=0)] = np.inf
+    n, others = one.channel.shape[2], one.channel.valid.any(axis=0)
+    others[f] = False
+    left = np.where(others, one.with_positions_of(np.arange(n)), np.inf)
     found = []
     for j in np.argsort(left, kind="stable")[:_PARTNERS]:
         if not left[j] < told - _BETTER:
             break
         other = (i, int(j))
-        if other not in frames:
-            partner = Frame(one.look, *other, one.scatter)
-            known = [partner.as_told()]
-        else:
-            partner, known = frames[other], trials[other]
+        partner = frames.get(other) or Frame(one.look, *other, one.scatter)
+        known = trials.get(other) or [partner.as_told()]
         theirs = float(partner.with_positions_of([f])[0])
         if theirs < known[0].chi2 - _BETTER:
             cost = 2 * np.log(max(n - 1, 1)) + theirs - min(trial.total for trial in known)

@@ -185,7 +185,7 @@ def _sequence(data, terms, null):
     while left:
         tested = {i: _test(gram, target, slices[i], total, freedom) for i in left}
         best = _simplest(terms, tested, max(left, key=lambda i: tested[i].evidence))
-        rates = false_discovery([tested[i].p_single for i in left])
+        rates = false_discovery([np.exp(tested[i].log_p) for i in left])
         small = tested[best].excess < _LEAST_SHARE * data.scale
         if len(taken) == _MOST_TERMS or rates[left.index(best)] >= ALPHA or small:
             break
@@ -267,10 +267,6 @@ class _Tested:
     evidence: float
 
     @property
-    def p_single(self):
-        return float(np.exp(self.log_p))
-
-    @property
     def excess(self):
         return self.statistic - self.rank
 
@@ -297,7 +293,7 @@ def _row(term, tested, scale):
         "detail": term.detail,
         "kind": "pattern",
         "share": float(np.clip(tested.excess / scale, 0, 1)),
-        "p_single": tested.p_single,
+        "p_single": float(np.exp(tested.log_p)),
     }
 
 
