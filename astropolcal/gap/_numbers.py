@@ -74,8 +74,7 @@ class Fitted:
 
         To first order, and less what the rest of the model absorbs.
         """
-        doubles = self.doubles
-        if not self.model.added.get(name) or doubles is None:
+        if not self.model.added.get(name) or self.doubles is None:
             return None
         problem, full = self.problem, self.model.fit.coefficients
         rows, without = self._rows(name), full.copy()
@@ -85,18 +84,32 @@ class Fitted:
         slopes = problem.jacobian(full)[:, others]
         without[others] += np.linalg.lstsq(slopes, lost, rcond=_TINY)[0]
         pairs = zip(problem.differences(without), problem.differences(full), strict=True)
-        single = doubles.in_pairs([one[0] - other[0] for one, other in pairs])
-        double = doubles.residuals(without) - doubles.residuals(full)
+        single = self._in_pairs([one[0] - other[0] for one, other in pairs])
+        double = np.subtract(*(self.doubles.residuals(problem.vector(q)) for q in (without, full)))
+        double = double[: self.doubles.n_data]
         # of two frames of opposite signs the double difference is as large as each
         return float(np.clip(np.sum(double**2) / max(np.sum(single**2), 1e-300), 0, 1))
 
     @cached_property
     def doubles(self):
-        """The double differences of the model, None where frames form no pairs."""
+        """Measurement of the double differences of the model, None where frames form no pairs."""
+        kind = {"observable": "normalized_double_difference", "ties": self.problem.ties}
         try:
-            return Doubles(self.model)
+            return Measurement(self.model.chains, self.model.observations, **kind)
         except ObservationError:
             return None
+
+    def _in_pairs(self, singles):
+        """Return the root mean square of values (W, F) over the frames of each, (n_data,)."""
+        parts = zip(self.doubles.datasets, singles, strict=True)
+        squares = [np.mean(one[:, d.frames] ** 2, axis=-1)[d.valid] for d, one in parts]
+        return np.sqrt(np.concatenate(squares))
+
+    @property
+    def double_noise_percent(self):
+        """Noise of the double differences, by that of the single differences, in percent."""
+        sigma = self._in_pairs([c.sigma[0] for c in self.problem.channels])
+        return 100 * float(np.sqrt(np.mean(sigma**2) / 2))
 
     def significance(self, name):
         """Return the size of an effect as a whole in units of its error, or None."""
@@ -171,39 +184,6 @@ def _number(values):
     """Return one number, or a list of them; None for what is not finite."""
     plain = [float(v) if np.isfinite(v) else None for v in np.atleast_1d(values)]
     return plain[0] if len(plain) == 1 else plain
-
-
-# ---- double differences ---------------------------------------------------------------------
-
-
-class Doubles:
-    """Normalized double differences of a model."""
-
-    def __init__(self, model):
-        self.problem = model.problem
-        self.measurement = Measurement(
-            model.chains,
-            model.observations,
-            observable="normalized_double_difference",
-            ties=model.problem.ties,
-        )
-
-    def residuals(self, coefficients):
-        """Return observed minus predicted, (n_data,)."""
-        residuals = self.measurement.residuals(self.problem.vector(coefficients))
-        return residuals[: self.measurement.n_data]
-
-    def in_pairs(self, singles):
-        """Return the root mean square of values (W, F) over the frames of each, (n_data,)."""
-        parts = zip(self.measurement.datasets, singles, strict=True)
-        squares = [np.mean(one[:, d.frames] ** 2, axis=-1)[d.valid] for d, one in parts]
-        return np.sqrt(np.concatenate(squares))
-
-    @property
-    def noise_percent(self):
-        """Their noise, by that of the single differences, in percent."""
-        sigma = self.in_pairs([c.sigma[0] for c in self.problem.channels])
-        return 100 * float(np.sqrt(np.mean(sigma**2) / 2))
 
 
 # ---- accuracies -----------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def _double(fitted, before, after):
     gaps = {"before_percent": before["rms_percent"], "after_percent": after["rms_percent"]}
     if fitted.doubles is None or None in gaps.values():
         return None
-    return gaps | {"noise_percent": fitted.doubles.noise_percent}
+    return gaps | {"noise_percent": fitted.double_noise_percent}
 
 
 def _shrinkage(diagnosis, exchanged):

@@ -13,7 +13,7 @@ from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise import estimates
 from astropolcal.exceptions import FitError
 from astropolcal.gap import channels
-from astropolcal.gap._numbers import Doubles
+from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations import Observations
@@ -157,7 +157,7 @@ def test_a_calibration_and_its_diagnosis_compare_with_the_same_noise():
         model = nominal_model(cal.chains, [observations], cal)
         *_, told = cal.fit["lack_of_fit"]
         assert told["noise"] == "roughness"
-        noise = Doubles(model).noise_percent
+        noise = Fitted(model).double_noise_percent
         assert told["noise_percent"] == pytest.approx(noise, rel=1e-6), factor
         rms = 100 * np.sqrt(np.sum(cal.residuals**2) / (cal.residuals.size - len(cal.covariance)))
         assert told["times_noise"] * noise == pytest.approx(rms, rel=0.15), factor
