@@ -61,11 +61,6 @@ def p(value):
     return p_words(value).removeprefix("p ").removeprefix("= ")
 
 
-def doubt(value):
-    """Return how probable it is that noise alone does it, in parentheses."""
-    return f"({p_words(value)})"
-
-
 def share(value):
     """Return a share as percent."""
     return "less than 1 %" if 0 < value <= 0.005 else f"{100 * value:.0f} %"
@@ -333,10 +328,11 @@ def _how_large(content):
     if content["verdict"] == "none":
         return text
     chance = content["gap_p_value"]
+    noise = f"({p_words(chance)})"
     # a pattern can be certain where the sum of squares is not conspicuous
     if chance > _CONSPICUOUS:
-        return f"{text} The residuals are no larger than noise {doubt(chance)}, but have a pattern."
-    return f"{text} The gap is real {doubt(chance)}."
+        return f"{text} The residuals are no larger than noise {noise}, but have a pattern."
+    return f"{text} The gap is real {noise}."
 
 
 def _what_is_left(content):
@@ -346,7 +342,7 @@ def _what_is_left(content):
         return "Nothing should be added to the model before its cause is known."
     where, part = content["where_left"], content["left_share"]
     text = f"What is left, {share(part)} of the gap, is more than" if part else "What is left is"
-    text += f" noise {doubt(content['remainder_p_value'])}"
+    text += f" noise ({p_words(content['remainder_p_value'])})"
     if where and content["verdict"] != "unexplained":
         text += f": {where_words(where[0], 'it')}"
     if content.get("nested_percent") is not None:

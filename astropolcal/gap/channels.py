@@ -239,9 +239,8 @@ class _GroupLamp(_Lamp):
         total = self.summed(weight)
         return self.summed(values * weight) / np.where(total > 0, total, 1.0)
 
-    def brightness(self, shift, weight):
-        """Return the brightness of each frame, that of its group, (F,)."""
-        return self.mean(shift, weight)
+    # that of a frame is that of its group
+    brightness = mean
 
     def design(self, valid):
         """Return the columns of the lamp, shape (k, W, F)."""

@@ -336,22 +336,16 @@ def _about_frames(diagnosis):
     """Return a line on the frames that are left out, and one on those that calibrate would."""
     masked, used = [], []
     for o in diagnosis.nominal.observations:
-        masked += _frames_by_reason(o.name, o.mask, o.mask_reasons)
-        prepared = _prepared(o)
-        extra = prepared.mask & ~o.mask
-        new = [why for why, n in prepared.mask_reasons.items() if n > o.mask_reasons.get(why, 0)]
-        used += _frames_by_reason(o.name, extra, new)
+        prepared, known = _prepared(o), o.mask_reasons
+        new = [why for why, n in prepared.mask_reasons.items() if n > known.get(why, 0)]
+        for lines, mask, reasons in ((masked, o.mask, known), (used, prepared.mask & ~o.mask, new)):
+            count = int(mask.any(axis=1).sum())
+            why = f" ({', '.join(reasons)})" if reasons else ""
+            lines += [f"{count} of {len(mask)} frames of {o.name}{why}"] if count else []
     lines = [f"Left out, as the tables mask them: {_words.listed(masked)}."] if masked else []
     if used:
         lines.append(f"Used here, though calibrate masks them: {_words.listed(used)}.")
     return lines
-
-
-def _frames_by_reason(name, mask, reasons):
-    """Return how many frames of a dataset have masked cells, and why, or nothing."""
-    count = int(mask.any(axis=1).sum())
-    why = f" ({', '.join(reasons)})" if reasons else ""
-    return [f"{count} of {len(mask)} frames of {name}{why}"] if count else []
 
 
 def _prepared(observations):

@@ -201,8 +201,17 @@ def _sequence(data, terms, null):
     data.scale = max(data.scale, sum(one.excess for _, one in taken))
     left = [i for i in left if tested[i].rank]
     found = [(terms[left[k]], tested[left[k]]) for k in ranked([-tested[i].log_p for i in left])]
-    rows = [_row(term, one, data.scale) for term, one in taken + found]
-    return rows, _row(null, whole, data.scale) | {"kind": "place"}
+    rows = [
+        {
+            "axis": term.axis,
+            "detail": term.detail,
+            "kind": "pattern",
+            "share": float(np.clip(one.excess / data.scale, 0, 1)),
+            "p_single": float(np.exp(one.log_p)),
+        }
+        for term, one in [*taken, *found, (null, whole)]
+    ]
+    return rows[:-1], rows[-1] | {"kind": "place"}
 
 
 def _simplest(terms, tested, best):
@@ -285,16 +294,6 @@ def _test(gram, target, where, total, freedom):
     log_p = stats.chi2.logsf(statistic / scatter, rank)
     evidence = statistic / scatter - rank * np.log(max(freedom, 2))
     return _Tested(statistic, rank, root, log_p, evidence)
-
-
-def _row(term, tested, scale):
-    return {
-        "axis": term.axis,
-        "detail": term.detail,
-        "kind": "pattern",
-        "share": float(np.clip(tested.excess / scale, 0, 1)),
-        "p_single": float(np.exp(tested.log_p)),
-    }
 
 
 def frame_patterns(observations):

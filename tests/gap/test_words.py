@@ -98,7 +98,6 @@ def test_numbers_have_the_digits_that_count():
         assert _words.percent(value) == words
     for value, words in ((0.3, "0.3"), (2e-6, "2e-06"), (1e-7, "< 1e-6"), (0.0, "< 1e-6")):
         assert _words.p(value) == words
-        assert _words.doubt(value) in (f"(p {words})", f"(p = {words})")
     for value, words in ((0.0, "0 %"), (0.0049, "< 1 %"), (1.0, "100 %"), (None, "-")):
         assert _words.short_share(value) == words
     assert _words.change(1.234, None) == "1.2 -> -"
