@@ -290,12 +290,12 @@ class Frame:
     """One frame's differences beside what all others say of them."""
 
     def __init__(self, look, i, f, scatter=1.0):
-        self.look, self.i, self.f, self.scatter = look, i, f, scatter
+        self.look, self.i, self.f, self.frames, self.scatter = look, i, f, [f], scatter
         self.dataset, self.channel = look.problem.datasets[i], look.problem.channels[i]
         self.valid = self.channel.valid[:, f]
         told, self.single = self.channel.told, self.channel.groups is not None
-        self.sigma = self.channel.sigma[told, :, f] * np.sqrt(scatter)
-        self.weight = np.where(self.valid, 1 / self.sigma, 0.0)
+        sigma = self.channel.sigma[told, :, f] * np.sqrt(scatter)
+        self.weight = np.where(self.valid, 1 / sigma, 0.0)
         self.observed = self.channel.observed[told, :, f]
         missed, self._sight, weight = look.of_frame(i, f)
         plain = self.predicted(self._positions([f]))[:, 0]
@@ -316,10 +316,9 @@ class Frame:
 
     def predicted(self, positions):
         """Return the differences, or log fluxes of a single beam, at some positions, (W, n)."""
-        propagator = Propagator(
-            self.look.chains[self.i], self.dataset.propagator.wavelength, positions
-        )
-        right, left = propagator.fluxes(self.dataset.current_values(self.look.vector))
+        chain, values = self.look.chains[self.i], self.dataset.current_values(self.look.vector)
+        propagator = Propagator(chain, self.dataset.propagator.wavelength, positions)
+        right, left = propagator.fluxes(values)
         if self.single:
             return np.log(np.maximum(right, _TINY))
         return (right - left) / (right + left)
@@ -334,7 +333,7 @@ class Frame:
 
     def as_told(self):
         """Return the trial in which nothing is wrong."""
-        return Trial("none", float(self.with_positions_of([self.f])[0]), 0.0)
+        return Trial("none", float(self.with_positions_of(self.frames)[0]), 0.0)
 
     def trials(self):
         """Return all trials that need no other frame."""
@@ -364,8 +363,9 @@ class Frame:
         return Trial(f"{stage} angle", chi2, _occam(offset, error, _ANGLES), told + offset, error)
 
     def _turned(self, stage, offsets):
-        positions = self._positions(np.full(len(offsets), self.f))
-        positions[stage] = positions[stage] + offsets
+        """Return the sum of squares that each of some angles leaves, in all frames, (n,)."""
+        positions = self._positions(np.tile(self.frames, len(offsets)))
+        positions[stage] = positions[stage] + np.repeat(offsets, len(self.frames))
         return self.chi2(self.predicted(positions))
 
     def _refined(self, stage, offset):
@@ -439,23 +439,15 @@ class Group(Frame):
         #: Data less the brightness at each wavelength, and less an angle.
         self.freedom = int(valid.sum() - valid.any(axis=1).sum()) - 1
 
-    def as_told(self):
-        """Return the trial in which nothing is wrong."""
-        stage = next(iter(angle_stages(self.look.chains[self.i])))
-        return Trial("none", float(self._turned(stage, np.zeros(1))[0]), 0.0)
-
     def trials(self):
         """Return the trials in which a stage stood elsewhere in all frames, the best first."""
         angles = self._positions(self.frames)
         alike = [s for s in angle_stages(self.look.chains[self.i]) if np.ptp(angles[s]) == 0]
         return sorted((self.angle(stage) for stage in alike), key=lambda trial: trial.total)
 
-    def _turned(self, stage, offsets):
-        """Return the sum of squares that each of some angles leaves."""
-        count = len(self.frames)
-        positions = self._positions(np.tile(self.frames, len(offsets)))
-        positions[stage] = positions[stage] + np.repeat(offsets, count)
-        predicted = self.predicted(positions).reshape(len(self.observed), -1, count)
+    def chi2(self, difference):
+        """Return the sum of squares that logarithms of the flux (W, n times frames) leave, (n,)."""
+        predicted = difference.reshape(len(self.observed), -1, len(self.frames))
         left = self.observed[:, None] - predicted
         total = self._weight.sum(axis=-1, keepdims=True)
         mean = (self._weight * left).sum(axis=-1, keepdims=True) / np.where(total > 0, total, 1.0)

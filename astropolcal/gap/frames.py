@@ -151,14 +151,14 @@ def _verdict(look, place, trials, n_frames):
     weight /= weight.sum()
     if weight[0] > 1 - _CERTAIN:
         return None
-    by_kind = {}
-    for trial, w in zip(rest, weight[1:], strict=True):
-        by_kind[trial.what] = by_kind.get(trial.what, 0.0) + float(w)
+    by_kind, weights = {}, weight[1:].tolist()
+    for trial, w in zip(rest, weights, strict=True):
+        by_kind[trial.what] = by_kind.get(trial.what, 0.0) + w
     what = max(by_kind, key=by_kind.get)
     best = min((t for t in rest if t.what == what), key=lambda trial: trial.total)
     evidence = none.total - best.total + 2 * np.log(prior)
-    sides = [w for t, w in zip(rest, weight[1:], strict=True) if t.beam == best.beam]
-    best.beam = best.beam if sum(sides) > _TELLS * by_kind[what] else ""
+    side = sum(w for t, w in zip(rest, weights, strict=True) if t.beam == best.beam)
+    best.beam = best.beam if side > _TELLS * by_kind[what] else ""
     rivals = {}
     if by_kind[what] < _DECIDED:
         worst_first = sorted(rest, key=lambda trial: -trial.total)

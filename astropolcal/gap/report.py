@@ -8,7 +8,7 @@ All of them say the same: `to_dict` works it out, and the others show it.
 import base64
 import io
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from textwrap import wrap
 
@@ -350,16 +350,12 @@ def _about_frames(diagnosis):
 
 def _prepared(observations):
     """Return a dataset with the masks with which calibrate would take it."""
-    if observations.instrument is None:
-        return observations
-    with warnings.catch_warnings():
+    # of an unknown instrument, or if nothing would be left: calibrate refuses such a table
+    with warnings.catch_warnings(), suppress(AstropolcalError):
         # what is masked is said in our own words
         warnings.simplefilter("ignore", AstropolcalWarning)
-        try:
-            return instruments.get(observations.instrument).prepare(observations)
-        except AstropolcalError:
-            # an unknown instrument, or nothing would be left: calibrate refuses such a table
-            return observations
+        return instruments.get(str(observations.instrument)).prepare(observations)
+    return observations
 
 
 def _images(figures):
