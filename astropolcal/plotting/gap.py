@@ -27,23 +27,21 @@ _COVERED = 99.5
 _LONGEST_NAME = 30
 
 
-def _gaps(model, noise):
-    """Return residuals in percent without the lamp, one array (2, W, F) a dataset."""
-    gaps = model.problem.differences(model.fit.coefficients)
-    # whitened by the same noise before and after, lest the two differ by their lamps
-    return [
-        np.where(channel.valid, 100 * channel.whiten(gap) * channel.sigma, np.nan)
-        for channel, gap in zip(noise.problem.channels, gaps, strict=True)
-    ]
-
-
 def _datasets(diagnosis):
-    """Return short name, observations, wavelengths (nm), and gaps before and after, of each."""
-    nominal, improved = diagnosis.nominal, diagnosis.improved
-    names = [shortened(one.name, _LONGEST_NAME) for one in nominal.observations]
-    nm = [1000 * nominal.problem.wavelength[one.bins] for one in nominal.problem.datasets]
-    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
-    return list(zip(names, nominal.observations, nm, before, after, strict=True))
+    """
+    Return short name, observations, wavelengths (nm), and gaps before and after, of each dataset.
+
+    Gaps are residuals in percent without the lamp, (2, W, F).
+    """
+    models, problem, found = (diagnosis.nominal, diagnosis.improved), diagnosis.nominal.problem, []
+    pairs = zip(*(m.problem.differences(m.fit.coefficients) for m in models), strict=True)
+    for dataset, channel, pair in zip(problem.datasets, problem.channels, pairs, strict=True):
+        # whitened by the same noise before and after, lest the two differ by their lamps
+        gaps = (100 * channel.whiten(gap) * channel.sigma for gap in pair)
+        name = shortened(dataset.observations.name, _LONGEST_NAME)
+        gaps = (np.where(channel.valid, gap, np.nan) for gap in gaps)
+        found.append((name, dataset.observations, 1000 * problem.wavelength[dataset.bins], *gaps))
+    return found
 
 
 def _finish(figure, axes, diagnosis, title):

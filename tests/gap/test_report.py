@@ -166,7 +166,6 @@ def test_double_differences_are_those_of_calibrate(found, content):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_what_was_worked_out_is_only_shown(found, content, tmp_path, monkeypatch):
     """No fit, however often and in which form a diagnosis is written."""
 
