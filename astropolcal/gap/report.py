@@ -222,23 +222,18 @@ def causes_table(diagnosis):
     >>> len(causes_table(SimpleNamespace(causes=[])))
     0
     """
-    causes = diagnosis.causes
-    percent = [[np.nan if h is None else h.percent for h in (c.before, c.after)] for c in causes]
-    before, after = np.reshape(percent, (-1, 2)).T * u.percent
-    aliases = [", ".join(one.name for one, _ in c.aliases) for c in causes]
-    return QTable(
-        {
-            "rank": np.arange(1, len(causes) + 1),
-            "effect": np.array([c.name for c in causes], dtype=str),
-            "place": np.array([c.effect.place for c in causes], dtype=str),
-            "cannot_be_told_from": np.array(aliases, dtype=str),
-            "probability": np.array([c.probability for c in causes], dtype=float),
-            "explained": np.array([c.explained for c in causes], dtype=float),
-            "physical": np.array([c.physical for c in causes], dtype=bool),
-            "gap_before": before,
-            "gap_after": after,
-        }
-    )
+    rows = []
+    for i, c in enumerate(diagnosis.causes, 1):
+        aliases = ", ".join(one.name for one, _ in c.aliases)
+        gaps = [np.nan if h is None else h.percent for h in (c.before, c.after)]
+        told = (c.effect.place, aliases, c.probability, c.explained, c.physical)
+        rows.append((i, c.name, *told, *gaps))
+    columns = {"rank": int, "effect": str, "place": str, "cannot_be_told_from": str}
+    columns |= {"probability": float, "explained": float, "physical": bool}
+    gaps = dict.fromkeys(("gap_before", "gap_after"), u.percent)
+    columns |= dict.fromkeys(gaps, float)
+    kinds = list(columns.values())
+    return QTable(rows=rows or None, names=list(columns), dtype=kinds, units=gaps)
 
 
 # ---- for the terminal ------------------------------------------------------------------------
