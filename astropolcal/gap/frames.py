@@ -240,7 +240,7 @@ def _fault(problem, place, trial, evidence, probability):
 
 
 def _words(fault, told, beam):
-    """Return what is wrong with a frame, of which the table told an angle, degree."""
+    """Return what is wrong with a frame, beside the angle (degree) that its table states."""
     if not fault.what.endswith(" angle"):
         off = None if fault.value is None else f"{100 * abs(fault.value - 1):.2g} %"
         return {

@@ -386,9 +386,9 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     panels = [None, *sizes] if dependence else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
-    entry = {"size": [p.name for p in model.added.get(effect) or ()], "cell": None}
-    entry["cell"] = cause.cell and cause.cell.to_dict()
-    words = dict(zip(entry["size"], labels(entry), strict=True))
+    keys = [p.name for p in model.added.get(effect) or ()]
+    cell = cause.cell.to_dict() if cause.cell else None
+    words = dict(zip(keys, labels({"size": keys, "cell": cell}), strict=True))
     columns = min(len(panels), 2)
     with st.canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
         for axes, name in zip(st.grid(figure, len(panels), columns)[0], panels, strict=True):
