@@ -160,7 +160,7 @@ class Fitted:
 
     @cached_property
     def _directions(self):
-        """A root of the covariance for unit noise, and the directions that the data do not determine."""
+        """Root of the covariance for unit noise, and directions that data do not determine."""
         singular, right, scale = self.problem.decomposed(self.model.fit.coefficients)
         good = singular > OPEN * singular[0]
         # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
