@@ -65,15 +65,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
     limit = _top(np.abs([panels[name] for name in _POLARIZED]))
-    height, width = corrected.stokes.shape[2:]
-    x, y = corrected._middle()
-    # milliarcseconds to arcseconds
-    step = 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
-    # pixel centres are whole numbers: the image reaches half a pixel further
-    extent = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
-    if corrected.north_up:
-        # east is positive, and to the left on the sky
-        extent *= [-1, -1, 1, 1]
+    extent = _extent(corrected)
     with st.canvas(figure, 12.5, 8.2) as figure:
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
@@ -145,6 +137,18 @@ def _top(values):
     known = values[np.isfinite(values)]
     top = np.quantile(known, _QUANTILE) if known.size else 1.0
     return top if top > 0 else 1.0
+
+
+def _extent(corrected):
+    """Return the edges of the image about the star; east is positive and to the left."""
+    height, width = corrected.stokes.shape[2:]
+    x, y = corrected._middle()
+    # milliarcseconds to arcseconds
+    step = 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
+    # pixel centres are whole numbers: the image reaches half a pixel further
+    edges = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
+    # east is to the left on the sky
+    return edges * ([-1, -1, 1, 1] if corrected.north_up else 1)
 
 
 def _axis_label(corrected, direction):
