@@ -739,22 +739,25 @@ class _LinearOptic(Optic):
     """An optic whose matrix is a constant, with elements in proportion to its parameters."""
 
     _constant = np.zeros((4, 4))
-    # for each parameter the rows, columns and factors of the elements that it adds to
+    # for each parameter a factor, and rows and columns of the elements that it adds to
     _elements = ()
 
     def _matrix(self, dispersion, *values):
-        out = blank(*values)
+        if not values:
+            return self._constant
+        out = np.empty((*np.broadcast(*values).shape, 4, 4))
         out[...] = self._constant
-        for value, elements in zip(values, self._elements, strict=True):
-            for row, column, factor in elements:
-                out[..., row, column] += factor * value
+        for value, (factor, places) in zip(values, self._elements, strict=True):
+            change = factor * value
+            for row, column in places:
+                out[..., row, column] += change
         return out
 
     def _derivatives(self, dispersion, *values):
         slopes = []
-        for elements in self._elements:
+        for factor, places in self._elements:
             out = blank(*values)
-            for row, column, factor in elements:
+            for row, column in places:
                 out[..., row, column] = factor
             slopes.append(out)
         return tuple(slopes)

@@ -276,7 +276,7 @@ class MuellerElement(_LinearOptic):
     OpticParameter('m33', value=0.8, fixed=True, bounds=(-1, 1))
     """
 
-    _elements = tuple(((*place, 1.0),) for place in _ELEMENTS)
+    _elements = tuple((1.0, (place,)) for place in _ELEMENTS)
     m00, m01, m02, m03 = (_element(0, j) for j in range(4))
     m10, m11, m12, m13 = (_element(1, j) for j in range(4))
     m20, m21, m22, m23 = (_element(2, j) for j in range(4))

@@ -224,7 +224,7 @@ class Depolarizer(_LinearOptic):
 
     # the intensity is kept
     _constant = UNITS[0, 0]
-    _elements = (((1, 1, 1.0),), ((2, 2, 1.0),), ((3, 3, 1.0),))
+    _elements = tuple((1.0, ((i, i),)) for i in (1, 2, 3))
 
 
 # sign of eta: the right beam is the ordinary one
@@ -281,8 +281,7 @@ class WollastonPrism(_BeamOptic, _LinearOptic):
 
     @property
     def _elements(self):
-        half = 0.5 * BEAMS[self._beam]
-        return (((0, 1, half), (1, 0, half)),)
+        return ((0.5 * BEAMS[self._beam], ((0, 1), (1, 0))),)
 
     def beams(self, wavelength, I, Q, U, V):  # noqa: E741
         """
@@ -340,4 +339,4 @@ class BeamGain(_BeamOptic, _LinearOptic):
 
     @property
     def _elements(self):
-        return (tuple((i, i, BEAMS[self._beam]) for i in range(4)),)
+        return ((BEAMS[self._beam], ((0, 0), (1, 1), (2, 2), (3, 3))),)

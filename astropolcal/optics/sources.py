@@ -46,7 +46,7 @@ class Light(_LinearOptic):
     U = Parameter(default=0.0, fixed=True, description="U of the light")
     V = Parameter(default=0.0, fixed=True, description="V of the light")
 
-    _elements = tuple(((row, 0, 1.0),) for row in range(4))
+    _elements = tuple((1.0, ((row, 0),)) for row in range(4))
 
     def evaluate(self, wavelength, *parameters):
         """Return ``wavelength`` and the Stokes parameters of the light."""
@@ -89,7 +89,7 @@ class PolarizedSource(_LinearOptic):
     u = Parameter(default=0.0, bounds=(-0.7, 0.7), description="U over I of the source")
 
     # only the first column: whatever polarization arrives is forgotten
-    _constant, _elements = UNITS[0, 0], (((1, 0, 1.0),), ((2, 0, 1.0),))
+    _constant, _elements = UNITS[0, 0], ((1.0, ((1, 0),)), (1.0, ((2, 0),)))
 
 
 class StarSource(PolarizedSource):
