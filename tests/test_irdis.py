@@ -25,7 +25,6 @@ from astropolcal.exceptions import (
     ObservationError,
 )
 from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
-from astropolcal.gap.effects import where as roles_module
 from astropolcal.instruments import IRDIS
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations, pointing
@@ -582,15 +581,6 @@ def minimal(plate=True):
     return chain
 
 
-@pytest.fixture
-def diattenuating_plates(monkeypatch):
-    """Plates and derotators that also attenuate count as such."""
-    retards = roles_module._retards
-    monkeypatch.setattr(
-        roles_module, "_retards", lambda o: retards(o) or isinstance(o, optics.DiattenuatorRetarder)
-    )
-
-
 def test_no_effect_of_an_optic_that_is_absent():
     for place in ["derotator", "telescope", "tertiary", "sky"]:
         found = {effect.name for effect in adapted(EFFECTS.values(), [minimal()])}
@@ -626,7 +616,7 @@ def test_effect_of_what_is_free_is_not_offered():
 
 
 @pytest.mark.slow
-def test_every_effect_with_a_place_in_irdis_does_what_it_must(diattenuating_plates):
+def test_every_effect_with_a_place_in_irdis_does_what_it_must():
     """Identity at zero, new names, and analytic derivatives, of the whole library."""
     for source in ["lamp", "star"]:
         if source == "star":
@@ -647,7 +637,7 @@ def test_every_effect_with_a_place_in_irdis_does_what_it_must(diattenuating_plat
             check_effect(name, chains, [table])
 
 
-def test_an_effect_edits_one_optic_of_a_kind(diattenuating_plates):
+def test_an_effect_edits_one_optic_of_a_kind():
     """Four diattenuating retarders, but one half-wave plate and one derotator."""
     chain, context = IRDIS_.chain("star"), Context(IRDIS_.wavelength.to_value(u.um))
     roles = Roles(chain)

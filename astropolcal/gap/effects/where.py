@@ -17,8 +17,11 @@ SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
 _NO_STAGES = (None, "parallactic", "altitude")
 _RETARDERS = (
-    *(optics.LinearRetarder, optics.EllipticalRetarder, optics.TwoLayerWaveplate),
-    *(optics.DiattenuatorRetarder, optics.KMirror),
+    optics.LinearRetarder,
+    optics.EllipticalRetarder,
+    optics.TwoLayerWaveplate,
+    optics.DiattenuatorRetarder,
+    optics.KMirror,
 )
 _BEHIND, _BEHIND_PLATE = "downstream of the derotator", "downstream of the half-wave plate"
 
