@@ -496,6 +496,33 @@ def test_steps_from_a_damaged_one_on_are_computed_again(small, tmp_path, torn, m
     assert kept == list(range(torn + 1, 61))
 
 
+def test_steps_that_another_run_has_left_behind_are_computed_again(small, tmp_path):
+    """Killed while it overwrote the steps behind a damaged one, where it had gone another way."""
+    first, second = tmp_path / "first.h5", tmp_path / "second.h5"
+    without_seed = RUN | {"seed": None}
+    quiet_sample(small, **without_seed, checkpoint=first)
+    whole = quiet_sample(small, **without_seed, checkpoint=second)
+    steps, start = stored_steps(first)
+    end = start + 30 * steps.itemsize
+    first.write_bytes(second.read_bytes()[:end] + first.read_bytes()[end:])
+    assert quiet_sample(small, **without_seed, checkpoint=first) == whole
+
+
+def test_damaged_words_of_a_checkpoint_are_refused(small, tmp_path):
+    path = tmp_path / "chain.h5"
+    quiet_sample(small, **RUN, checkpoint=path)
+    good = path.read_bytes()
+    text = good[: good.index(b"}")]
+    # in the place of the steps, the length of the text, and a number of the run
+    numbers = text.index(b"\n") + 1
+    for at in (numbers, text.index(b" ", numbers) + 1, text.rindex(b".") + 1):
+        content = bytearray(good)
+        content[at] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(FitError, match=r"chain\.h5: the checkpoint is damaged"):
+            quiet_sample(small, **RUN, checkpoint=path)
+
+
 def test_checkpoint_in_use(small, tmp_path):
     path = tmp_path / "chain.h5"
     quiet_sample(small, **RUN, checkpoint=path)

@@ -6,7 +6,9 @@ fails it takes the process with it. The block before its structures, which it le
 says where the steps are and (JSON) of which run, so that no structure is read that may be damaged.
 All steps have the same size, with their number, the state of the random numbers and a CRC; a run
 writes them in place. What counts is the beginning of the file up to the first step that is not
-whole; the rest is computed again, with the same random numbers.
+whole; the rest is computed again, with the same random numbers. The CRC goes on from that of the
+step before: what an earlier run has left behind a step that was computed again may follow from
+other places of the walkers, where another machine rounds otherwise or no seed was given.
 """
 
 import errno
@@ -28,6 +30,7 @@ __all__ = []
 _FORMAT = b"astropolcal posterior checkpoint 3\n"
 _KEYS = 624  # words of the state of MT19937
 _LEAST_BLOCK = 512  # of HDF5, before its structures; larger ones are twice, four times ... as large
+_LONGEST = 2**29  # bytes that may say of which run the steps are
 
 
 def _step(n_walkers, n_parameters):
@@ -47,8 +50,9 @@ def _step(n_walkers, n_parameters):
     return np.dtype(fields)
 
 
-def _crc(step):
-    return zlib.crc32(step.tobytes()[:-4])
+def _crc(step, before):
+    """Return the CRC of a step, which goes on from that of the step before."""
+    return zlib.crc32(step.tobytes()[:-4], before)
 
 
 class Chain:
@@ -107,10 +111,12 @@ class Chain:
         """Take the steps of a file."""
         self._file.seek(self._start)
         found = np.fromfile(self._file, self._steps.dtype, len(self._steps))
+        before = 0
         for number, step in enumerate(found, 1):
-            if step["number"] != number or step["crc"] != _crc(step):
+            if step["number"] != number or step["crc"] != _crc(step, before):
                 break
             self.count = self.saved = number
+            before = int(step["crc"])
         self._steps[: self.count] = found[: self.count]
 
     def _create(self, path, description, arrays):
@@ -133,8 +139,10 @@ class Chain:
             if stream.error is not None:
                 raise stream.error
             size = stream.seek(0, os.SEEK_END)
+            # of both: the place is what the CRC of the text begins with
+            numbers = f"{self._start} {len(stated)} {zlib.crc32(stated, self._start)}\n"
             for place, content in (
-                (0, _FORMAT + f"{self._start:020}\n".encode() + stated + b"\n"),
+                (0, _FORMAT + numbers.encode() + stated + b"\n"),
                 (self._start, self._steps[: self.count].view(np.uint8)),
             ):
                 stream.seek(place)
@@ -144,10 +152,11 @@ class Chain:
     def append(self, coords, log_prob, random_state, accepted):
         """Keep a step; bring the file up to date when it is time."""
         step = self._steps[self.count : self.count + 1]
+        before = int(self._steps["crc"][self.count - 1]) if self.count else 0
         self.count += 1
         _, keys, *generator = random_state
         step[0] = (coords, log_prob, accepted, generator, keys, self.count, 0)
-        step["crc"] = _crc(step)
+        step["crc"] = _crc(step, before)
         if self.count - self.saved >= self.every:
             self.flush()
 
@@ -225,9 +234,13 @@ def _head(stream, path):
     if stream.read(len(_FORMAT)) != _FORMAT:
         raise FitError(f"{path}: is not a checkpoint of this version")
     with understood(path, FitError, "the checkpoint is damaged"):
-        start, stated = int(stream.readline(100)), json.loads(stream.readline())
-        if not 0 < start < os.path.getsize(path):
-            raise ValueError(f"its steps begin at byte {start}")
+        start, length, crc = map(int, stream.readline(100).split())
+        if not (0 <= length < min(start, _LONGEST) and start < os.path.getsize(path)):
+            raise ValueError(f"its steps begin at byte {start}, behind a text of {length}")
+        stated = stream.read(length)
+        if zlib.crc32(stated, start) != crc:
+            raise ValueError("what it says of the run does not match its CRC")
+        stated = json.loads(stated)
         arrays = {key: np.array(values, float) for key, values in stated["arrays"].items()}
         return start, int(stated["room"]), dict(stated["description"]), arrays
 
