@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Sequential calibration, joint calibration of lamps and stars, and robust losses."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from astropolcal.calibration.noise import outlying_data
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.noise.weighting import LOSSES
 from astropolcal.exceptions import FitError
+from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -255,6 +258,15 @@ def test_weights_of_the_losses():
     assert np.all(np.diff(LOSSES["cauchy"](residuals)) < 0)
 
 
-def test_unknown_loss_is_an_error(data):
-    with pytest.raises(FitError, match=r"loss = 'l3'; allowed are linear, huber, cauchy, bisquare"):
+def test_unknown_loss_is_an_error(data, fitted):
+    from astropolcal.calibration.noise.weighting import weighting_of
+
+    message = r"loss = 'l3'; allowed are linear, huber, cauchy, bisquare"
+    with pytest.raises(FitError, match=message):
         calibrate(*data, loss="l3")
+    # the text of a calibration that was read from a file may be any
+    cal = fitted["joint"]
+    live = Measurement(cal.chains, data[1], wavelength=cal.wavelength)
+    settings = cal.settings | {"weights": "given", "loss": "l3"}
+    with pytest.raises(FitError, match=message):
+        weighting_of(replace(cal, settings=settings, measurement=live))

@@ -232,20 +232,19 @@ class Model:
         for what, course in vary.items():
             check_choice(f"vary: {what}", course, COURSES, ParameterError)
             names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
+            # of a drift, and of a step at an event, every element has its own
+            law, waves, found = np.eye(len(names)), waves_of(self.dates), []
             if course in ("walk", "scatter"):
                 found = [self._weighed(names, self._parts()).best([course])]
-            else:
-                gaps = {"steps": np.flatnonzero(self.chances == EVENT).tolist(), "drift": [None]}
-                times, law = waves_of(self.dates).get(course), np.eye(len(names))
-                # of a drift, and of a step at an event, every element has its own
-                found = [
-                    Try(0.0, course, gap, law, times[:, [gap or 0]], np.inf)
-                    for gap in gaps.get(course, [])
-                ]
-            if course == "steps" and not found:
-                raise ParameterError(
-                    f"vary: {what} has steps, but there is no event between the runs"
-                )
+            elif course == "drift":
+                found = [Try(0.0, course, None, law, waves[course][:, [0]], np.inf)]
+            elif course == "steps":
+                for gap in np.flatnonzero(self.chances == EVENT).tolist():
+                    found.append(Try(0.0, course, gap, law, waves[course][:, [gap]], np.inf))
+                if not found:
+                    raise ParameterError(
+                        f"vary: {what} has steps, but there is no event between the runs"
+                    )
             for one in found:
                 self._take([*self.terms, self._term(what, names, one)])
 

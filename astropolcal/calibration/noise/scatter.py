@@ -51,8 +51,10 @@ def leave_out_groups(measurement, by="derotator"):
     for dataset in measurement.datasets:
         plus, table = dataset.frames[:, 0], dataset.observations
         turns = "derotator" in table.frames.colnames and "parallactic" not in dataset.positions
-        if by in ("dataset", "pair"):
-            number = np.arange(len(plus)) * (by == "pair")
+        if by == "dataset":
+            number = np.zeros(len(plus), dtype=int)
+        elif by == "pair":
+            number = np.arange(len(plus))
         elif by == "derotator" and turns:
             number = clusters(table.position("derotator")[plus])
         else:

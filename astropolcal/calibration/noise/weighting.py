@@ -20,7 +20,7 @@ from astropolcal.calibration.identifiability.linearized import Whitened, triangl
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]
 
@@ -44,6 +44,8 @@ LOSSES = {
 
 def robust_sigma(measurement, loss):
     """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
+    # that of a calibration from a file may be any text
+    check_choice("loss", loss, LOSSES, FitError)
     residuals = measurement.residuals()
     scale = _scales(measurement, residuals)
     # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
@@ -161,8 +163,10 @@ class Weighting:
 
     def __init__(self, choice, sigma):
         self.choice, self.sigma = choice, sigma
-        #: Whether every datum has a noise, and whether it comes from the residuals of the fit.
-        self.is_known, self.from_residuals = not np.isnan(sigma).any(), choice in CHOICES[:2]
+        #: Whether every datum has a noise.
+        self.is_known = not np.isnan(sigma).any()
+        #: Whether the noise comes from the residuals of the fit.
+        self.from_residuals = choice in (None, "wavelength")
         #: One over the noise of each datum; None where all weigh the same.
         self.weight = 1 / sigma if choice is not None and self.is_known else None
         #: Standard deviation of a datum of weight one, against which priors weigh.
@@ -304,7 +308,7 @@ def first_weighting(measurement, weights):
                 f"the noise is that of {sigma.size} data, the measurement has "
                 f"{measurement.n_data}; estimate it from this measurement"
             )
-        return _known(GIVEN, sigma, f"noise from {weights.method}: {{}} of {{}} data have none")
+        return _known(GIVEN, sigma, f"noise from {weights.method}: ", "have none")
     if weights is not None and not isinstance(weights, str):
         sigma = given_noise(measurement, weights)
         if np.median(sigma) > _LARGEST:
@@ -323,13 +327,14 @@ def first_weighting(measurement, weights):
         )
     if weights != "errors":
         return Weighting(weights, np.full(measurement.n_data, np.nan))
-    return _known("errors", measurement.sigma, "weights='errors', but {} of {} data have no error")
+    return _known("errors", measurement.sigma, "weights='errors', but ", "have no error")
 
 
-def _known(choice, sigma, words):
+def _known(choice, sigma, before, after):
+    """Return the noise; words around the number of data without one if there are such."""
     bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
-        raise FitError(words.format(bad.sum(), bad.size))
+        raise FitError(f"{before}{bad.sum()} of {bad.size} data {after}")
     return Weighting(choice, sigma)
 
 
@@ -435,7 +440,8 @@ def _by_wavelength(measurement, leverage):
                 "weights"
             )
         levels[i] = np.sqrt(total / freedom) if row.size else np.nan
-    for own in (numbers == i for i in np.unique(numbers[np.isfinite(levels)])):
+    for number in np.unique(numbers[np.isfinite(levels)]):
+        own = numbers == number
         levels[own] = np.fmax(levels[own], _FLOOR * np.nanmedian(levels[own]))
     return np.repeat(levels, [row.size for row in rows])
 

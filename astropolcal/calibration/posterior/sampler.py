@@ -464,7 +464,8 @@ def sample(
         log_posterior.units,
         # from canonical to declared units
         chain.coords[:kept] / log_posterior.factors,
-        chain.log_prob[:kept],
+        # a part of the steps would hold them all in memory
+        chain.log_prob[:kept].copy(),
         acceptance=chain.accepted / (kept * thin),
         fitted=log_posterior.centre / log_posterior.factors,
         thin=thin,

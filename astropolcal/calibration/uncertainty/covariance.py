@@ -112,7 +112,8 @@ class Covariance:
     def __eq__(self, other):
         if not isinstance(other, Covariance):
             return NotImplemented
-        return same_content(vars(self), vars(other))
+        keys = ("names", "units", "matrix", "factor", "null")
+        return all(same_content(getattr(self, key), getattr(other, key)) for key in keys)
 
     __hash__ = None
 
@@ -232,7 +233,7 @@ class Covariance:
 
 
 def same_content(a, b):
-    """Return whether dictionaries of arrays are equal, NaN to NaN, which `==` of them is not."""
+    """Return whether values, or dictionaries of arrays, are equal, NaN to NaN as `==` is not."""
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(same_content(a[key], b[key]) for key in a)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):

@@ -379,7 +379,7 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     measurement, labels = refit.measurement, labels_of(refit.measurement, block)
     # for each dataset the block of each datum
     blocks = [
-        _numbered(labels[segment], f"{dataset.observations.name} has {{}} {block} blocks")
+        _numbered(labels[segment], f"{dataset.observations.name} has ", f" {block} blocks")
         for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True)
     ]
     counts = [int(numbers.max()) + 1 for numbers in blocks]
@@ -414,12 +414,16 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     return Resampled(known.names, known.units, samples, block, sum(counts), rejected)
 
 
-def _numbered(labels, words):
-    """Return the number of the group of each datum, of which there are enough."""
+def _numbered(labels, before, after):
+    """Return the number of the group of each datum; words around their count if there are too few.
+
+    The words may hold the name of a dataset, which may hold anything.
+    """
     _, numbers = np.unique(labels, return_inverse=True)
-    if numbers.max() + 1 < _FEWEST:
+    count = int(numbers.max()) + 1
+    if count < _FEWEST:
         raise FitError(
-            f"{words.format(numbers.max() + 1)}; {_FEWEST} are needed, and many more to be accurate"
+            f"{before}{count}{after}; {_FEWEST} are needed, and many more to be accurate"
         )
     return numbers
 
@@ -598,7 +602,7 @@ def robust_covariance(calibration, groups="derotator"):
         raise FitError(
             f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one per datum"
         )
-    numbers = _numbered(labels, "{} groups for a robust covariance")
+    numbers = _numbered(labels, "", " groups for a robust covariance")
     residuals = problem.residuals(problem.solution)[: measurement.n_data]
     # derivatives to the determined directions, each in units of its standard error
     slopes = whitened.along(whitened.rows)
