@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Figures of a diagnosis: the gap by wavelength and frame, its maps, and its causes."""
 
-import re
 import textwrap
 
 import numpy as np
@@ -323,25 +322,17 @@ _AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear
 _CELL = 8
 # probabilities that are not written, and from which the ground is dark
 _LEAST, _DARK = 0.01, 0.65
-# words in the place of a named effect, and the place that they mean
-_PLACES = {
-    "detector|spectrograph": "detector",
-    "upstream of": "source",
-    "downstream of the derotator": "after:derotator",
-    "half-wave plate": "in:hwp",
-    "derotator": "in:derotator",
-    "source|polarizer|star|sky|mirror|telescope": "source",
-}
 
 
 def _cause_map(diagnosis):
     """Return {place: {family: (probability, what)}}, places in the order of the light."""
-    rows = {p.name: {} for chain in diagnosis.nominal.chains for p in places(chain)}
+    chains = diagnosis.nominal.chains
+    rows = {p.name: {} for chain in chains for p in places(chain)}
     rows["detector"] = rows.pop("detector", {})
     for cause in diagnosis.causes:
         own, words = {}, {}
         for one, part in [(cause, cause.share), *cause.aliases]:
-            place, family, what = _on_map(one.effect, one.cell)
+            place, family, what = _on_map(one.effect, one.cell, chains)
             own[place, family] = own.get((place, family), 0.0) + part * cause.probability
             words.setdefault((place, family), what)
         for (place, family), chance in own.items():
@@ -351,18 +342,35 @@ def _cause_map(diagnosis):
     return rows
 
 
-def _on_map(effect, cell):
+def _on_map(effect, cell, chains):
     """Return place, family and what exactly of a cause."""
     if cell is not None:
         family, _, axis = cell.kind.partition("_")
         known = family in _FAMILIES
         what = _AXES.get(axis, axis) if known else cell.kind.replace("_", " ")
         return cell.place, family if known else _FAMILIES[-2], what
-    known = (place for words, place in _PLACES.items() if re.search(words, effect.place))
-    place = next(known, effect.place)
+    place = _place_of(effect, chains)
     words = f"{effect.name} {effect.title}"
     family = next((family for family in _FAMILIES[:4] if family in words), _OTHER)
     return place, _FAMILIES[-2] if place == "detector" else family, "named"
+
+
+def _place_of(effect, chains):
+    """Return the place of a named effect that is no cell, in the first chain with its optic."""
+    where = effect.where
+    if where is None:
+        return effect.place
+    every = [effect.roles(chain) for chain in chains]
+    there = [roles for roles in every if where.anchor(roles) is not None]
+    roles = (there or every)[0]
+    optic = where.anchor(roles)
+    # behind a splitter the light is on its way to the detector
+    if optic is not None and optic.splits_light and where.relation != "before":
+        return "detector"
+    place = where.cell_place(roles)
+    known = {one.name for chain in chains for one in places(chain)} | {"detector"}
+    # what turns with the sky, and is no optic, has no frame of its own on the map
+    return place if place in known else where.in_front_of(roles)
 
 
 def plot_effect_sizes(diagnosis, effect, *, figure=None):

@@ -16,13 +16,14 @@ from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, diagnose, get_effect
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.effects import EffectParameter
+from astropolcal.gap.effects import Effect, EffectParameter
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.plotting import gap as figures
 from astropolcal.plotting._style import BLACK
 from astropolcal.plotting.gap import (
     _cause_map,
+    _on_map,
     plot_cause_map,
     plot_effect_sizes,
     plot_gap_frames,
@@ -190,6 +191,29 @@ def test_named_effects_have_a_place_in_the_map():
         found = {k: row for k, row in _cause_map(diagnosis(cause(name))).items() if row}
         assert list(found) == [place]
         assert family in found[place] or family == "other"
+
+
+def test_an_effect_of_the_user_is_in_the_row_of_its_place():
+    """Whatever the optic is called; an alternative is where the optic is that it turns."""
+    glass = optics.LinearRetarder(retardance=0 * u.deg, name="pane")
+    charis = instruments.get("charis")
+    inside, on_sky = charis.chain(derotator="linear"), charis.chain("star")
+    for side, chain, place in (
+        ({"inside": "hwp"}, inside, "in:hwp"),
+        ({"after": "derotator"}, inside, "after:derotator"),
+        ({"before": "hwp"}, inside, "source"),
+        ({"before": "hwp"}, on_sky, "telescope"),
+        ({"after": "wollaston"}, inside, "detector"),
+    ):
+        own = Effect.insert(glass, **side, name="pane", title="a pane of the user")
+        assert _on_map(own, None, [chain])[0] == place, (side, place)
+    for name, place in (
+        ("hwp_sign", "in:hwp"),
+        ("mirror_flip", "after:derotator"),
+        ("parallactic_sign", "source"),
+        ("beams_swapped", "detector"),
+    ):
+        assert _on_map(get_effect(name), None, [on_sky])[0] == place, name
 
 
 def test_cells_that_matter_have_words():

@@ -478,7 +478,7 @@ _ALTERNATIVES = [
     laws.Alternative(
         "mirror_flip",
         "odd number of reflections downstream of the derotator, missing or in excess",
-        _RELAY.said, "relay", laws.flipped_behind, "everywhere: U and V have the wrong sign",
+        _RELAY.said, _RELAY, laws.flipped_behind, "everywhere: U and V have the wrong sign",
         when=lambda roles: roles.splitter is not None,
     ),
     # an odd number in all: two flips with only rotators between them are a rotation
