@@ -338,8 +338,10 @@ def simulated(names, size=None, seed=3):
 
 
 def assert_recovered(model, name, truth):
-    for key, (found, error, unit, _) in model.sizes(name).items():
-        off = (found - truth[key] / canonical_factor(unit)) / error
+    found, errors = model.fit.coefficients, model.problem.errors(model.fit.coefficients)
+    for key in (parameter.name for parameter in model.added[name]):
+        where = model.problem.slices[key]
+        off = (found[where] - truth[key]) / errors[where]
         assert np.all(np.abs(off) < 4), f"{key}: {off} standard errors"
 
 

@@ -197,10 +197,11 @@ def test_sizes_are_those_of_the_simulation(content):
 def test_angles_of_cells_are_in_degrees(found):
     located = with_cell(found, Cell("in:derotator", "retardance_h", "time"))
     (entry,) = to_dict(located)["causes"][0]["size"].values()
-    (radian, *_) = located.improved.sizes(located.causes[0].name).values()
+    model = located.improved
+    (radian,) = model.added[located.causes[0].name]
     assert entry["unit"] == "deg"
-    basis = radian[3].basis
-    assert entry["value"][0] == pytest.approx(np.rad2deg(basis @ radian[0])[0])
+    size = radian.basis @ model.fit.coefficients[model.problem.slices[radian.name]]
+    assert entry["value"] == pytest.approx(np.rad2deg(size))
 
 
 @pytest.mark.slow
