@@ -6,6 +6,7 @@ import textwrap
 
 import numpy as np
 
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
 from astropolcal.words import listed, p_words
 
@@ -199,7 +200,8 @@ def others(entry, ranks):
         if one not in same and one["name"] not in ranks:
             groups.setdefault(_outline(one), []).append(one)
     found = [(_title(g), sum(one["probability"] for one in g)) for g in groups.values()]
-    return [f"{words} ({share(chance)})" for words, chance in sorted(found, key=lambda x: -x[1])]
+    found = [found[i] for i in ranked([chance for _, chance in found])]
+    return [f"{words} ({share(chance)})" for words, chance in found]
 
 
 def cause(entry):

@@ -16,6 +16,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from astropolcal import progress
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.gap.attribution import ALIKE, scan
 from astropolcal.gap.cells import Cell, count_runs, split_run
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -664,5 +665,8 @@ def _members(chosen, beside, loss):
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())
-    members = [(one, float(weight / total)) for one, weight in weights.values()]
-    return sorted(members, key=lambda item: -item[1])
+    (_, most), *others = weights.values()
+    # of equally probable ones rounding alone would tell which comes first
+    others.sort(key=lambda item: item[0].name)
+    others = [others[i] for i in ranked([weight for _, weight in others])]
+    return [(one, float(weight / total)) for one, weight in [(own, most), *others]]
