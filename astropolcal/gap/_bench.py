@@ -2,8 +2,10 @@
 """
 Simulated calibrations with faults in them, for the challenge.
 
-Nothing of the diagnosis is used but names: Stokes vectors go through the Mueller matrices of the
-optics, and a fault is the matrix exponential of a generator, or something that no such matrix is.
+Stokes vectors go through the Mueller matrices of the optics, and a fault is the matrix exponential
+of a generator, or something that no such matrix is. What is shared with the diagnosis are optics
+and free parameters, generators and functions of the frame, the listed effects, and the names of
+what a detector does; nothing of its fits, noise, derivatives and evidence.
 """
 
 from dataclasses import dataclass

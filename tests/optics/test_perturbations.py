@@ -1,14 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Perturbations and their dependences on the frame; their matrices are in the registry's laws."""
 
+import astropy.units as u
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from astropolcal import optics
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import is_physical
+from astropolcal.mueller import is_physical, rotate
 from astropolcal.observations import Observations, example_table
 from astropolcal.optics import Perturbation
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
@@ -29,6 +31,28 @@ def test_a_perturbation_is_the_exponential_of_its_generator(kind, size, t):
         np.testing.assert_allclose(found, expm(size * t * GENERATORS[kind]), atol=1e-12)
     if kind.startswith(("retardance", "rotation", "diattenuation")):
         assert is_physical(found / found[0, 0])
+
+
+def test_generators_are_the_first_order_of_known_optics():
+    """Simulated challenges and the diagnosis share them: nothing else would show a wrong one."""
+    h = 1e-6
+    known = {
+        "retardance_h": optics.LinearRetarder(retardance=h * u.rad),
+        "retardance_d": optics.LinearRetarder(retardance=h * u.rad, theta=45 * u.deg),
+        "rotation": optics.Rotator(theta=h * u.rad),
+        "diattenuation_h": optics.Diattenuator(diattenuation=h),
+        "diattenuation_d": optics.Diattenuator(diattenuation=h, theta=45 * u.deg),
+        "depolarization_linear": optics.Depolarizer(retained_q=1 - h, retained_u=1 - h),
+        "depolarization_circular": optics.Depolarizer(retained_v=1 - h),
+    }
+    slopes = {kind: (optic.mueller(1.6 * u.um) - np.eye(4)) / h for kind, optic in known.items()}
+    # Q is lost and U is won, as a loss of Q alone is beside one of both
+    slopes["depolarization_h"] = np.diag([0.0, -1.0, 1.0, 0.0])
+    slopes["depolarization_d"] = rotate(slopes["depolarization_h"], 22.5 * u.deg)
+    slopes["diattenuation_c"] = np.fliplr(np.diag([1.0, 0.0, 0.0, 1.0]))
+    assert slopes.keys() | {"gain"} == GENERATORS.keys()
+    for kind, slope in slopes.items():
+        np.testing.assert_allclose(slope, GENERATORS[kind], atol=1e-5, err_msg=kind)
 
 
 def test_dependences_have_their_functions_and_drivers():
