@@ -309,11 +309,13 @@ def noise(channel, residual, angles, without=None):
         seen.variance = channel.variance[1:]
         sigma = frame_noise(seen, np.where(valid, level, 0.0)[None], angles)
         sigma = np.stack([np.ones_like(sigma[0]), sigma[0]])
+    if without is None:
+        return sigma
     for own, told in zip(sigma, np.sqrt(channel.variance), strict=True):
         stated = np.isfinite(told) & (told > 0) & channel.valid
-        if without is not None and (stated & valid).any():
-            wanted = stated & without
-            own[wanted] = told[wanted] * np.median((own / told)[stated & valid])
+        known, wanted = stated & valid, stated & without
+        if known.any():
+            own[wanted] = told[wanted] * np.median(own[known] / told[known])
     return sigma
 
 
