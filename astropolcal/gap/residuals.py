@@ -307,16 +307,16 @@ def frame_patterns(observations):
         if axis in known:
             found |= _harmonics(observations.position(axis), axis, orders)
     single = list(found.items())
-    for k in (2, 4):
-        plate = found.get(("hwp", _PLATE.format(k)))
+    second, fourth = ("hwp", _PLATE.format(2)), ("hwp", _PLATE.format(4))
+    for plate in (second, fourth):
         for (axis, words), other in single:
-            if plate is not None and axis != "hwp" and "harmonic 1 " not in words:
-                both = (plate[:, None] * other[None]).reshape(-1, plate.shape[1])
-                found[f"hwp x {axis}", f"{_PLATE.format(k)} times {words}"] = both
+            if plate in found and axis != "hwp" and "harmonic 1 " not in words:
+                both = (found[plate][:, None] * other[None]).reshape(-1, other.shape[1])
+                found[f"hwp x {axis}", f"{plate[1]} times {words}"] = both
     time = 2 * observations.position("sequence") - 1
     found["time", "a trend through the run"] = _legendre(time)
-    if plate is not None:
-        found["time x hwp", f"{_PLATE.format(4)} with a trend through the run"] = plate * time
+    if fourth in found:
+        found["time x hwp", f"{fourth[1]} with a trend through the run"] = found[fourth] * time
     if "hwp" in known:
         angle = np.mod(observations.position("hwp") + 1e-9, np.pi / 4)
         kinds = np.unique(np.round(angle, 4))[:8]

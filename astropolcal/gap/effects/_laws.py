@@ -44,7 +44,7 @@ def mirror_leaves(key, polarized=False):
             return False
         # nothing is free in what is not there; what is free takes the effect up
         names = () if mirror is None else set(mirror.param_names) - {"theta", key}
-        return all(is_held(getattr(mirror, key)) for key in names)
+        return all(is_held(getattr(mirror, name)) for name in names)
 
     return when
 
