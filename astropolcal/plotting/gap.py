@@ -356,7 +356,7 @@ def _on_map(effect, cell, chains):
 
 
 def _place_of(effect, chains):
-    """Return the place of a named effect that is no cell, in the first chain with its optic."""
+    """Return the place of a named effect that is not a cell, in a chain with its optic."""
     where = effect.where
     if where is None:
         return effect.place
