@@ -78,6 +78,8 @@ class FrameOptic(Optic):
     takes_numbers = True
 
     def _dispersion_at(self, wavelength):
+        # for its check of the wavelength
+        super()._dispersion_at(wavelength)
         # no law in wavelength: the coordinate takes the place of the dispersion
         return 0.0
 

@@ -244,3 +244,11 @@ def test_differential_gain_keeps_the_sum_of_equal_beams():
     ]
     np.testing.assert_allclose(sum(both), np.broadcast_to(2 * np.eye(4), (3, 4, 4)), atol=1e-15)
     assert np.abs(both[0] - both[1]).max() > 0.1
+
+
+def test_wavelength_that_is_none_is_refused():
+    """Also by optics that depend on no wavelength."""
+    for optic in [cls() for cls in OPTICS.values()]:
+        for wavelength in (-1.0, 0.0, np.nan) * u.um:
+            with pytest.raises(ParameterError, match="must be positive"):
+                optic.mueller(wavelength)
