@@ -10,11 +10,12 @@ from importlib.metadata import entry_points
 
 from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
-from astropolcal.instruments import charis, irdis, nominal, subaru, vampires
 from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.nominal import FORS2, GPI, NIRC2, MagAOX, NaCo, RomanCoronagraph
+from astropolcal.instruments.subaru import IRCS, REACH, FastPDI, HiCIAO
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
 
@@ -135,8 +136,7 @@ def get(name):
     )
 
 
-for _module in (charis, irdis, nominal, subaru, vampires):
-    for _cls in list(vars(_module).values()):
-        _own = getattr(_cls, "__module__", None) == _module.__name__
-        if _own and isinstance(_cls, type) and issubclass(_cls, Instrument):
-            register(_cls)
+_AT_SUBARU = CHARIS, FastPDI, HiCIAO, IRCS, REACH, VAMPIRES
+_ELSEWHERE = FORS2, GPI, IRDIS, MagAOX, NIRC2, NaCo, RomanCoronagraph
+for _cls in _AT_SUBARU + _ELSEWHERE:
+    register(_cls)
