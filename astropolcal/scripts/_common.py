@@ -147,7 +147,7 @@ def _seen(path, place, done, look=os.stat):
 def _check_output(path):
     if isinstance(path, Folder):
         # it is made later, inside the nearest folder that exists
-        place = next(p for p in [path, *Path(path).absolute().parents] if os.path.exists(p))
+        place = next(p for p in [Path(path), *Path(path).absolute().parents] if os.path.exists(p))
         if not os.path.isdir(place):
             raise AstropolcalError(f"{place}: is a file, not a folder")
         for part in Path(path).parts:

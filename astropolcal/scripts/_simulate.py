@@ -122,9 +122,9 @@ def run(arguments):
     if arguments.cubes:
         response = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
         detector = DetectorModel(noise=not arguments.no_noise, **response)
-        options = {"image": image, "detector": detector, "flux": arguments.flux} | scene
-        options["seed"] = arguments.seed
-        paths = simulate_cubes(arguments.cubes, chain, instrument, frames, **options)
+        cubes = {"image": image, "detector": detector, "flux": arguments.flux}
+        cubes["seed"] = arguments.seed
+        paths = simulate_cubes(arguments.cubes, chain, instrument, frames, **cubes, **scene)
         written.append(f"{one_line(arguments.cubes, None)} ({counted(len(paths), 'cube')})")
     if arguments.output:
         observations.write(arguments.output, overwrite=True)
