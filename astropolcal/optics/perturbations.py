@@ -138,11 +138,12 @@ def split_run(text):
 
 _ROTATING = ("retardance_h", "retardance_d", "rotation")
 # by kind: how often a turn goes round, the generator over that, and the square of this
-_POWERS = {
-    kind: (rate, generator / rate, generator @ generator / rate**2)
-    for kind, generator in GENERATORS.items()
-    for rate in [2.0 if kind == "rotation" else 1.0]
-}
+_POWERS = {kind: (1.0, generator, generator @ generator) for kind, generator in GENERATORS.items()}
+_POWERS["rotation"] = (
+    2.0,
+    GENERATORS["rotation"] / 2,
+    GENERATORS["rotation"] @ GENERATORS["rotation"] / 4,
+)
 
 
 class Perturbation(_BeamOptic, _Modulated):

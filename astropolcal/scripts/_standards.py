@@ -130,12 +130,12 @@ def _describe(star, known):
     lines += [common.wrapped(fact, indent=14) for fact in facts]
     if star.law is not None:
         lines += ["", f"  Serkowski law ({star.law_reference})"]
-    units = {"p_max": " %", "lambda_max": " um", "K": "", "theta": " deg"}
-    for name, unit in units.items() if star.law is not None else ():
-        value, error = getattr(star.law, name).value, star.law_errors.get(name)
-        value = 100 * value if name == "p_max" else value
-        spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
-        lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
+        units = {"p_max": " %", "lambda_max": " um", "K": "", "theta": " deg"}
+        for name, unit in units.items():
+            value, error = getattr(star.law, name).value, star.law_errors.get(name)
+            value = 100 * value if name == "p_max" else value
+            spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
+            lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
     if known is not None:
         lines += ["", "  In a calibration"]
         for row in known["stokes"]:
