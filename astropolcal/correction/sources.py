@@ -87,12 +87,15 @@ class TurnedSource:
         height, width = source.image_shape
         centre = ((width - 1) / 2, (height - 1) / 2) if centre is None else centre
         try:
-            shape = (source.n_frames, 2, 2)
-            self._centres = np.broadcast_to(np.asarray(centre, dtype=float), shape)
+            centre = np.asarray(centre, dtype=float)
+            # a number alone would be taken for both x and y
+            if centre.shape not in ((2,), (2, 2), (source.n_frames, 2, 2)):
+                raise ValueError
         except (TypeError, ValueError):
             raise ParameterError(
                 f"centre = {one_line(centre)}; x and y are needed, or those of each beam and frame"
             ) from None
+        self._centres = np.broadcast_to(centre, (source.n_frames, 2, 2))
         self._options = options | {"size": size}
         self.image_shape = source.image_shape if size is None else tuple(np.broadcast_to(size, 2))
         self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths

@@ -193,7 +193,7 @@ def test_turned_sources_need_images():
     image = np.ones((2, 3, 4, 4))
     with pytest.raises(ParameterError, match="each of the 2 frames"):
         TurnedSource(ArraySource(image, image), [0, 0, 0] * u.deg)
-    for centre in ([1, 2, 3], "here", np.ones((3, 2, 2))):
+    for centre in (5, [5], [[5], [6]], [1, 2, 3], "here", np.ones((3, 2, 2))):
         with pytest.raises(ParameterError, match=r"centre = .*; x and y are needed"):
             TurnedSource(ArraySource(image, image), [0, 0] * u.deg, centre=centre)
 
