@@ -511,6 +511,7 @@ def pair_frames(
     """
     hwp = np.atleast_1d(angle_to_rad(hwp, "hwp"))
     n_frames, tolerance = len(hwp), float(angle_to_rad(tolerance, "tolerance"))
+    derotator_tolerance = float(angle_to_rad(derotator_tolerance, "derotator_tolerance"))
     labels = range(n_frames) if labels is None else labels
     there = np.sort(np.mod(hwp, _HALF))
     # the neighbours across 0 and 90 deg
@@ -528,7 +529,7 @@ def pair_frames(
     setting = {"hwp": hwp, "steps": steps, "tolerance": tolerance, "flc_state": flc_state}
     if derotator is not None:
         setting["derotator"] = np.atleast_1d(angle_to_rad(derotator, "derotator"))
-        setting["derotator_tolerance"] = float(angle_to_rad(derotator_tolerance, "tolerance"))
+        setting["derotator_tolerance"] = derotator_tolerance
     # in long tables partners are sought among the neighbours in time first, and farther away for
     # the frames that found none, so that the work grows as the number of frames
     left, width, chosen = np.argsort(steps, kind="stable"), _WINDOW, []

@@ -104,8 +104,6 @@ def _warn_of_uncovered(time):
             )
 
 
-# the frames of a target have the same text
-@lru_cache(maxsize=1024, typed=True)
 def sky_angle(name, value):
     """
     Return a right ascension or a declination, by name, in degree.
@@ -116,14 +114,18 @@ def sky_angle(name, value):
     try:
         angle = plain_number(value)
     except (TypeError, ValueError):
-        unit = u.hourangle if name == "right_ascension" else u.deg
-        angle = float(Angle(str(value), unit=unit).to_value(u.deg))
+        angle = _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
     if not np.isfinite(angle):
         raise ValueError(f"{value!r} is not finite")
     return angle
 
 
 # the frames of a target have the same text
+@lru_cache(maxsize=1024)
+def _sexagesimal(text, unit):
+    return float(Angle(text, unit=unit).to_value(u.deg))
+
+
 def pointing(coord, time, location):
     """
     Return altitude and parallactic angle of a target.
@@ -409,12 +411,11 @@ def frame_coordinate(observations, name):
     if name in MOVES:
         angle = observations.position(name.rpartition("_")[0])
         order, out = np.argsort(time, kind="stable"), np.zeros_like(angle)
-        moved = np.diff(angle[order], prepend=angle[order[:1]])
-        if name.endswith("_direction"):
-            # a stage that stays where it is was last moved as before
-            last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))
-            moved = moved[last] < 0
-        out[order] = moved
+        steps = np.diff(angle[order], prepend=angle[order[:1]])
+        # a stage that stays where it is was last moved as before
+        last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+        # how far, or whether it was backwards
+        out[order] = steps if name.endswith("_move") else steps[last] < 0
         return out
     if name.endswith("_rate"):
         return angle_change(observations, observations.position(name.removesuffix("_rate")))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
 from astropolcal.observations.observables import pair_frames
 
 CYCLE = [0.0, 45.0, 22.5, 67.5]
@@ -110,6 +110,9 @@ def test_derotator_tolerance():
     with pytest.warns(AstropolcalWarning, match="2 of 2 frames left out"):
         assert pair([0.0, 45.0], [90.0, 90.6]) == []
     assert pair([0.0, 45.0], [90.0, 90.6], derotator_tolerance=1 * u.deg) == [[0, 1]]
+    for derotator in (None, [90.0, 90.6]):
+        with pytest.raises(ParameterError, match="derotator_tolerance = 1 needs a unit"):
+            pair([0.0, 45.0], derotator, derotator_tolerance=1)
 
 
 def test_the_modulator_must_be_in_the_same_state():
