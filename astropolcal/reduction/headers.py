@@ -315,9 +315,9 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     blocks = np.split(np.arange(len(hwp)), np.flatnonzero(np.abs(np.diff(derotator)) > 1.0) + 1)
     # the steps that most blocks have, if there is a majority
     ranked = Counter(tuple(steps[block]) for block in blocks if max(steps[block]) < 1e6)
-    (sequence, count), (_, second) = [*ranked.most_common(2), (None, 0), (None, 0)][:2]
-    if len(blocks) < 2 or count == second:
-        sequence = None
+    ranked = ranked.most_common(2)
+    tied = len(ranked) == 2 and ranked[0][1] == ranked[1][1]
+    sequence = None if len(blocks) < 2 or not ranked or tied else ranked[0][0]
     found = {}
     for i, expected in (one for b in blocks for one in _misfits(b, steps, sequence, uneven)):
         found[int(i)] = f"half-wave plate at {hwp[i]:g} deg"

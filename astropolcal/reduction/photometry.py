@@ -284,7 +284,6 @@ def evenly_lit(cube, good, layout):
 
 
 # damaged pixels may be beyond all numbers, and are then infinitely far off
-# damaged pixels may be beyond all numbers, and are then infinitely far off
 @np.errstate(over="ignore", invalid="ignore")
 def _outliers(cut, known, weights, detector):
     """Return the single pixels that are far off their neighbours."""

@@ -224,9 +224,9 @@ def _checked(table):
         for key, name in _NAMES.items():
             names |= {f"{key}_statistical": f"{name}_err"}
             names |= {f"{key}_{_SYSTEMATIC}": f"{name}_{_SYSTEMATIC}"}
-        for old in {*names} & {*table.colnames}:
-            if old != names[old]:
-                table.rename_column(old, names[old])
+        for old, new in names.items():
+            if old in table.colnames and old != new:
+                table.rename_column(old, new)
         if "determined" in table.colnames and "mask" not in table.colnames:
             table["mask"] = ~np.asarray(table["determined"], dtype=bool)
     names = [_NAMES[key] for key in _REQUIRED] + ["v"] * ("v" in table.colnames)

@@ -171,12 +171,12 @@ def read_pypolcal(files, meta=None, *, name=None):
         _, bins = np.unique(wavelength.round(4), return_inverse=True)
     # cubes are numbered in the order in which the first file lists them
     cubes, seen = [row["filepath"].strip() for _, _, row in rows], {}
-    for (path, i, _), *cell in zip(rows, cubes, bins.tolist(), strict=True):
-        if tuple(cell) in seen:
+    for (path, i, _), cube, b in zip(rows, cubes, bins.tolist(), strict=True):
+        if (cube, b) in seen:
             raise ObservationError(
-                f"{path}, line {i}: {one_line(cell[0], 80)} is given already in {seen[*cell]}"
+                f"{path}, line {i}: {one_line(cube, 80)} is given already in {seen[cube, b]}"
             )
-        seen[*cell] = f"{path}, line {i}"
+        seen[cube, b] = f"{path}, line {i}"
     numbers = {cube: number for number, cube in enumerate(dict.fromkeys(cubes))}
     frames = [numbers[cube] for cube in cubes]
     table = QTable({"file": [Path(row["filepath"]).name for _, _, row in rows]})
