@@ -160,7 +160,9 @@ def import_context(path, folder):
             digest, there = sha256_of(Path(scratch) / file), folder / file
             if known.get(file, digest) != digest:
                 raise CalibrationFileError(f"{path}: {file} does not have its checksum")
-            if there.exists() and sha256_of(there) != digest:
+            with understood(there, CalibrationFileError, "cannot be read"):
+                same = not there.exists() or sha256_of(there) == digest
+            if not same:
                 raise CalibrationFileError(f"{folder} has another file {file}; nothing is written")
         with understood(folder, CalibrationFileError, "cannot be written", reads=False):
             folder.mkdir(parents=True, exist_ok=True)

@@ -744,6 +744,10 @@ def test_archive_of_a_context(years, tmp_path_factory):
     with refused("another file 2025.asdf"):
         import_context(path, other / "new")
     assert (other / "new" / "2025.asdf").read_text() == "mine"
+    # a folder in the place of a file
+    (other / "odd" / "2025.asdf").mkdir(parents=True)
+    with refused("2025.asdf: is a folder, not a file"):
+        import_context(path, other / "odd")
 
 
 def test_forged_archives_write_nothing(years, tmp_path_factory):
