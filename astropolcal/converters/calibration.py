@@ -10,7 +10,6 @@ checked against that version and its checksum, and then carried to the newest on
 """
 
 from importlib.metadata import version as installed
-from itertools import zip_longest
 
 import astropy.units as u
 import numpy as np
@@ -315,7 +314,11 @@ def _check_optics(calibration, free):
 
 
 def _check_names(what, names, expected):
-    for name, other in zip_longest(names, expected):
+    if len(names) != len(expected):
+        raise CalibrationFileError(
+            f"{what} of {len(names)} parameters, but {len(expected)} are free in the chains"
+        )
+    for name, other in zip(names, expected, strict=True):
         if name != other:
             raise CalibrationFileError(f"{what} of {name!r}, where {other!r} is free in the chains")
 
