@@ -460,9 +460,9 @@ def restart(calibration, observations, free, *, chain=None, **options):
     # another mirror branch would look like a change of the instrument
     start = {"observable": old.settings["observable"], "search": False}
     start |= {"wavelength": old.wavelength, "instrument": old.instrument}
-    if instrument is not None:
+    if options.get("positions") is None and instrument is not None:
         pairs = zip(datasets, chains, strict=True)
-        start["positions"] = [instrument.positions(*pair) for pair in pairs]
+        options["positions"] = [instrument.positions(*pair) for pair in pairs]
     table = parameter_table(chains)
     # those of which the leading parameter is free
     start["ties"] = {

@@ -11,7 +11,7 @@ from scipy import stats
 from astropolcal import calibrate, instruments
 from astropolcal.chain import leaves
 from astropolcal.converters.calibration import content_hash
-from astropolcal.exceptions import AstropolcalError, FitError, ParameterError
+from astropolcal.exceptions import AstropolcalError, FitError, InstrumentError, ParameterError
 from astropolcal.measurement import Tie
 from astropolcal.pipeline.history import (
     Change,
@@ -253,6 +253,21 @@ def test_restart_keeps_ties_of_what_is_free(years):
     assert held.chain["derotator"].theta.value == old.chain["derotator"].theta.value
     free = restart(old, observe(7, "2026-03-01"), ["hwp.theta"])
     assert list(free.ties) == ["derotator.theta"]
+
+
+def test_restart_takes_positions_that_are_given(years, monkeypatch):
+    table, chain = observe(7, "2026-03-01"), make_chain()
+    given = [CHARIS.positions(table, chain)]
+    usual = restart(years[0], table, ["derotator"], positions=None, cross_validate=False)
+
+    def cannot(*arguments):
+        raise InstrumentError("no positions of this table")
+
+    monkeypatch.setattr(type(CHARIS), "positions", cannot)
+    new = restart(years[0], table, ["derotator"], positions=given, cross_validate=False)
+    np.testing.assert_array_equal(
+        new.chain["derotator"].retardance, usual.chain["derotator"].retardance
+    )
 
 
 def test_restart_on_bad_input(years):
