@@ -97,7 +97,9 @@ class TurnedSource:
             ) from None
         self._centres = np.broadcast_to(centre, (source.n_frames, 2, 2))
         self._options = options | {"size": size}
-        self.image_shape = source.image_shape if size is None else tuple(np.broadcast_to(size, 2))
+        self.image_shape = source.image_shape
+        if size is not None:
+            self.image_shape = tuple(np.broadcast_to(size, 2).tolist())
         self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths
         self.names, self.has_variances = source.names, source.has_variances
 
@@ -186,7 +188,8 @@ class _WholeCubes:
         self._places = [[found[path] for path in files] for files in self._beam_files]
         shapes = {path: places[0][0] for path, places in found.items()}
         if stacked:
-            shapes = {path: (1, *s[1:]) if s[0] else s for path, s in shapes.items()}
+            # of all exposures one image is made; what has no image at all is refused below
+            shapes = {path: (1, *s[1:]) if s and s[0] else s for path, s in shapes.items()}
         first = shapes[files[0]]
         for path, shape in shapes.items():
             if shape != first or len(shape) != 3 or 0 in shape:

@@ -239,6 +239,13 @@ def test_a_cube_of_nothing(tmp_path, shape):
         CubeFiles([path], [(3, 3), (3, 2)], 3, extension=0)
 
 
+def test_a_file_without_an_image(tmp_path):
+    fits.PrimaryHDU().writeto(tmp_path / "a.fits")
+    for stacked in (False, True):
+        with pytest.raises(ObservationError, match=r"a.fits: a cube of shape \(\)"):
+            CubeFiles([tmp_path / "a.fits"], [(3, 3), (3, 2)], 3, extension=0, stacked=stacked)
+
+
 @pytest.mark.parametrize("kind", [">f4", ">f8"])
 def test_nans_that_signal_are_nans(tmp_path, kind):
     """A damaged file may hold them; numpy warns where they are used, which is an error here."""
