@@ -322,14 +322,21 @@ def _median(pixels, known):
     return (ordered[row, (number - 1) // 2] + ordered[row, number // 2]) / 2.0
 
 
-def _level(cube, good, detector, layout):
-    """Return the median outside the beams, the variance of a pixel, and their number."""
-    *centres, width, height, angle = layout.internal_apertures
-    clear = np.ones(cube.shape[1:], dtype=bool)
+@lru_cache(maxsize=8)
+def _outside(apertures, shape):
+    """Return the pixels that are clear of all rectangles, the same in all frames of a run."""
+    *centres, width, height, angle = apertures
+    clear = np.ones(shape, dtype=bool)
     for centre in centres:
-        along, across = turned(clear.shape, centre, angle)
+        along, across = turned(shape, centre, angle)
         # the wings of the beams reach farther than the rectangles
         clear &= (np.abs(along) > width / 2 + _CLEAR) | (np.abs(across) > height / 2 + _CLEAR)
+    return clear
+
+
+def _level(cube, good, detector, layout):
+    """Return the median outside the beams, the variance of a pixel, and their number."""
+    clear = _outside(layout.internal_apertures, cube.shape[1:])
     pixels = np.array(cube[:, clear], dtype=float)
     # cubes hold exact zeros where the detector has no lenslets
     known = good[:, clear] & (pixels != 0.0)
