@@ -222,7 +222,8 @@ def diagnose(
     Parameters
     ----------
     calibration : Calibration, `~astropy.modeling.CompoundModel` or sequence of them
-        The nominal model: a calibration, or the chain of each dataset, which is then calibrated.
+        The nominal model: a calibration, or the chain of each dataset. Its free parameters are
+        calibrated with these data, from the values that they have.
     observations : Observations or sequence of Observations
         The datasets, used together.
     effects : "all" or sequence of str or Effect

@@ -15,6 +15,7 @@ from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, diagnose, get_effect
+from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import Effect, EffectParameter
 from astropolcal.gap.effects.effect import CellEffect
@@ -329,8 +330,7 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
         (axes,) = plot_effect_sizes(found, own.name).axes
         assert axes.get_xlabel() == label
         assert "deg" in axes.get_ylabel()
-        first = next(iter(improved.sizes(own.name).values()))
-        value = np.rad2deg(first[3].basis @ first[0])[0]
+        value = next(iter(Fitted(improved).sizes(own.name).values()))["value"][0]
         if dependence == "time":
             curve = next(line for line in axes.lines if len(line.get_xdata()) == 400)
             np.testing.assert_allclose(curve.get_ydata()[[0, -1]], [-value, value], rtol=1e-6)

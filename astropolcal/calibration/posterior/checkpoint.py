@@ -7,7 +7,7 @@ says where the steps are and (JSON) of which run, so that no structure is read t
 All steps have the same size, with their number, the state of the random numbers and a CRC; a run
 writes them in place. What counts is the beginning of the file up to the first step that is not
 whole; the rest is computed again, with the same random numbers. The CRC goes on from that of the
-step before: what an earlier run has left behind a step that was computed again may follow from
+step before: what an earlier run has left after a step that was computed again may follow from
 other places of the walkers, where another machine rounds otherwise or no seed was given.
 """
 
@@ -236,7 +236,7 @@ def _head(stream, path):
     with understood(path, FitError, "the checkpoint is damaged"):
         start, length, crc = map(int, stream.readline(100).split())
         if not (0 <= length < min(start, _LONGEST) and start < os.path.getsize(path)):
-            raise ValueError(f"its steps begin at byte {start}, behind a text of {length}")
+            raise ValueError(f"its steps begin at byte {start}, after a text of {length}")
         stated = stream.read(length)
         if zlib.crc32(stated, start) != crc:
             raise ValueError("what it says of the run does not match its CRC")
