@@ -191,27 +191,16 @@ def correct(
         "max_condition": max_condition,
         "labels": frames.names,
     }
-    rows = model.rows()
-    # raises where the frames determine too little, whatever their brightness
-    estimator(rows, scale=frames.scale, **how)
-    frames, unmeasured = _with_brightness(frames, rows, brightness, how)
-    solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
-    weak = [w for w, words in enumerate(solution.weak) if words]
-    if weak:
-        unmeasured += [
-            f"poorly determined at {len(weak)} of {len(solution.weak)} wavelengths, left out "
-            f"there: at {frames.wavelength[weak[0]]:.6g} {solution.weak[weak[0]]} (condition "
-            f"{solution.condition[weak[0]]:.3g}, allowed is {max_condition:g})"
-        ]
-    for words in doubts + unmeasured:
-        warnings.warn(words, AstropolcalWarning, stacklevel=2)
+    frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = None
     if model.calibration is not None and n_samples:
         systematic = sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
     elif model.calibration is not None:
         systematic = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
     if systematic is not None and systematic.is_open:
-        warnings.warn(_OPEN, AstropolcalWarning, stacklevel=2)
+        unmeasured.append(_OPEN)
+    for words in doubts + unmeasured:
+        warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
     found = corrected_planes(frames.source, solution, by_variance, **division)
     n = len(components)
@@ -250,6 +239,23 @@ def _observable(calibration, frames, observable):
     names, alone = frames.names, set(range(len(frames.names))) - set(np.ravel(frames.pairs))
     words = f"{len(alone)} of {len(names)} frames have no partner 45 deg away and are left out"
     return observable, [f"{words}; the first is {names[min(alone)]}"] if alone else []
+
+
+def _estimated(model, frames, brightness, how, mode):
+    """Return the frames with their brightness, their solution, and what is to be said of it."""
+    rows = model.rows()
+    # raises where the frames determine too little, whatever their brightness
+    estimator(rows, scale=frames.scale, **how)
+    frames, doubts = _with_brightness(frames, rows, brightness, how)
+    solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
+    weak = [w for w, words in enumerate(solution.weak) if words]
+    if weak:
+        doubts += [
+            f"poorly determined at {len(weak)} of {len(solution.weak)} wavelengths, left out "
+            f"there: at {frames.wavelength[weak[0]]:.6g} {solution.weak[weak[0]]} (condition "
+            f"{solution.condition[weak[0]]:.3g}, allowed is {how['max_condition']:g})"
+        ]
+    return frames, solution, doubts
 
 
 def _with_brightness(frames, rows, brightness, how):
