@@ -59,6 +59,8 @@ _MORE = 3
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
+# evidence that is the same to so many digits is of causes that do the same
+_DIGITS = 6
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
 _NEAR, _BENT = 0.03, 500.0
 # and so is one that needs a size so many times as far from the usual
@@ -666,7 +668,7 @@ def _members(chosen, beside, loss):
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())
     (_, most), *others = weights.values()
-    # of equally probable ones rounding alone would tell which comes first
-    others.sort(key=lambda item: item[0].name)
+    # of one probability the best first; of what does the same, rounding alone would tell which is
+    others.sort(key=lambda item: (-round(item[0].evidence, _DIGITS), item[0].name))
     others = [others[i] for i in ranked([weight for _, weight in others])]
     return [(one, float(weight / total)) for one, weight in [(own, most), *others]]
