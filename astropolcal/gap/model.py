@@ -225,6 +225,23 @@ class Model:
         fit = self.problem.fit(self.fit.coefficients, **settings)
         return Model(self.problem, fit, self.added)
 
+    def sizes(self, name):
+        """
+        Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
+        """
+        errors = self.problem.errors(self.fit.coefficients)
+        found = {}
+        for parameter in self.added[name]:
+            slot = self.problem.free.by_name[parameter.name]
+            where = self.problem.slices[parameter.name]
+            found[parameter.name] = (
+                self.fit.coefficients[where] / slot.factor,
+                errors[where] / slot.factor,
+                slot.unit,
+                parameter,
+            )
+        return found
+
     def is_physical(self, name):
         """
         Return whether the fitted values of an effect are possible.

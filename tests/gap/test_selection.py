@@ -57,7 +57,8 @@ def test_a_planted_cell_is_found_first_and_alone(name, cell, sizes):
     assert found.unlisted < 0.1
     assert found.model.p_value > 1e-3
     shares = [share for _, share in group.members]
-    assert shares == sorted(shares, reverse=True)
+    # what is equal up to rounding is in the order of the names
+    assert np.all(np.diff(shares) < 1e-9)
     assert sum(shares) == pytest.approx(1)
 
 
