@@ -174,15 +174,15 @@ class Look:
     def lowering(self, i, columns):
         """Return by how much columns (k, 2, W, F) of one frame each lower chi-square, (F,)."""
         residual, taken = self._parts[i]
-        inner = np.einsum("hcaf,gcaf->fhg", columns, columns)
+        inner = np.einsum("hxaf,gxaf->fhg", columns, columns)
         full = np.einsum("fhh->fh", inner).copy()
-        part = np.einsum("cafk,hcaf->fkh", taken, columns, optimize=True)
+        part = np.einsum("xafk,hxaf->fkh", taken, columns, optimize=True)
         inner -= np.einsum("fkh,fkg->fhg", part, part)
         share = np.minimum(self.shares[i], 1.0)
-        inner -= np.einsum("caf,hcaf,gcaf->fhg", share, columns, columns)
+        inner -= np.einsum("xaf,hxaf,gxaf->fhg", share, columns, columns)
         scale = np.sqrt(np.where(full > 0, full, 1.0))
         values, vectors = np.linalg.eigh(inner / scale[:, :, None] / scale[:, None, :])
-        along = np.einsum("hcaf,caf->fh", columns, residual) / scale
+        along = np.einsum("hxaf,xaf->fh", columns, residual) / scale
         along = np.einsum("fhg,fh->fg", vectors, along)
         return _fall(values, along)
 
