@@ -10,7 +10,7 @@ from copy import copy as copied
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, null_space, solve, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, null_space, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
 from astropolcal.chain import Train, leaves
@@ -320,6 +320,9 @@ class GapProblem:
             if converged:
                 break
             normal, growth = self._normal(q, residual, take, live), 2
+            if not np.isfinite(normal[0]).all():
+                # the model has no derivative here
+                break
             while damping < _STUCK:
                 step, promised = self._step(q, live, *normal, damping)
                 trial = np.clip(q + step, self.low, self.high)
@@ -443,7 +446,8 @@ def _within(triangle, wanted, low, high, found):
         found = np.clip(found, low, high)
         if not held.all():
             rest = target[~held] - gram[np.ix_(~held, held)] @ found[held]
-            found[~held] = solve(gram[np.ix_(~held, ~held)], rest, assume_a="pos")
+            root = _root(gram[np.ix_(~held, ~held)])
+            found[~held] = cho_solve((root, False), rest, check_finite=False)
         # where a bound holds, the sum of squares falls outwards only
         inwards = (target - gram @ found) * np.where(found > low, -1.0, 1.0)
         wrong = np.where(held, (inwards > tiny) & (low < high), (found < low) | (found > high))

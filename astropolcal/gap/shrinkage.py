@@ -60,17 +60,14 @@ class HeldOut:
         labels, numbers = groups
         rows = []
         for i, gap in enumerate(gaps):
-            parts = [
+            squares = whitened = count = 0
+            for number, channel, one in zip(numbers, problem.channels, gap, strict=True):
+                seen = channel.valid & (number == i)
+                squares += np.sum(channel.gap(one)[seen] ** 2)
                 # mostly two channels a datum: half, so that noise gives 1 a datum
-                (
-                    np.sum(channel.gap(one)[seen] ** 2),
-                    np.sum(channel.whiten(one)[:, seen] ** 2) / channel.count,
-                    seen.sum(),
-                )
-                for number, channel, one in zip(numbers, problem.channels, gap, strict=True)
-                for seen in [channel.valid & (number == i)]
-            ]
-            rows.append(np.sum(parts, axis=0))
+                whitened += np.sum(channel.whiten(one)[:, seen] ** 2) / channel.count
+                count += seen.sum()
+            rows.append((squares, whitened, count))
         return cls.of_rows(labels, rows)
 
     @property

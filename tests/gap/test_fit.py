@@ -190,6 +190,12 @@ def test_a_step_within_bounds_is_that_of_bounded_least_squares(plain):
     assert promised == pytest.approx(target @ target - left @ left)
 
 
+def test_a_model_without_derivatives_does_not_converge(plain, monkeypatch):
+    nothing = np.full((plain.n_rows, plain.size), np.nan)
+    monkeypatch.setattr(plain, "jacobian", lambda *_: nothing)
+    assert not plain.fit().converged
+
+
 # ---- what follows --------------------------------------------------------------------------
 
 

@@ -461,18 +461,6 @@ def _smoothed(measurement, weighting, fitter, outcome):
     return outcome, weighting
 
 
-def _turned(wavelength, phases, low, high):
-    """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
-    found = np.full(len(phases), np.nan)
-    for i in range(1, len(phases) - 1):
-        beside = np.interp(wavelength[i], wavelength[[i - 1, i + 1]], phases[[i - 1, i + 1]])
-        off = abs(phases[i] - beside)
-        for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
-            if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
-                found[i] = other
-    return found
-
-
 def _thinned(measurement, weighting):
     """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
     if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
