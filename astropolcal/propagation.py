@@ -259,7 +259,9 @@ class Sweep:
             row[..., 0] = weight
             inward, pairs = _back(steps, row, [], by_optic, result, alone)
             adjoint, behind = adjoint + inward, behind + pairs
-        _back(self._common, adjoint, behind, by_optic, result, crossings)
+        # upstream of the first optic that is asked for nothing is needed
+        first = min(by_optic, default=len(self._common))
+        _back(self._common[first:], adjoint, behind, by_optic, result, crossings)
         # of a coefficient: what its parameter does in each frame, times how it moves that
         result |= {key: result[to] * rate for key, (to, rate) in rates.items() if to in result}
         shape = self._propagator.shape

@@ -48,6 +48,13 @@ _OTHER = -0.5
 _ALONE = -1.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
+# evidence that is the same to so many decimals is of causes that do the same
+_DECIMALS = 3
+
+
+def preference(candidate):
+    """Return the key that sorts the best first; of what does the same, the name decides."""
+    return -round(candidate.evidence, _DECIMALS), candidate.name
 
 
 @dataclass
@@ -171,7 +178,7 @@ class Scan:
                 found = _named(probes, [candidate.named], self.temper, degree, names)
             else:
                 found = _of_cell(probes, candidate.cell, degree, self.temper)
-            best = max([best, *found], key=lambda one: one.evidence)
+            best = min([best, *found], key=preference)
         return best
 
     def of_cell(self, cell, degree):
@@ -226,7 +233,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     probes = Probes(model, () if without is None else (without,), like)
     found = _cells(probes, temper) if cells else []
     found += _named(probes, effects, temper)
-    found.sort(key=lambda one: -one.evidence)
+    found.sort(key=preference)
     return Scan(found, probes, temper)
 
 
@@ -243,7 +250,7 @@ def _cells(probes, temper):
             names = [name for name in names if name != "constant"]
             constant = Cell(place, kind, "constant")
             bent = [one for d in _DEGREES for one in _of_cell(probes, constant, d, temper)]
-            found += sorted(bent, key=lambda one: -one.evidence)[:1]
+            found += sorted(bent, key=preference)[:1]
         for same, waves in probes.grouped(names):
             by_law = [(d, whole.first(law.shape[1]).normal(waves)) for d, law in laws.items()]
             found += _candidates(place, kind, same, by_law, temper)
@@ -280,7 +287,7 @@ def _of_cell(probes, cell, degree, temper, others=()):
     else:
         names, parts = [cell.dependence], [part[None] for part in bent]
     found = _candidates(cell.place, cell.kind, names, [(degree, parts)], temper)
-    return sorted(found, key=lambda one: -one.evidence)
+    return sorted(found, key=preference)
 
 
 def _candidates(place, kind, names, by_law, temper):

@@ -17,7 +17,7 @@ import numpy as np
 
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
-from astropolcal.gap.attribution import ALIKE, scan
+from astropolcal.gap.attribution import ALIKE, preference, scan
 from astropolcal.gap.cells import Cell, count_runs, split_run
 from astropolcal.gap.shrinkage import foreseen, stability
 
@@ -59,8 +59,6 @@ _MORE = 3
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
-# evidence that is the same to so many digits is of causes that do the same
-_DIGITS = 6
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
 _NEAR, _BENT = 0.03, 500.0
 # and so is one that needs a size so many times as far from the usual
@@ -129,6 +127,10 @@ class _State:
     @property
     def outline(self):
         return frozenset(one.name for one in self.chosen)
+
+    @property
+    def name(self):
+        return sorted(self.outline)
 
     @property
     def is_dear(self):
@@ -290,12 +292,8 @@ def _scanned(model, library, cells):
     temper = max(1.0, (model.fit.chi2 - most.statistic) / freedom)
     if temper == 1.0:
         return found
-    again = sorted((one.tempered(temper) for one in found.candidates[:_RETEMPERED]), key=_evidence)
+    again = sorted((one.tempered(temper) for one in found.candidates[:_RETEMPERED]), key=preference)
     return replace(found, candidates=again, temper=temper)
-
-
-def _evidence(candidate):
-    return -candidate.evidence
 
 
 def _distinct(candidates, most):
@@ -396,7 +394,7 @@ def _extensions(task, states, known, most, least):
         fitted = _fitted(grown[:most] if several == most else grown[most:], instead)
         if fitted:
             break
-    fitted.sort(key=lambda state: -state.evidence)
+    fitted.sort(key=preference)
     return fitted if fitted and fitted[0].evidence >= least else []
 
 
@@ -557,11 +555,11 @@ def _rivals_beside(found, own, library):
     ]
     enough = mine[0].evidence + _CLEARLY if mine else -np.inf
     better = {one.name: one for one in few if one.evidence >= enough}
-    best = sorted(better.values(), key=_evidence) + mine
+    best = sorted(better.values(), key=preference) + mine
     # a name is given where it does as well as its cell
     as_good = [[n for n in (*names, one) if n.evidence > one.evidence - _AS_GOOD] for one in best]
     return [
-        max((n for n in same if n.is_named), key=lambda n: n.evidence, default=one)
+        min((n for n in same if n.is_named), key=preference, default=one)
         for one, same in zip(best, as_good, strict=True)
     ]
 
@@ -669,6 +667,6 @@ def _members(chosen, beside, loss):
     total = sum(weight for _, weight in weights.values())
     (_, most), *others = weights.values()
     # of one probability the best first; of what does the same, rounding alone would tell which is
-    others.sort(key=lambda item: (-round(item[0].evidence, _DIGITS), item[0].name))
+    others.sort(key=lambda item: preference(item[0]))
     others = [others[i] for i in ranked([weight for _, weight in others])]
     return [(one, float(weight / total)) for one, weight in [(own, most), *others]]

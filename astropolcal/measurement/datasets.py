@@ -204,8 +204,9 @@ class Dataset:
             values[i][j] = factor * vector[where] + offset
         return values
 
-    def jacobian(self, sweep):
+    def jacobian(self, sweep, among=None):
         """Return the derivative of the data to the flat vector, (n_free, n_data)."""
+        live = [one for one in self._live if among is None or np.any(among[one[1]])]
         right, left = self._fluxes(sweep)
         derivative = self.observable.derivative(right, left)
         # the weights of columns are spread over the nodes of their exposures
@@ -213,11 +214,11 @@ class Dataset:
         weights = [(c * self._node_weights[:, None]).reshape(len(c), -1) for c in columns]
         # backward sweep: d(datum)/d(parameter) = sum over frames and beams of
         # d(datum)/d(flux) * d(flux)/d(parameter), without ever building the fluxes' own Jacobian
-        slopes = sweep.derivatives([key for key, *_ in self._live], weights)
+        slopes = sweep.derivatives([key for key, *_ in live], weights)
         n_groups, n_bins = self.frames.shape[0], len(self.bins)
         out = np.zeros((self.n_free, n_bins, n_groups))
         each = np.arange(n_bins)
-        for key, where, factor, _ in self._live:
+        for key, where, factor, _ in live:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
             # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them

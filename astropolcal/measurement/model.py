@@ -276,10 +276,14 @@ class Measurement(ScalarParameters):
         parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def jacobian(self, vector):
-        """Return the derivative of all data to all free parameters, (n_free, n_data)."""
+    def jacobian(self, vector, among=None):
+        """
+        Return the derivative of all data to all free parameters, (n_free, n_data).
+
+        Where ``among``, (n_free,), is given and False, it is not worked out, and zero.
+        """
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
-        parts = [d.jacobian(s) for d, s in zip(self.datasets, sweeps, strict=True)]
+        parts = [d.jacobian(s, among) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def evaluate(self, x, *parameters):

@@ -93,6 +93,7 @@ class BinProblem(Problem):
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
         self.elements = starts[:, None] + np.arange(self.n_bins)
         self._below, self._above = self._low[self.elements], self._high[self.elements]
+        self._own = np.isin(np.arange(self._low.size), self.elements)
         rows = {slot.name: row for row, slot in enumerate(self.slots)}
         #: Priors that enter the costs of the bins, with the slot of each.
         self.priors = [
@@ -116,7 +117,7 @@ class BinProblem(Problem):
 
     def _step(self, vector, damping):
         """Return the per-wavelength parameters after a damped step, within their bounds."""
-        jacobian = self.measurement.jacobian(vector) * self.weights
+        jacobian = self.measurement.jacobian(vector, self._own) * self.weights
         # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
         blocks *= self._present[:, None, :]
