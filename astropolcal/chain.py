@@ -577,7 +577,7 @@ def _turned(light, angle):
 
 def _check_axes(wavelength, positions):
     """Return the positions with an axis for wavelengths, and the shape of both together."""
-    if np.ndim(wavelength) > 1:
+    if np.ndim(wavelength) > 1 or not np.size(wavelength):
         raise ParameterError(
             f"wavelength has shape {np.shape(wavelength)}; allowed are a scalar or one axis"
         )

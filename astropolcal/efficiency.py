@@ -25,7 +25,13 @@ from astropolcal.observations.pointings import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import beams_of_frames, stage_positions
-from astropolcal.units import angle_to_rad, canonical_factor, length_to_um
+from astropolcal.units import (
+    angle_to_rad,
+    canonical_factor,
+    check_seed,
+    length_to_um,
+    wavelengths_of,
+)
 from astropolcal.words import check_choice, counted
 
 __all__ = ["best_derotator", "best_modulation", "demodulation", "polarimetric_efficiency"]
@@ -161,7 +167,7 @@ def polarimetric_efficiency(
         # it only counts on sky
         law = _law_of(instrument).plate_law(mode) if _SKY & set(stages(path)) else (0.0, 0.0)
     positions = _positions(path, derotator, altitude, parallactic, law)
-    lam = np.atleast_1d(u.Quantity(wavelength))
+    lam = np.atleast_1d(wavelengths_of(wavelength))
     shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
     if np.prod(shape, dtype=float) * lam.size > _MOST_CELLS:
         raise ParameterError(
@@ -547,7 +553,7 @@ def best_modulation(chain, wavelength, frames, free, *, components="IQUV", seed=
     """
     from scipy.optimize import minimize
 
-    chain, frames, rng = chain.copy(), frames.copy(), np.random.default_rng(seed)
+    chain, frames, rng = chain.copy(), frames.copy(), np.random.default_rng(check_seed(seed))
     settings = [_setting(chain, frames, name) for name in free]
     sizes = np.cumsum([value.size for value, *_ in settings])[:-1]
     start = np.concatenate([value for value, *_ in settings]) if settings else np.zeros(0)

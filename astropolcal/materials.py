@@ -338,8 +338,10 @@ class TabulatedLaw:
                 f"a table of {self._wavelength.shape} wavelengths has {self._index.shape} "
                 "indices; allowed is one per wavelength"
             )
-        if self._wavelength.size < 2 or not np.all(np.diff(self._wavelength) > 0):
-            raise ParameterError("the wavelengths of a table must be two or more and increase")
+        if self._wavelength.size < 2 or not np.all(np.diff(self._wavelength, prepend=0.0) > 0):
+            raise ParameterError(
+                "the wavelengths of a table must be two or more and increase from above zero"
+            )
         good = np.isfinite(self._index) & (self._index.real > 0) & (self._index.imag >= 0)
         if not good.all():
             row = int(np.argmin(good))

@@ -11,7 +11,7 @@ from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
 from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator, splits
-from astropolcal.units import length_to_um
+from astropolcal.units import check_seed, length_to_um, wavelengths_of
 from astropolcal.words import check_type
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
@@ -131,7 +131,7 @@ def simulate(
     >>> simulate(charis.chain(), charis.wavelength, frames, seed=1).n_frames
     16
     """
-    wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
+    wavelength, seed = np.atleast_1d(wavelengths_of(wavelength)), check_seed(seed)
     wanted = "a table is needed, such as half_wave_plate_cycles() gives"
     check_type("frames", frames, Table, wanted, ParameterError)
     if not len(frames):
@@ -169,16 +169,6 @@ def beams_of_frames(chain, frames, lamp):
         repeated["group"] = np.repeat(np.arange(len(frames)), count)
     repeated["beam"] = np.tile(beams, len(frames))
     return ("flux",), repeated, None if lamp is None else np.repeat(lamp, count)
-
-
-def check_seed(seed):
-    """Return the seed of random numbers if `numpy.random.default_rng` takes it, else raise."""
-    try:
-        # draws nothing, so that a generator stays as it is
-        np.random.default_rng(seed)
-    except (TypeError, ValueError):
-        raise ParameterError(f"seed = {seed!r}; allowed are whole numbers from 0 up") from None
-    return seed
 
 
 def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):

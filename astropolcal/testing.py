@@ -37,6 +37,7 @@ from astropolcal.optics import (
     StateAnalyser,
 )
 from astropolcal.simulation import simulate
+from astropolcal.units import check_seed
 
 __all__ = ["check_instrument"]
 
@@ -541,7 +542,7 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
     if not isinstance(instrument, Instrument):
         raise InstrumentError(f"class: {instrument!r} is not an Instrument, nor a class of one")
     report = Conformance(instrument.name or type(instrument).__name__)
-    probe = Probe(instrument, seed)
+    probe = Probe(instrument, check_seed(seed))
     for rule in RULES:
         if rule in skip:
             report.skipped[rule] = "skipped"

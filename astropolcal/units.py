@@ -107,6 +107,31 @@ def length_to_um(value, name="wavelength"):
     return to_unit(value, u.um, name)
 
 
+def wavelengths_of(value, name="wavelength"):
+    """Return wavelengths as a quantity of any shape; raise unless they are lengths above zero."""
+    try:
+        found = u.Quantity(value)
+        good = (found.to_value(u.um) > 0) & np.isfinite(found.value)
+    # an error of astropy's units is a TypeError, too
+    except (TypeError, ValueError, u.UnitsError):
+        good = np.zeros(1, dtype=bool)
+    if not good.size or not good.all():
+        raise ParameterError(
+            f"{name} = {one_line(value)} needs a unit such as nm, and finite numbers above zero"
+        )
+    return found
+
+
+def check_seed(seed, *, generator=True):
+    """Return the seed of random numbers, plain, or raise; a ``generator`` may stand for it."""
+    try:
+        # draws nothing, so that a generator stays as it is
+        (np.random.default_rng if generator else np.random.SeedSequence)(seed)
+    except (TypeError, ValueError):
+        raise ParameterError(f"seed = {seed!r}; allowed are whole numbers from 0 up") from None
+    return seed.tolist() if isinstance(seed, np.integer | np.ndarray) else seed
+
+
 def mjd_of(value, name="time"):
     """
     Return moments as Modified Julian Dates, UTC.

@@ -3,6 +3,7 @@
 
 import datetime
 import io
+from dataclasses import replace
 
 import asdf
 import astropy.units as u
@@ -25,7 +26,7 @@ from astropolcal.exceptions import (
     ObservationError,
 )
 from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
-from astropolcal.instruments import IRDIS
+from astropolcal.instruments import IRDIS, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations, pointing
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -408,6 +409,27 @@ def test_pupil_tracking_adds_half_the_offset_of_the_pupil():
     )
     difference = pupil["derotator"] - field["derotator"]
     assert difference.to_value(u.deg) == pytest.approx(135.99 / 2)
+
+
+def test_site_and_laws_are_those_of_the_subclass():
+    """At another site the altitude moves otherwise, and a plate that stands does not turn."""
+
+    class Elsewhere(IRDIS):
+        sky_law = SkyLaw(plate=(0.0, 0.0), derotator={"field": (0, 0), "pupil": (0, 0.5)})
+        files = replace(IRDIS.files, site=(-155.5, 19.8, 4139.0))
+
+    cards = header(**{"ESO DET NDIT": 100, "ESO INS4 DROT3 END": None})
+    tables = []
+    for one in (IRDIS_, Elsewhere()):
+        with pytest.warns(AstropolcalWarning, match="until the middle") as caught:
+            tables.append(one.frame_table([cards]))
+        assert ("by up to 0 deg" in str(caught[0].message)) == (one is not IRDIS_)
+        layout = one.configured(cards).files
+        assert layout.tracking == one.sky_law.plate_law("field")
+        with pytest.warns(AstropolcalWarning, match="until the middle"):
+            found = layout.from_header(cards)["ESO TEL ALT"]
+        assert found == pytest.approx(tables[-1]["altitude"][0].value, abs=1e-9)
+    assert abs(tables[0]["altitude"] - tables[1]["altitude"])[0] > 0.01 * u.deg
 
 
 def test_angles_of_the_start_alone_are_taken_and_told():

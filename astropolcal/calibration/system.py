@@ -10,10 +10,10 @@ import numpy as np
 from astropolcal.chain import join, leaves, system_mueller, system_mueller_derivatives
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations.reading import nearest_bins
+from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
-from astropolcal.units import canonical_factor, mjd_of
+from astropolcal.units import canonical_factor, mjd_of, wavelengths_of
 
 __all__ = []
 
@@ -175,10 +175,7 @@ def match_wavelengths(grid, chain, wavelength, interpolate=False):
     """
     if wavelength is None:
         return grid, np.eye(grid.size)
-    try:
-        lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
-    except (TypeError, u.UnitConversionError):
-        raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
+    lam = np.atleast_1d(wavelengths_of(wavelength)).to(grid.unit)
     bins, off = nearest_bins(lam, grid)
     if not off.any():
         return lam, np.eye(grid.size)[bins]
@@ -196,13 +193,19 @@ def match_wavelengths(grid, chain, wavelength, interpolate=False):
             f"nearest is {nearest:.2f}; interpolate=True interpolates it linearly"
         )
     # laws of glass and metal interpolate between calibrated wavelengths, but are not trusted beyond
-    outside = (lam < grid.min()) | (lam > grid.max())
-    if (outside & off).any():
-        raise WavelengthRangeError(
-            f"{lam[outside & off][0]:.2f} is outside the calibrated range, "
-            f"{grid.min():.2f} to {grid.max():.2f}"
-        )
+    check_range(lam, grid)
     return lam, between(lam.value, grid.value) if several else None
+
+
+def check_range(wavelength, grid):
+    """Raise if wavelengths are beyond the calibrated ones."""
+    wavelength, slack = np.atleast_1d(wavelength), SAME_WAVELENGTH * grid.max()
+    outside = (wavelength < grid.min() - slack) | (wavelength > grid.max() + slack)
+    if outside.any():
+        raise WavelengthRangeError(
+            f"wavelength {wavelength[outside][0].to(grid.unit):.2f} is outside the calibrated "
+            f"range {grid.min():.2f} to {grid.max():.2f}"
+        )
 
 
 def spread_out(free, slopes, shape, mix, axis=0):

@@ -17,6 +17,7 @@ from astropolcal.observations import Observations
 from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.pipeline.headers import describe
+from astropolcal.units import wavelengths_of
 
 __all__ = ["ScienceFrames"]
 
@@ -85,7 +86,7 @@ class ScienceFrames:
     meta: dict = field(default_factory=dict)
 
     def __post_init__(self):
-        self.wavelength = np.atleast_1d(u.Quantity(self.wavelength))
+        self.wavelength = np.atleast_1d(wavelengths_of(self.wavelength))
         if self.wavelength.shape != (self.source.n_wavelengths,):
             raise ObservationError(
                 f"wavelength has shape {self.wavelength.shape}; the frames have "

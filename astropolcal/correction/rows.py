@@ -21,7 +21,7 @@ from astropolcal.observations.pointings import plain_states
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
-from astropolcal.units import length_to_um
+from astropolcal.units import length_to_um, wavelengths_of
 
 __all__ = ["ideal_chain", "measurement_rows"]
 
@@ -56,7 +56,7 @@ class RowModel(Rows):
 
     def __init__(self, calibration, positions, wavelength, *, chain=None, interpolate=False):
         chain = sky_chain(calibration) if chain is None else chain
-        self.wavelength = np.atleast_1d(u.Quantity(wavelength))
+        self.wavelength = np.atleast_1d(wavelengths_of(wavelength))
         self.calibration = calibration if hasattr(calibration, "covariance") else None
         names = [
             f"{leaf.name}.{key}"
@@ -67,10 +67,9 @@ class RowModel(Rows):
         free = mix = None
         if self.calibration is not None:
             free = free_of(calibration)
-        if self.calibration is not None and names:
             grid = calibration.wavelength
             _, mix = match_wavelengths(grid, chain, self.wavelength, interpolate)
-            if not np.isin(mix, (0.0, 1.0)).all():
+            if names and not np.isin(mix, (0.0, 1.0)).all():
                 warnings.warn(
                     f"interpolated linearly between the {grid.size} calibrated wavelengths: "
                     f"{', '.join(names)}",
@@ -191,7 +190,8 @@ def ideal_chain(chain, wavelength):
     >>> float(ideal["wollaston"].efficiency.value), ideal["hwp"].retardance.quantity
     (1.0, <Quantity 180. deg>)
     """
-    found = (_ideal(leaf, np.atleast_1d(wavelength)) for leaf in leaves(chain))
+    lam = np.atleast_1d(wavelengths_of(wavelength))
+    found = (_ideal(leaf, lam) for leaf in leaves(chain))
     return join(leaf for leaf in found if leaf is not None)
 
 

@@ -12,6 +12,7 @@ from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line, understood
 from astropolcal.fitscheck import open_fits, readable_fits
+from astropolcal.units import to_unit
 
 __all__ = []
 
@@ -181,7 +182,14 @@ class _WholeCubes:
         left = files if left_files is None else [str(path) for path in left_files]
         self._beam_files, self._extension = (files, left), extension
         self._weights, self._stacked, self._detectors = weights, stacked, detectors
-        scale = np.broadcast_to(np.asarray(left_scale, dtype=float), self.n_frames)
+        scale = to_unit(left_scale, None, "left_scale")
+        one_each = scale.shape in ((), (self.n_frames,))
+        if not (one_each and np.all((scale > 0) & np.isfinite(scale))):
+            raise ParameterError(
+                f"left_scale = {one_line(left_scale)}; allowed are one number above zero, or one "
+                f"for each of the {self.n_frames} frames"
+            )
+        scale = np.broadcast_to(scale, self.n_frames)
         self._scale = np.stack([np.ones(self.n_frames), scale])
         # each file once, where both beams are in one
         found = {path: _places(path, extension) for path in dict.fromkeys([*files, *left])}

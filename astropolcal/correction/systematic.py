@@ -18,7 +18,7 @@ from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
-from astropolcal.simulation import check_seed
+from astropolcal.units import check_seed
 
 __all__ = ["Systematic"]
 

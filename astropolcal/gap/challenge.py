@@ -25,6 +25,7 @@ from astropolcal.gap._faults import Fault
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.progress import shown, steps
+from astropolcal.units import check_seed
 from astropolcal.words import check_choice, counted
 
 __all__ = ["ChallengeResult", "make_challenge", "run_challenge", "score_answer"]
@@ -106,7 +107,7 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
     setup = Setup() if setup is None else setup
     if not setup.sources:
         raise GapError(f"{setup.instrument}: has no source on the bench")
-    bench = Bench(setup, np.random.default_rng(seed))
+    bench = Bench(setup, np.random.default_rng(check_seed(seed)))
     kinds = {"none": [], "pair": [bench.rng.choice(("cell", "listed")) for _ in range(2)]}
     known, faults, told = fault or {}, [], []
     for one in kinds.get(kind, [kind]):

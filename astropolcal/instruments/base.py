@@ -36,6 +36,7 @@ from astropolcal.observations.pointings import (
     sky_positions,
 )
 from astropolcal.observations.reading import common_wavelengths
+from astropolcal.units import wavelengths_of
 from astropolcal.words import check_choice
 
 __all__ = ["Instrument", "SkyLaw", "add_nuisance"]
@@ -368,7 +369,7 @@ class Instrument(ABC):
 
     def grid(self, wavelength=None):
         """Return the wavelengths of the parameters of a chain, by default the usual ones."""
-        return self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
+        return self.wavelength if wavelength is None else np.atleast_1d(wavelengths_of(wavelength))
 
     def source_of(self, observations, spellings=None):
         """

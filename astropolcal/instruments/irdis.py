@@ -13,7 +13,7 @@ differences here, right minus left, have the opposite sign of the published ones
 
 import warnings
 from collections import ChainMap
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import astropy.units as u
@@ -31,7 +31,7 @@ from astropolcal.instruments.telescope import INTERNAL, PARANAL, STARS, misalign
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
-from astropolcal.units import iso_date, plain_number
+from astropolcal.units import iso_date, plain_number, wavelengths_of
 from astropolcal.words import check_choice, counted
 
 __all__ = ["IRDIS"]
@@ -96,7 +96,7 @@ class _Header:
         return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
 
 
-def frame_table(headers):
+def frame_table(headers, site, sky_law):
     """Return the table of frames from their headers, see the method of `IRDIS`."""
     if not headers:
         raise ObservationError("no headers were given, at least one is needed")
@@ -112,8 +112,8 @@ def frame_table(headers):
             names = ", ".join(sorted(map(str, found)))
             raise ObservationError(f"frames of several {what}: {names}")
     (band,), (tracking,) = bands, trackings
-    rows = [_row(frame, tracking, on_sky=stars[0]) for frame in frames]
-    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking)
+    rows = [_row(frame, tracking, site if stars[0] else None) for frame in frames]
+    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, sky_law)
     table = QTable({key: [row[key] for row in rows] for key in rows[0]})
     table["wavelength"] = np.full(len(rows), 1.0) * _BANDS[band]
     table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
@@ -132,7 +132,8 @@ def _filter(frame):
     return band
 
 
-def _row(frame, tracking, on_sky):
+def _row(frame, tracking, site):
+    """Return the angles and times of a frame, of a star with the site of the telescope."""
     angles = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
     angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
     # the image turns by twice the derotator
@@ -144,10 +145,10 @@ def _row(frame, tracking, on_sky):
         start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
         middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
         moment = middle.isot
-    if on_sky:
+    if site is not None:
         angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
         target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
-        places = pointing(target, Time([start, middle]), location_of(PARANAL))
+        places = pointing(target, Time([start, middle]), location_of(site))
         # by how much altitude and parallactic angle change until the middle
         higher, turned = (float(np.diff(angle.to_value(u.deg))[0]) for angle in places)
         motion = (turned + 180) % 360 - 180, higher
@@ -169,7 +170,7 @@ def _stage(frame, keyword):
     return frame.mean_angle(first, last if last in frame else first)
 
 
-def _warn_of_starts(frames, motions, tracking):
+def _warn_of_starts(frames, motions, tracking, sky_law):
     """Say which angles are those of the start, and by how much the middle differs."""
     for column, keyword in _STAGES.items():
         few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
@@ -177,7 +178,7 @@ def _warn_of_starts(frames, motions, tracking):
             continue
         on_sky = (0.0, 0.0)
         if tracking is not None:
-            law = SKY_LAW.plate_law if column == "hwp_true" else SKY_LAW.derotator_law
+            law = sky_law.plate_law if column == "hwp_true" else sky_law.derotator_law
             on_sky = law(tracking)
         lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
         warnings.warn(
@@ -196,7 +197,7 @@ _SAME_FILTER = 0.01
 
 def filters_at(wavelength):
     """Return the index of the filter of every wavelength."""
-    centres, lam = CENTRES.to_value(u.um), u.Quantity(wavelength).to_value(u.um)
+    centres, lam = CENTRES.to_value(u.um), wavelengths_of(wavelength).to_value(u.um)
     index = np.abs(lam[:, None] / centres - 1).argmin(axis=1)
     # written so that NaN is off, too
     off = ~(np.abs(lam / centres[index] - 1) <= _SAME_FILTER)
@@ -308,12 +309,15 @@ SKY_LAW = SkyLaw(
 _PLATE, _TURN = (f"{_STAGES[name]} BEGIN" for name in ("hwp_true", "derotator"))
 
 
+@dataclass(frozen=True)
 class IrdisLayout(FileLayout):
     """Files whose angles follow from several keywords, see `frame_table`."""
 
+    sky_law: SkyLaw = SKY_LAW
+
     def from_header(self, header):
         """Return a header with the angles, and the time, in the middle of the exposure."""
-        (row,) = frame_table([header])
+        (row,) = frame_table([header], self.site, self.sky_law)
         angles = KEYWORDS.keys() & set(row.colnames)
         known = {KEYWORDS[name]: row[name].to_value(u.deg) for name in angles}
         with offline():
@@ -334,7 +338,7 @@ class IrdisLayout(FileLayout):
         # a star that is always up: by its motion the altitude is that of the start
         own = {_ROTATION: "FIELD", "RA": 0.0, "DEC": -80.0} | own
         own["ESO TEL PARANG END"] = own[_PARALLACTIC]
-        _, motion = _row(_Header(0, own), None, on_sky=True)["motion"]
+        _, motion = _row(_Header(0, own), None, self.site)["motion"]
         return own | {"ESO TEL ALT": own["ESO TEL ALT"] - motion}
 
 
@@ -373,7 +377,7 @@ LAYOUT = IrdisLayout(
 )
 
 
-def layout_of(header):
+def layout_of(header, layout, sky_law):
     """Return how files with such a header look; without ``NAXIS1`` they are of full frames."""
     columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
     if columns % 2 or min(rows, columns // 2) < 16:
@@ -381,11 +385,11 @@ def layout_of(header):
             f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, of "
             "16 x 16 pixels and more each"
         )
-    places = side_by_side(rows, columns // 2, _LIT)
+    places = side_by_side(rows, columns // 2, _LIT) | {"tracking": sky_law.plate_law("field")}
     if str(header.get(_ROTATION, "")).strip() == "PUPIL":
         # the offset of the plate to the pupil is not known: it is not checked
-        places |= {"tracking": SKY_LAW.plate_law("pupil"), "tracking_tolerance": 90.0}
-    return replace(LAYOUT, shape=(1, rows, columns), **places)
+        places |= {"tracking": sky_law.plate_law("pupil"), "tracking_tolerance": 90.0}
+    return replace(layout, shape=(1, rows, columns), sky_law=sky_law, **places)
 
 
 class IRDIS(Instrument):
@@ -557,12 +561,12 @@ class IRDIS(Instrument):
         # a new one: the registry hands out instances that others may hold
         one = type(self)()
         one.wavelength = np.atleast_1d(_BANDS[_filter(_Header(0, header))])
-        one.files = layout_of(header)
+        one.files = layout_of(header, self.files, self.sky_law)
         return one
 
     def mode_header(self, wavelength):
         """Return the filter in the headers of files of a wavelength."""
-        found = [FILTERS[i] for i in filters_at(np.atleast_1d(wavelength))]
+        found = [FILTERS[i] for i in filters_at(self.grid(wavelength))]
         if len(found) != 1:
             raise InstrumentError(
                 f"irdis: a file is of one filter, not of {', '.join(found)}; give one wavelength, "
@@ -619,7 +623,7 @@ class IRDIS(Instrument):
         >>> table["derotator"].round(6), table.meta["filter"]
         (<Quantity [1.] deg>, 'H')
         """
-        table = frame_table(list(headers))
+        table = frame_table(list(headers), self.files.site, self.sky_law)
         days = {self.coating_on(time) for time in table["time"]}
         if len(days) > 1:
             raise InstrumentError(

@@ -33,6 +33,7 @@ from astropolcal.instruments.layout import (
 from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
+from astropolcal.units import wavelengths_of
 
 __all__ = ["VAMPIRES"]
 
@@ -145,7 +146,7 @@ def mode_header(wavelength):
     known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
     known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
     known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
-    wavelength = np.atleast_1d(u.Quantity(wavelength)).to_value(u.nm)
+    wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
     for header, names in known:
         own = _wavelengths(names).value
         if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):

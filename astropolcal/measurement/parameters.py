@@ -266,6 +266,11 @@ class FreeParameters:
             if np.isscalar(offset) and offset == 0:
                 offset = 0.0 * (unit or u.one)
             offset = to_unit(offset, unit, f"offset of {name}") * canonical_factor(unit)
+            if offset.size not in (1, source.size) or not np.isfinite(offset).all():
+                raise ParameterError(
+                    f"tie {name} -> {tie.source}: offset = {tie.offset}; allowed are 1 or "
+                    f"{source.size} finite values"
+                )
             self._followers[name] = source, float(tie.factor), offset
         self._bounds = self._limits()
 
@@ -572,6 +577,11 @@ def bind_prior(prior, name, unit, bounds):
         raise ParameterError(
             f"prior of {name} is a {type(prior).__name__}; allowed are Normal, Uniform and "
             "frozen continuous distributions of scipy.stats"
+        )
+    if np.isnan(distribution.support()).any():
+        given = [*map(str, distribution.args), *(f"{k}={v}" for k, v in distribution.kwds.items())]
+        raise ParameterError(
+            f"prior of {name}: {distribution.dist.name}({', '.join(given)}) is no distribution"
         )
     mode = _mode(distribution)
     low, high = limits(bounds)

@@ -22,7 +22,7 @@ from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
-from astropolcal.units import iso_date, plain_number
+from astropolcal.units import iso_date, plain_number, wavelengths_of
 
 __all__ = []
 
@@ -259,7 +259,7 @@ def bins_on_grid(observations, grid):
 def common_wavelengths(observations, wavelength=None):
     """Return the grid given, or the union of the wavelengths of datasets, ascending, micrometre."""
     if wavelength is not None:
-        return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
+        return np.atleast_1d(wavelengths_of(wavelength).to_value(u.um))
     # compared with the next lower one, so that a chain of near values keeps its first
     merged = np.sort(np.concatenate([obs.wavelength.to_value(u.um) for obs in observations]))
     return merged[np.diff(merged, prepend=-np.inf) > SAME_WAVELENGTH * merged]

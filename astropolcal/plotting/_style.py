@@ -8,8 +8,9 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import atomic_path
+from astropolcal.units import wavelengths_of
 
 # Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -106,10 +107,7 @@ def legend_outside(figure, handles, *, place="outside lower center", title=None,
 
 def nanometres(wavelength):
     """Return wavelengths in nm as floats, shape (n_wavelengths,)."""
-    try:
-        return np.atleast_1d(u.Quantity(wavelength).to_value(u.nm))
-    except (TypeError, u.UnitConversionError):
-        raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
+    return np.atleast_1d(wavelengths_of(wavelength).to_value(u.nm))
 
 
 def wavelength_label(axes):

@@ -34,6 +34,7 @@ from astropolcal.observations.pointings import offline, tracked
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.images import Scene, expose, number, per_wavelength, pixels
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
+from astropolcal.units import check_seed
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -320,7 +321,7 @@ def simulate_cubes(
     beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
-        np.random.default_rng, np.random.SeedSequence(seed).spawn(n_frames + 2)
+        np.random.default_rng, np.random.SeedSequence(check_seed(seed)).spawn(n_frames + 2)
     )
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)

@@ -33,9 +33,11 @@ def find_star(image, good, places, *, fwhm=4.0, companion=0.1):
     """
     Find the brightest star that is seen in all beams of an image (Y, X).
 
-    ``places`` are (x, y) of its images from a common point, each met within some pixels; peaks rise
-    above the noise of the image smoothed with half of ``fwhm``. A second star brighter than the
-    fraction ``companion`` makes it ambiguous.
+    ``places`` are (x, y) of its images from a common point, each met within some pixels: there the
+    brightest peak is taken and not the nearest, as beams move on the detector and a companion may
+    stand where the star was looked for. Hot pixels are to be left out of ``good``: one that
+    outshines the star is taken for it. Peaks rise above the noise of the image smoothed with half
+    of ``fwhm``. A second star brighter than the fraction ``companion`` makes it ambiguous.
     """
     from photutils.detection import find_peaks
 

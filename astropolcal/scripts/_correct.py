@@ -20,8 +20,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.scripts import _common as common
 from astropolcal.scripts._archive import is_archive, run_archive
-from astropolcal.simulation import check_seed
-from astropolcal.units import plain_number
+from astropolcal.units import check_seed, plain_number
 from astropolcal.words import counted
 
 HELP = "correct science cubes with a calibration and write Stokes parameters"

@@ -5,7 +5,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import calibrate, optics
+from astropolcal import calibrate, load, optics
+from astropolcal.calibration.uncertainty import derived_mueller
 from astropolcal.chain import leaves, system_mueller, with_beam
 from astropolcal.correction import measurement_rows
 from astropolcal.correction.rows import RowModel, sky_chain
@@ -71,6 +72,22 @@ def test_a_wavelength_that_is_not_calibrated_is_refused(calibration, track):
         measurement_rows(calibration, positions, [1.5] * u.um)
     with pytest.raises(WavelengthRangeError, match="outside the calibrated range"):
         measurement_rows(calibration, positions, [2.5] * u.um, interpolate=True)
+    # of laws alone, too, which are trusted between the calibrated wavelengths only
+    chain = optics.LinearPolarizer(name="polarizer")
+    chain = chain | optics.TwoLayerWaveplate(mount="hwp", name="hwp", fixed={"theta": False})
+    chain = chain | optics.WollastonPrism(name="wollaston", efficiency=0.9)
+    lam = [1.2, 1.6, 2.0] * u.um
+    data = simulate(chain, lam, half_wave_plate_cycles(), seed=1)
+    laws = calibrate(chain, data, cross_validate=False)
+    at = {"hwp": [0, 22.5] * u.deg}
+    for call in (
+        lambda lam: measurement_rows(laws, at, lam),
+        lambda lam: derived_mueller(laws, at, lam),
+        lambda lam: load(laws).system_mueller(positions=at, wavelength=lam, light="internal"),
+    ):
+        call([1.4] * u.um)
+        with pytest.raises(WavelengthRangeError, match="outside the calibrated range"):
+            call([1.4, 2.1] * u.um)
 
 
 def test_interpolation_names_the_parameters(calibration, track):

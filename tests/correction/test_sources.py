@@ -146,6 +146,9 @@ def test_files_of_two_cameras(cameras):
     found = source.variances(1, slice(1, 2), slice(0, 2))
     np.testing.assert_allclose(found, 9 * expected[1, 1:, :2, 4:7, 5:8])
     assert np.isnan(source.variances(0, ALL, slice(1, 2))[:, 0, 1, 1]).all()
+    for wrong in (np.nan, 0, -1.0, np.inf, [1.0, 2.0, 3.0], "x", [[1.0, 1.0]]):
+        with pytest.raises(ParameterError, match="left_scale = "):
+            CubeFiles(right, [(7, 6), (6, 5)], 3, extension=0, left_files=left, left_scale=wrong)
 
 
 def test_centres_may_move_from_frame_to_frame(cameras):

@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from scipy import stats
 
 from astropolcal import optics
 from astropolcal.exceptions import ObservationError, ParameterError
@@ -270,8 +271,6 @@ def test_mode_of_a_skew_density_is_where_it_peaks():
         ("gamma", 2.0, (0, None)),
         ("t", 4.0, (None, None)),
     ]:
-        from scipy import stats
-
         prior = bind_prior(getattr(stats, name)(scale), "a.b", None, bounds)
         expected = {"lognorm": np.exp(-(0.5**2)), "gamma": 1.0, "t": 0.0}[name]
         assert prior.mode == pytest.approx(expected, abs=1e-5), (name, scale, bounds)
@@ -279,8 +278,6 @@ def test_mode_of_a_skew_density_is_where_it_peaks():
 
 
 def test_a_density_that_peaks_at_its_end():
-    from scipy import stats
-
     prior = bind_prior(stats.expon(scale=0.1), "a.b", None, (0, 1))
     assert prior.mode == 0.0
     # half the square of the residual is x / scale
@@ -295,6 +292,9 @@ def test_priors_that_are_none():
         (Normal(0 * u.deg, 0 * u.deg), "needs a positive std"),
         (Normal(np.nan * u.deg, 1 * u.deg), "needs a positive std"),
         (Normal(0, 1), "needs a unit"),
+        (Normal(0 * u.deg, np.inf * u.deg), "needs a positive std"),
+        (stats.gamma(-1), r"gamma\(-1\) is no distribution"),
+        (stats.norm(0, scale=-1), r"norm\(0, scale=-1\) is no distribution"),
         (0.3, "is a float; allowed are Normal, Uniform"),
         (Uniform(10 * u.deg, 20 * u.deg), "outside the bounds -5 to 5 deg"),
     ]:

@@ -162,6 +162,14 @@ def test_impossible_tie():
         ),
         ({"plate.theta": Tie("wollaston.theta")}, "wollaston.theta is not free"),
         ({"plate.theta": Tie("plate.retardance")}, "the shapes differ"),
+        (
+            {"plate.theta": Tie("wollaston.efficiency", offset=[1, 2] * u.deg)},
+            r"offset = \[1. 2.\] deg; allowed are 1 or 1 finite values",
+        ),
+        (
+            {"plate.theta": Tie("wollaston.efficiency", offset=np.nan * u.deg)},
+            "offset = nan deg; allowed are 1 or 1 finite values",
+        ),
     ]:
         with pytest.raises(ParameterError, match=words):
             FreeParameters([two_optics()], 3, ties)

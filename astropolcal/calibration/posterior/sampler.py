@@ -26,6 +26,7 @@ from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import in_one_thread, shown, steps
+from astropolcal.units import check_seed
 from astropolcal.words import check_type, did_you_mean
 
 __all__ = ["LogPosterior", "sample"]
@@ -435,6 +436,7 @@ def sample(
     emcee = need("emcee", "sampling")
     wanted = "what `calibrate` returns is needed"
     check_type("calibration", calibration, Calibration, wanted, FitError)
+    seed = check_seed(seed, generator=False)
     measurement = calibration.live_measurement()
     weights = "given" if noise is not None else weighting_of(calibration).choice
     log_posterior = LogPosterior(measurement, noise=noise, parameters=parameters)

@@ -16,6 +16,7 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.linearized import led
 from astropolcal.calibration.system import (
     between,
+    check_range,
     free_of,
     from_first_stage,
     inverse_rows,
@@ -33,7 +34,6 @@ from astropolcal.chain import (
 from astropolcal.exceptions import (
     ChainError,
     ParameterError,
-    WavelengthRangeError,
 )
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import SAME_WAVELENGTH
@@ -43,7 +43,7 @@ from astropolcal.optics import (
     MetalMirror,
     PowerLawMirror,
 )
-from astropolcal.units import canonical_factor
+from astropolcal.units import canonical_factor, wavelengths_of
 
 __all__ = [
     "Derived",
@@ -295,7 +295,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
         return _of_optic(calibration, dataset, optic, components, wavelength)
     if not callable(getattr(leaf, "retardance", None)):
         raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
-    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
     found = propagate(
         calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
     )
@@ -350,17 +350,11 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
 def _of_optic(calibration, dataset, optic, keys, wavelength):
     """Return one parameter of an optic, or the length of several, between the wavelengths, too."""
     leaf = find_optic(calibration.chains[dataset], optic)
-    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
     grid, wanted = calibration.wavelength.to_value(u.nm), np.atleast_1d(lam.to_value(u.nm))
     # one number for all wavelengths holds anywhere
-    several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
-    slack = SAME_WAVELENGTH * grid.max()
-    outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
-    if several and outside.any():
-        raise WavelengthRangeError(
-            f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
-            f"{grid.min():.2f} to {grid.max():.2f} nm"
-        )
+    if any(np.size(getattr(leaf, key).value) > 1 for key in keys):
+        check_range(lam, calibration.wavelength)
     weights, unit = between(wanted, grid), getattr(leaf, keys[0]).unit
 
     def length(*chains):
@@ -436,13 +430,14 @@ def _grid(calibration, wavelength):
     grid = calibration.wavelength
     if wavelength is None:
         return grid
-    lam = u.Quantity(wavelength)
+    lam = wavelengths_of(wavelength)
     several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
     if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=SAME_WAVELENGTH)):
         raise ParameterError(
             f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
             "leave out wavelength"
         )
+    check_range(lam, grid)
     return lam
 
 

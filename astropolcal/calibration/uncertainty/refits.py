@@ -38,8 +38,7 @@ from astropolcal.calibration.uncertainty.covariance import (
 )
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.progress import counting, in_one_thread, shown
-from astropolcal.simulation import check_seed
-from astropolcal.units import to_unit
+from astropolcal.units import check_seed, to_unit
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
