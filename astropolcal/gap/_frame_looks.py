@@ -33,6 +33,8 @@ _NEWTON = 8
 _UNKNOWN = 1e12
 # differences that are wrong for no known reason, wavelength by wavelength
 _ANY = 0.3
+#: Evidence that is the same to so many digits is not ordered by what rounding leaves.
+DIGITS = 6
 _TINY = 1e-6
 _BEAMS = {1: "right", -1: "left"}
 
@@ -282,8 +284,8 @@ class Trial:
 
     @property
     def total(self):
-        """Minus twice the logarithm of the evidence."""
-        return self.chi2 + self.cost
+        """Minus twice the logarithm of the evidence; of what does the same it is the same."""
+        return round(float(self.chi2 + self.cost), DIGITS)
 
 
 class Frame:

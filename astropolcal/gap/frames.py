@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._frame_looks import Frame, Group, Look, Trial, angle_stages
+from astropolcal.gap._frame_looks import DIGITS, Frame, Group, Look, Trial, angle_stages
 from astropolcal.gap.model import NOISE, Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
@@ -137,7 +137,11 @@ def _faults(look, accused, n_frames):
             trial = Trial("exchanged", 0.0, 0.0, partner=fault.place[1])
             found[other] = _fault(look.problem, other, trial, fault.evidence, fault.probability)
     found = _of_groups(look, list(found.values()), scatter)
-    return sorted(found, key=lambda fault: -fault.evidence)
+    return sorted(found, key=_order)
+
+
+def _order(fault):
+    return -round(fault.evidence, DIGITS), fault.place
 
 
 def _verdict(look, place, trials, n_frames):
@@ -297,7 +301,7 @@ def _lamp(model):
             trial = Trial("lamp", 0.0, 0.0, size, float(abs(deviation[f]) / off))
             chance = float(1 - 2 * score.size * stats.norm.sf(off))
             found.append(_fault(problem, (i, int(f)), trial, off**2, chance))
-    return sorted(found, key=lambda fault: -fault.evidence)
+    return sorted(found, key=_order)
 
 
 def _off_the_drift(channel, gap):
@@ -446,7 +450,7 @@ def _worst(look, n_frames):
             chances.append(np.minimum(-log, fall / 2))
         scores.append(np.max(chances, axis=0))
     places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
-    every = np.concatenate(scores)
+    every = np.concatenate(scores).round(DIGITS)
     least = max(np.log(n_frames * looks / _ALPHA), _NEARLY * every.max())
     return [places[k] for k in np.argsort(-every, kind="stable") if every[k] > least]
 
