@@ -29,6 +29,7 @@ from astropolcal.gap.effects._laws import (
     without_constant,
 )
 from astropolcal.gap.effects.effect import label_of, tracking_laws
+from astropolcal.gap.effects.where import Where
 from astropolcal.observations import Observations, example_table
 
 GRID = np.array([1.2, 1.4, 1.7, 2.0, 2.2])
@@ -186,6 +187,14 @@ def test_roles_of_a_bare_chain():
     assert roles.derotator is roles.polarizer is roles.mirror is roles.telescope_mirror is None
     assert roles.all("derotator") == []
     assert roles.all("no such role") == []
+
+
+def test_a_place_without_an_optic_has_no_anchor():
+    """Not even where an optic has no name."""
+    roles = Roles(optics.LinearRetarder() | plate() | WOLLASTON)
+    for place in ("source", "telescope", "detector"):
+        assert Where.of(place).anchor(roles) is None, place
+    assert Where.of("after:hwp").anchor(roles).name == "hwp"
 
 
 def test_a_retarder_in_front_of_the_plate_is_a_plate_and_behind_a_derotator():

@@ -670,6 +670,13 @@ def test_declarations_that_are_refused():
         Effect("x", "x", "after:hwp", "diattenuation", "clock")
     with pytest.raises(GapError, match="place = 'hwp'; allowed are 'after:OPTIC'"):
         Effect("x", "x", "hwp", "diattenuation")
+    chains, data = clean("beam_gain")
+    film, context = optics.EllipticalRetarder(name="film"), context_of(data)
+    for limit in (1 * u.s, 1 * u.um, "x", np.nan, 0, -1 * u.deg, [1, 2] * u.deg, 0.1):
+        with pytest.raises(GapError, match="effect film: limit"):
+            Effect.insert(film, before="wollaston", limit=limit).edit(chains, context)
+    with pytest.raises(GapError, match="effect a: size has unit m"):
+        Effect("a", "a", "after:hwp", "diattenuation", limit=1 * u.m)._sizes()
     with pytest.raises(GapError, match="no setting 'limits'; did you mean 'limit'"):
         Effect("x", "x", "after:hwp", "diattenuation", limits=3)
     with pytest.raises(GapError, match="it must do nothing"):

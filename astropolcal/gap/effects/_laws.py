@@ -12,6 +12,7 @@ from astropolcal.gap.effects.effect import Edit, Effect, EffectParameter
 from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
+from astropolcal.units import to_unit
 
 #: Lag of an angle in frames, written as an angle over that of one frame: 0.25, at most 2.
 LAG = {"scale": 0.25 * u.rad, "limit": 2 * u.rad}
@@ -333,7 +334,7 @@ class Held(Effect):
 
 
 def _in_unit(quantity, parameter):
-    return u.Quantity(quantity).to_value(parameter.unit or u.one)
+    return to_unit(quantity, parameter.unit, f"limit of {parameter.name}")
 
 
 def around(parameter, limit, possible):

@@ -22,7 +22,7 @@ from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
-from astropolcal.units import canonical_factor
+from astropolcal.units import canonical_factor, to_unit
 from astropolcal.words import did_you_mean
 
 __all__ = []
@@ -325,8 +325,22 @@ class Effect:
                 )
         if self.place is None and self.where is not None:
             self.place = self.where.words
+        for what in ("scale", "limit"):
+            self._check_size(what, getattr(self, what))
         if self.inserted is None:
             self._check_perturbation()
+
+    def _check_size(self, what, size, unit=None):
+        """Raise unless a size is positive, in a unit that converts to one, or in any if None."""
+        if size is None:
+            return
+        try:
+            unit = getattr(size, "unit", None) if unit is None else unit
+            found = to_unit(size, unit, what)
+        except ParameterError as error:
+            raise GapError(f"effect {self.name}: {error}") from None
+        if found.shape or not 0 < found < np.inf:
+            raise GapError(f"effect {self.name}: {what} = {size}; a number above zero is needed")
 
     def _check_perturbation(self):
         known = (*GENERATORS, *_SEVERAL)
@@ -500,11 +514,17 @@ class Effect:
             if is_in and self.applies_to(roles):
                 chain, parts, more = self.put(chain, roles, context, self.label)
                 ties |= more
-                keys |= dict.fromkeys(
-                    f"{part.name}.{key}" for part in parts for key in self.free_of(part)
-                )
+                keys |= {
+                    f"{part.name}.{key}": getattr(part, key).unit
+                    for part in parts
+                    for key in self.free_of(part)
+                }
             edited.append(chain)
-        return Edit(edited, self.parameters(keys, chains, context), ties)
+        found = self.parameters(keys, chains, context)
+        for one in (one for one in found if one.name in keys):
+            for what in ("limit", "scale"):
+                self._check_size(what, getattr(one, what), keys[one.name] or u.one)
+        return Edit(edited, found, ties)
 
     def parameters(self, names, chains, context):
         """Return the parameters of these names, with their sizes and laws."""
@@ -525,7 +545,12 @@ class Effect:
         sizes = limit / 10 if scale is None else scale, limit
         # perturbations are plain numbers, in radian where they are angles
         is_plain = self.inserted is None and type(self).put is Effect.put
-        return tuple(_plain(size) for size in sizes) if is_plain else sizes
+        return tuple(self._plain(size) for size in sizes) if is_plain else sizes
+
+    def _plain(self, size):
+        angle = u.Quantity(size).unit.is_equivalent(u.rad)
+        self._check_size("size", size, u.rad if angle else u.one)
+        return to_unit(size, u.rad if angle else u.one)
 
     def law(self, context, chains=()):
         """Return the law of its parameters in wavelength, None for a single number."""
@@ -624,11 +649,6 @@ class Effect:
 
     def __repr__(self):
         return f"<Effect {self.name}: {self.title}>"
-
-
-def _plain(size):
-    size = u.Quantity(size)
-    return size.to_value(u.rad if size.unit.is_equivalent(u.rad) else u.one)
 
 
 def _has_axes(optic):

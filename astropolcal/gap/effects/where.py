@@ -65,8 +65,11 @@ class Where:
 
     def anchor(self, roles):
         """Return the optic by which the place is given, None where there is none."""
+        if self.optic is None:
+            # an optic without a name is not what is meant
+            return None
         own = [] if self.is_role else [o for o in roles.leaves if o.name == self.optic]
-        return next(iter(own), getattr(roles, self.optic or "", None))
+        return next(iter(own), getattr(roles, self.optic, None))
 
     def find(self, roles, chosen=None):
         """Return the ``Place`` in a chain, or None; no other where an optic was chosen."""
