@@ -363,13 +363,13 @@ def _images(figures):
 def _image(figure):
     """Return a figure as data URIs, wide and narrow, with its width and height in CSS pixels."""
     width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
-    found = {"width": width, "height": height, "source": _source(figure, _DPI)}
+    found = {"width": width, "height": height, "source": figure_source(figure, _DPI)}
     with _narrow(figure):
-        return found | {"narrow": _source(figure, _FINE)}
+        return found | {"narrow": figure_source(figure, _FINE)}
 
 
-def _source(figure, dpi):
-    # part of the page, which has to be one file that can be sent
+def figure_source(figure, dpi):
+    """Return a figure as part of a page, which has to be one file that can be sent."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi)
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

@@ -581,7 +581,7 @@ def bind_prior(prior, name, unit, bounds):
     if np.isnan(distribution.support()).any():
         given = [*map(str, distribution.args), *(f"{k}={v}" for k, v in distribution.kwds.items())]
         raise ParameterError(
-            f"prior of {name}: {distribution.dist.name}({', '.join(given)}) is no distribution"
+            f"prior of {name}: {distribution.dist.name}({', '.join(given)}) is not a distribution"
         )
     mode = _mode(distribution)
     low, high = limits(bounds)

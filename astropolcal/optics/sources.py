@@ -224,6 +224,11 @@ class StarSource(PolarizedSource):
 
 def _interstellar(wavelength, p_max, lambda_max, width, rotation):
     """Return degree and direction, the logarithm of lambda_max over the wavelength, and shape."""
-    log = np.log(lambda_max / wavelength)
-    shape = np.exp(-width * log**2)
+    shape, log = serkowski(wavelength, lambda_max, width)
     return p_max * shape, np.exp(-2j * rotation * log), log, shape
+
+
+def serkowski(wavelength, lambda_max, width):
+    """Return the law of Serkowski as a share of its maximum, and the logarithm in it."""
+    log = np.log(lambda_max / wavelength)
+    return np.exp(-width * log**2), log

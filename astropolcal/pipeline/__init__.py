@@ -5,7 +5,7 @@ from astropolcal.pipeline.export import mueller_table, write_mueller
 from astropolcal.pipeline.history import Change, changes, parameter_history, restart
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
-from astropolcal.pipeline.monitoring import health, write_health
+from astropolcal.pipeline.monitoring import health
 from astropolcal.pipeline.store import fetch, import_context
 from astropolcal.pipeline.timeline import courses
 
@@ -24,6 +24,5 @@ __all__ = [
     "mueller_table",
     "parameter_history",
     "restart",
-    "write_health",
     "write_mueller",
 ]

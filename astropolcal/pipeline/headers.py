@@ -10,12 +10,12 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal import instruments
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.result.calibration import (
     _dates,
     _moment,
     beam_words,
     folded,
-    instrument_of,
     optics_words,
     validity_of,
 )
@@ -208,7 +208,7 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
 
     ``optics_in`` are all optional optics in the beam, ``beam`` those known to be in it or not.
     """
-    instrument, kinds = instrument_of(calibration), {}
+    instrument, kinds = known_instrument(calibration.instrument), {}
     known = None if optics_in is None else set(optics_in)
     for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
         inner = split_chain(without_nuisance(chain))[1]
@@ -304,7 +304,7 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
         times, taken = (Time(texts, format="isot", scale="utc") for texts in (list(moments), days))
     # (n_moments, n_days), in days
     apart = np.abs((times[:, None] - taken).to_value(u.day)).min(axis=1)
-    limit, worst = _max_age(max_age, held, instrument_of(calibration)), apart.argmax()
+    limit, worst = _max_age(max_age, held, known_instrument(calibration.instrument)), apart.argmax()
     if apart[worst] > limit:
         moment = list(moments)[worst]
         warnings.warn(
@@ -318,7 +318,7 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
 
 def _check_changes(calibration, light, days, moments, name, way):
     """Refuse a day between which and all days of the data the instrument has changed."""
-    instrument, held = instrument_of(calibration), validity_of(calibration)
+    instrument, held = known_instrument(calibration.instrument), validity_of(calibration)
     if instrument is None:
         return
     own = {leaf.name for chain in calibration.chains for leaf in leaves(chain)}

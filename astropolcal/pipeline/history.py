@@ -17,7 +17,8 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import calibrate
-from astropolcal.calibration.result.calibration import instrument_of, validity_of
+from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
@@ -454,7 +455,7 @@ def restart(calibration, observations, free, *, chain=None, **options):
     old = getattr(calibration, "calibration", calibration)
     datasets = [observations] if isinstance(observations, Observations) else list(observations)
     free = [free] if isinstance(free, str) else list(free)
-    instrument = instrument_of(old)
+    instrument = known_instrument(old.instrument)
     chains = _new_chains(old, datasets, instrument, chain)
     _hold(old, chains, free)
     # another mirror branch would look like a change of the instrument

@@ -14,7 +14,8 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration.result.calibration import Calibration, instrument_of, validity_of
+from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.result.calibration import Calibration, validity_of
 from astropolcal.calibration.system import (
     MuellerMatrices,
     at_wavelengths,
@@ -322,7 +323,7 @@ class LoadedCalibration:
     @property
     def instrument(self):
         """The `~astropolcal.instruments.Instrument`, or None if it is not a known one."""
-        return instrument_of(self.calibration)
+        return known_instrument(self.calibration.instrument)
 
     @property
     def wavelength(self):

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.time import Time
 
 from astropolcal.calibration.fit.evidence import COURSES, moment_of
-from astropolcal.calibration.result.calibration import instrument_of
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
@@ -16,7 +16,7 @@ from astropolcal.pipeline.library import Library
 from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
 
-__all__ = ["health", "write_health"]
+__all__ = ["health"]
 
 #: A change, or a course, at least this probable is an event.
 LIKELY = 0.9
@@ -159,7 +159,7 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
                 content["events"].append(one | {"words": words})
     content["events"].sort(key=lambda one: one["to"])
     newest = dated[-1] if dated else entries[-1]
-    known = instrument_of(newest.calibration) or Instrument
+    known = known_instrument(newest.calibration.instrument) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
@@ -214,26 +214,9 @@ def _alarms(content, newest, verdict, moment, goal, limit):
 
 def write_health(content, path, *, figures=None):
     """
-    Write what `health` returns as one self-contained page.
+    Write what `health` returns as one self-contained page, which replaces an existing one.
 
-    Parameters
-    ----------
-    content : dict
-        Of `health`.
-    path : path-like
-        The file; an existing one is replaced.
-    figures : sequence of dict of str to str, optional
-        Per group, data URIs of figures by caption.
-
-    Raises
-    ------
-    ParameterError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> from astropolcal.pipeline import write_health
-    >>> write_health({"now": "2027-01-01T00:00:00", "groups": [], "unreadable": {}}, "h.html")
+    ``figures`` are data URIs by caption, a dict per group.
     """
     figures = figures or [{} for _ in content["groups"]]
     groups = list(zip(content["groups"], figures, strict=True))

@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrated parameters against wavelength and date, with what is known of their errors."""
 
-import base64
-import io
 import textwrap
 from contextlib import suppress
 from datetime import timedelta
@@ -645,10 +643,3 @@ def draw_accuracies(group, goal=None, *, figure=None):
         changed = "; grey: an optic changed" if group["events"] else ""
         fig.suptitle(f"Accuracy over time{changed}")
     return fig
-
-
-def embedded(figure):
-    """Return a figure as a data URI, for a page that is one file."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

@@ -35,7 +35,8 @@ library DIR Input  folder of calibrations
 @in_one_thread
 def run(arguments):
     """Say how the instruments do, and write the page."""
-    from astropolcal.pipeline import Library, health, write_health
+    from astropolcal.pipeline import Library, health
+    from astropolcal.pipeline.monitoring import write_health
 
     common.check_suffix("--html", arguments.html, *common.PAGES)
     library = Library(arguments.library)
@@ -73,8 +74,9 @@ def _group(group):
 
 def _figures(library, group, goal):
     """Return the figures of a group by caption, as data URIs."""
+    from astropolcal.gap.report import figure_source
     from astropolcal.plotting import plot_history
-    from astropolcal.plotting.parameters import draw_accuracies, embedded
+    from astropolcal.plotting.parameters import draw_accuracies
 
     names = {one["name"] for one in group["calibrations"] if one["date"]}
     entries = [entry for entry in library.entries if entry.name in names]
@@ -83,4 +85,4 @@ def _figures(library, group, goal):
         # more parameters than a figure holds; the courses are in the table
         with suppress(ParameterError):
             found[one["words"]] = plot_history(entries, [one["what"]], title=one["words"])
-    return {caption: embedded(figure) for caption, figure in found.items()}
+    return {caption: figure_source(figure, 110) for caption, figure in found.items()}

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.modeling import Fittable1DModel, Parameter
 
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.optics.sources import serkowski
 from astropolcal.units import angle_to_rad, length_to_um, to_unit
 
 __all__ = ["SerkowskiLaw", "whittet_width"]
@@ -163,8 +164,8 @@ class SerkowskiLaw(Fittable1DModel):
 
     def evaluate(self, x, p_max, lambda_max, K, theta, rotation):
         """Return the degree of polarization; astropy calls it."""
-        log = np.log(u.Quantity(lambda_max, u.um).value / _in_range(x, self.valid_range))
-        degree = p_max * np.exp(-u.Quantity(K).value * log**2)
+        longest, width = u.Quantity(lambda_max, u.um).value, u.Quantity(K).value
+        degree = p_max * serkowski(_in_range(x, self.valid_range), longest, width)[0]
         # a model with units must not mix plain numbers with quantities
         return degree << u.dimensionless_unscaled if hasattr(x, "unit") else degree
 
@@ -180,8 +181,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     @staticmethod
     def _columns(x, p_max, lambda_max, K, theta, rotation, slope=0.0):
-        log = np.log(lambda_max / np.asarray(x, dtype=float))
-        shape = np.exp(-K * log**2)
+        shape, log = serkowski(np.asarray(x, dtype=float), lambda_max, K)
         degree = p_max * shape
         none = np.zeros_like(shape)
         # d/dp_max, d/dlambda_max, d/dK of p_max exp(-K ln^2(lambda_max /

@@ -9,7 +9,8 @@ import pytest
 
 from astropolcal import calibrate, instruments
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.pipeline import Library, changes, courses, health, parameter_history, write_health
+from astropolcal.pipeline import Library, changes, courses, health, parameter_history
+from astropolcal.pipeline.monitoring import write_health
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -16,7 +16,7 @@ from gap_data import chain, observed, with_effect
 
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import to_dict, write_html
-from astropolcal.pipeline import write_health
+from astropolcal.pipeline.monitoring import write_health
 from astropolcal.scripts._diagnose import _figures, _size_figures
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

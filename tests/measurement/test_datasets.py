@@ -293,8 +293,8 @@ def test_priors_that_are_none():
         (Normal(np.nan * u.deg, 1 * u.deg), "needs a positive std"),
         (Normal(0, 1), "needs a unit"),
         (Normal(0 * u.deg, np.inf * u.deg), "needs a positive std"),
-        (stats.gamma(-1), r"gamma\(-1\) is no distribution"),
-        (stats.norm(0, scale=-1), r"norm\(0, scale=-1\) is no distribution"),
+        (stats.gamma(-1), r"gamma\(-1\) is not a distribution"),
+        (stats.norm(0, scale=-1), r"norm\(0, scale=-1\) is not a distribution"),
         (0.3, "is a float; allowed are Normal, Uniform"),
         (Uniform(10 * u.deg, 20 * u.deg), "outside the bounds -5 to 5 deg"),
     ]:

@@ -16,6 +16,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import instruments
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.result.summary import summary, to_dict
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
@@ -27,7 +28,6 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import (
     AstropolcalError,
     CalibrationFileError,
-    InstrumentError,
     ObservationError,
 )
 from astropolcal.measurement import Measurement
@@ -522,7 +522,7 @@ def measurement_of_all(calibration, observations, positions=None):
     given = [_prepared(calibration, table) for table in given]
     order = _order(calibration.datasets, given)
     tables = [given[i] for i in order]
-    instrument = instrument_of(calibration)
+    instrument = known_instrument(calibration.instrument)
     if positions is not None:
         positions = [positions[i] for i in order]
     elif instrument is not None:
@@ -559,7 +559,7 @@ def _prepared(calibration, table):
     """Return a table with the masks of the instrument, if the calibration was made with them."""
     # hashes are those of the tables as they were fitted, masks included
     wanted = {record.content_hash for record in calibration.datasets}
-    instrument = instrument_of(calibration)
+    instrument = known_instrument(calibration.instrument)
     if table.content_hash in wanted or instrument is None:
         return table
     try:
@@ -733,15 +733,6 @@ def validity_of(calibration):
             instrument = instruments.get(calibration.instrument)
             derived["optics_in"] = [list(instrument.setup(record)[1]) for record in records]
     return Validity(calibration.instrument, **(derived | stated))
-
-
-def instrument_of(calibration):
-    """Return the instrument; None without one, or for a name that somebody chose."""
-    name = calibration.instrument
-    try:
-        return None if name is None else instruments.get(name)
-    except InstrumentError:
-        return None
 
 
 def _dates(calibration):

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import instruments
-from astropolcal.calibration.result.calibration import instrument_of
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.efficiency import has_derotator, has_plate, polarimetric_efficiency, sky_path
@@ -107,7 +107,7 @@ def _resolved(label, member):
         return member.published(), member.wavelength, member, None
     if hasattr(member, "chains") and hasattr(member, "wavelength"):
         # datasets share what is compared; the first chain has it
-        return member.chains[0], member.wavelength, instrument_of(member), member
+        return member.chains[0], member.wavelength, known_instrument(member.instrument), member
     if isinstance(member, tuple) and len(member) == 2:
         return member[0], np.atleast_1d(u.Quantity(member[1])), None, None
     raise ParameterError(
