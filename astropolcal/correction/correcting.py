@@ -170,12 +170,8 @@ def correct(
     >>> float(star.q[0].round(9)), float(star.u[0].round(9))
     (0.02, -0.01)
     """
-    check_choice("mode", mode, MODES, ParameterError)
     by_variance = isinstance(weights, str)
-    if by_variance and weights != "variance":
-        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
-    wanted = "ScienceFrames are needed, after the calibration"
-    check_type("frames", frames, ScienceFrames, wanted, ParameterError)
+    _check(frames, mode, weights)
     if hasattr(calibration, "datasets"):
         when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
         check_frames(calibration, frames.moments(), "the calibration", **when)
@@ -192,11 +188,7 @@ def correct(
         "labels": frames.names,
     }
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
-    systematic = None
-    if model.calibration is not None and n_samples:
-        systematic = sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
-    elif model.calibration is not None:
-        systematic = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
+    systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
     for words in doubts + unmeasured:
@@ -215,6 +207,23 @@ def correct(
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
+
+
+def _check(frames, mode, weights):
+    check_choice("mode", mode, MODES, ParameterError)
+    if isinstance(weights, str) and weights != "variance":
+        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
+    wanted = "ScienceFrames are needed, after the calibration"
+    check_type("frames", frames, ScienceFrames, wanted, ParameterError)
+
+
+def _systematic(model, solution, mode, open_directions, n_samples, seed):
+    """Return the errors that the calibration makes, None of a chain that nobody fitted."""
+    if model.calibration is None:
+        return None
+    if n_samples:
+        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
+    return linear_systematic(model, solution, mode=mode, open_directions=open_directions)
 
 
 def _observable(calibration, frames, observable):

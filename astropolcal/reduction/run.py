@@ -285,6 +285,20 @@ def reduce_run(
     reduction = Reduction(
         instrument, photometry, problems=lost, options=options, masters=task["masters"]
     )
+    frames = _usable(frames, reduction, layout, hwp_sequence, keep_repeats)
+    if not frames:
+        raise ObservationError(_nothing(len(files), task, reduction.problems))
+    reduction.frames = frames
+    for frame in frames:
+        if frame.values.get("light") == "uneven":
+            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
+    reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
+    reduction.meta = _meta(frames, instrument, source, meta or {})
+    return reduction
+
+
+def _usable(frames, reduction, layout, hwp_sequence, keep_repeats):
+    """Return the frames that belong in a table together; note why the others do not."""
     # copies before sequences: a copy would look like an angle too often
     frames = set_aside(frames, reduction)
     if any(frame.values.get("flc_state") for frame in frames):
@@ -295,17 +309,9 @@ def reduce_run(
     staged = {"hwp", "derotator"} <= {*layout.stages}
     if staged and hwp_sequence is None:
         frames = consistent(frames, reduction, layout)
-    if staged and photometry == "internal" and not keep_repeats:
+    if staged and reduction.source == "internal" and not keep_repeats:
         frames = without_repeats(frames, reduction)
-    if not frames:
-        raise ObservationError(_nothing(len(files), task, reduction.problems))
-    reduction.frames = frames
-    for frame in frames:
-        if frame.values.get("light") == "uneven":
-            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
-    reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
-    reduction.meta = _meta(frames, instrument, source, meta or {})
-    return reduction
+    return frames
 
 
 def _instrument(instrument, files=()):

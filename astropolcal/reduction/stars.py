@@ -58,12 +58,8 @@ def measure_stars(
     like polarization. Pixels without a value are filled with the Gaussian and what the pixels
     around them have beyond it. The options are described in `reduce_run`.
     """
-    _check(radius, factor, max_radius, annulus, companion, max_masked, aperture_correction)
-    if aperture_correction is True and not layout.two_beams:
-        raise ParameterError(
-            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
-            "the wings is that of two beams, allowed are False and 'growth'"
-        )
+    _check(radius, factor, max_radius, annulus, companion, max_masked)
+    _check_correction(aperture_correction, layout)
     result = Photometry.empty(len(cube), len(layout.beams))
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
@@ -109,7 +105,7 @@ def measure_stars(
     return result
 
 
-def _check(radius, factor, max_radius, annulus, companion, max_masked, correction):
+def _check(radius, factor, max_radius, annulus, companion, max_masked):
     if isinstance(radius, str):
         if radius not in ("fwhm", "growth"):
             raise ParameterError(f"radius = {radius!r}; allowed are 'fwhm', 'growth' and pixels")
@@ -121,9 +117,17 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked, correctio
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
+
+
+def _check_correction(correction, layout):
     if correction not in (False, True, "growth"):
         raise ParameterError(
             f"aperture_correction = {correction!r}; allowed are False, True and 'growth'"
+        )
+    if correction is True and not layout.two_beams:
+        raise ParameterError(
+            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
+            "the wings is that of two beams, allowed are False and 'growth'"
         )
 
 

@@ -68,6 +68,7 @@ __all__ = ["calibrate"]
 STRATEGIES = ("joint", "two-step", "sequential")
 ERRORS = ("scatter", "white")
 GAUGES = ("minimal", None)
+_CHOICES = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS, "gauge": GAUGES}
 _ROBUST_ROUNDS = 50
 
 
@@ -180,13 +181,9 @@ def calibrate(
     >>> cal.converged
     True
     """
-    for name, value, allowed in (
-        ("strategy", strategy, STRATEGIES),
-        ("loss", loss, LOSSES),
-        ("errors", errors, ERRORS),
-        ("gauge", gauge, GAUGES),
-    ):
-        check_choice(name, value, allowed, FitError)
+    chosen = {"strategy": strategy, "loss": loss, "errors": errors, "gauge": gauge}
+    for name, value in chosen.items():
+        check_choice(name, value, _CHOICES[name], FitError)
     search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
@@ -201,23 +198,15 @@ def calibrate(
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
-    if strategy == "joint":
-        outcome, weighting = joint(measurement, weighting, fitter, search, options)
-        stages = []
-    elif strategy == "two-step":
-        outcomes, weighting, stages = two_step(measurement, weighting, fitter, search, options)
-    else:
-        outcomes, weighting, stages = sequential(measurement, weights, fitter, search, options)
-    if stages:
-        # the first step that did not converge makes the next ones useless
-        outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1])
+    given = weights if strategy == "sequential" else weighting
+    outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
         outcome, weighting = _robust(measurement, fitter, loss, outcome)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
         )
-    chosen, whitened = _at_gauge(measurement, weighting, origin, gauge)
+    taken, whitened = _at_gauge(measurement, weighting, origin, gauge)
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
     return _result(
         measurement,
@@ -225,16 +214,23 @@ def calibrate(
         settings={
             "instrument": instrument,
             "fitter": type(fitter).__name__,
-            "strategy": strategy,
-            "loss": loss,
-            "errors": errors,
-            "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+            **chosen,
+            "gauge": describe_gauge(gauge, taken, measurement.free, list(fix or ())),
             **({"own": copies} if copies else {}),
         },
         fit=outcome,
         stages=stages,
         cross_validate=cross_validate,
     )
+
+
+def _by_strategy(strategy, *how):
+    """Return the outcome of a fit, with its weighting and stages."""
+    if strategy == "joint":
+        return *joint(*how), []
+    outcomes, weighting, stages = (two_step if strategy == "two-step" else sequential)(*how)
+    # the first step that did not converge makes the next ones useless
+    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), weighting, stages
 
 
 def _fixed(chain, fix):

@@ -443,14 +443,7 @@ def sample(
     n = log_posterior.sampled.size
     n_walkers = max(2 * n, _FEWEST_WALKERS) if n_walkers is None else n_walkers
     thin = max(n // _PARAMETERS_A_STEP_KEPT, 1) if thin is None else thin
-    _check(n, n_walkers, n_steps, thin, checkpoint_every)
-    if burn_in is not None:
-        # two kept steps at least must be left, for a standard deviation
-        most = (n_steps // thin - 2) * thin
-        if not _is_whole(burn_in) or not 0 <= burn_in <= most:
-            allowed = f"{n_steps} steps allow whole numbers from 0 to {most}"
-            raise _refused("burn_in", burn_in, allowed)
-        burn_in = -(-int(burn_in) // thin)
+    _check(n, n_walkers, n_steps, thin, checkpoint_every, burn_in)
     laplace = Laplace(log_posterior)
     moves = default_moves(emcee, laplace) if moves is None else moves
     refuse_biased(moves, emcee.__version__)
@@ -473,7 +466,8 @@ def sample(
         thin=thin,
         seed=seed,
         settings=_settings(log_posterior, moves, weights, emcee.__version__),
-        burn_in=burn_in,
+        # of kept steps
+        burn_in=None if burn_in is None else -(-int(burn_in) // thin),
     )
     if not posterior.converged:
         short = posterior.n_times < ENOUGH
@@ -485,7 +479,7 @@ def sample(
     return posterior
 
 
-def _check(n, n_walkers, n_steps, thin, every):
+def _check(n, n_walkers, n_steps, thin, every, burn_in):
     for name, value in (("n_steps", n_steps), ("thin", thin), ("checkpoint_every", every)):
         if not _is_whole(value) or value < 1:
             raise _refused(name, value, "allowed are whole numbers from 1 up")
@@ -496,6 +490,11 @@ def _check(n, n_walkers, n_steps, thin, every):
     if not _is_whole(n_walkers) or n_walkers < fewest:
         reason = f"{n} parameters need a whole number from {fewest} up"
         raise _refused("n_walkers", n_walkers, reason)
+    # two kept steps at least must be left, for a standard deviation
+    most = (n_steps // thin - 2) * thin
+    if burn_in is not None and (not _is_whole(burn_in) or not 0 <= burn_in <= most):
+        allowed = f"{n_steps} steps allow whole numbers from 0 to {most}"
+        raise _refused("burn_in", burn_in, allowed)
 
 
 def _is_whole(value):
