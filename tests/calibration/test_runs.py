@@ -246,14 +246,11 @@ def test_wrong_input_is_refused_in_one_line():
 @pytest.mark.slow
 def test_wanted_courses_of_what_the_data_leave_open_fit_as_well_as_any():
     """Angles of an elliptical derotator turn against each other: a bound must not stop the fit."""
-    chain, tables = (
-        CHARIS.chain(derotator="elliptical", wavelength=GRID),
-        make_runs(0.3 * np.arange(4)),
-    )
     vary = {"hwp.theta": "drift", "derotator.theta": "walk"}
-    found = calibrate_runs(chain, tables, vary=vary)
-    assert found.converged
-    # 132 data less what is fitted of each run; twice that where the search was stuck
-    assert found.runs["rms"].max() < 1.3 * found.runs["rms_alone"].max()
-    value, std = elements(found, "wollaston.efficiency")
-    assert np.all(np.abs(value - [0.98, 0.975, 0.97]) < 4 * std)
+    for step in (0.1, 0.3):
+        chain = CHARIS.chain(derotator="elliptical", wavelength=GRID)
+        found = calibrate_runs(chain, make_runs(step * np.arange(4), seed=20), vary=vary)
+        assert found.converged
+        assert np.all(found.runs["rms"] < 1.4 * found.runs["rms_alone"]), step
+        value, std = elements(found, "wollaston.efficiency")
+        assert np.all(np.abs(value - [0.98, 0.975, 0.97]) < 4 * std), step

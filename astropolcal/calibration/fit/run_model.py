@@ -43,6 +43,8 @@ _CHANGED, _MOST_CHANGED = 0.3, 0.05
 _SIMPLE = ("steps", "drift")
 # the solution has arrived where no determined direction moves by this share of its error
 _ARRIVED, _MOST_ROUNDS, _HALVINGS, _SHORTER = 0.01, 20, 6, 1.1
+# so far beyond a bound, in steps of a degree or so, is rounding
+_BEYOND = 1e-9
 _PINV = 1e-9
 # rows of so many runs are reduced at a time
 _MANY = 2000
@@ -169,17 +171,39 @@ class Model:
         rows, aims = self._system()
         n, (low, high) = len(self.shared), self.limits
         start, held = self.value.copy(), np.zeros(self.value.size, dtype=bool)
+        stopped, every, wanted = [~mine for mine in self.own], rows, aims
         while True:
             new, live = start.copy(), np.flatnonzero(~held)
-            found = decompose(rows[:, live])
-            left = aims - rows @ (start - self.value)
-            new[live] += found.half.T @ (found.half @ (rows[:, live].T @ left))
+            found = pulled = decompose(rows[:, live])
+            if every is not rows:
+                pulled = decompose(every[:, live])
+            left = wanted - every @ (start - self.value)
+            new[live] += pulled.half.T @ (pulled.half @ (every[:, live].T @ left))
             outside = ~held[:n] & ((new[:n] < low) | (new[:n] > high))
-            if not outside.any():
-                self.held = held
-                return new, found
             start[:n] = np.where(outside, np.clip(new[:n], low, high), start[:n])
             held[:n] |= outside
+            if not outside.any():
+                more, bounds = self._beyond(new, stopped)
+                if not bounds.size:
+                    self.held = held
+                    return new, found
+                # pulled to its bound as hard as data can, which they resist where they know better
+                hard = np.abs(rows).max(initial=1.0)
+                every = np.concatenate([every, hard * more])
+                wanted = np.concatenate([wanted, hard * (bounds - more @ self.value)])
+
+    def _beyond(self, value, free):
+        """Return rows of what a course leads beyond its bounds in a run, and these, once each."""
+        rows, bounds = [np.zeros((0, value.size))], [np.zeros(0)]
+        for i in range(len(self.names)) if self.terms else ():
+            shares, limits = self._shares(i), np.array(self.work.shapes[i].free.bounds())
+            theta = shares @ value
+            nearest = np.clip(theta, *(limits / self.scales[i]))
+            far = free[i] & (np.abs(theta - nearest) > _BEYOND)
+            free[i] &= ~far
+            rows.append(shares[far])
+            bounds.append(nearest[far])
+        return np.concatenate(rows), np.concatenate(bounds)
 
     def _vectors(self, value):
         """Return the canonical parameters of all runs."""
