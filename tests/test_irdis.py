@@ -24,6 +24,7 @@ from astropolcal.exceptions import (
     ChainError,
     InstrumentError,
     ObservationError,
+    ParameterError,
 )
 from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
 from astropolcal.instruments import IRDIS, SkyLaw
@@ -430,6 +431,9 @@ def test_site_and_laws_are_those_of_the_subclass():
             found = layout.from_header(cards)["ESO TEL ALT"]
         assert found == pytest.approx(tables[-1]["altitude"][0].value, abs=1e-9)
     assert abs(tables[0]["altitude"] - tables[1]["altitude"])[0] > 0.01 * u.deg
+    Elsewhere.files = replace(IRDIS.files, site=())
+    with pytest.raises(ParameterError, match="the site of the telescope is needed"):
+        Elsewhere().frame_table([cards])
 
 
 def test_angles_of_the_start_alone_are_taken_and_told():

@@ -32,7 +32,7 @@ from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import MOVES, PLACES
 from astropolcal.units import angle_to_rad, mjd_of, plain_number
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, check_type
 
 __all__ = ["location_of", "pointing"]
 
@@ -148,6 +148,11 @@ def pointing(coord, time, location):
     altitude, parallactic : `~astropy.units.Quantity`
         Degree; the parallactic angle is between -180 and 180 deg, positive in the west.
 
+    Raises
+    ------
+    ParameterError
+        If the location is none.
+
     Warns
     -----
     AstropolcalWarning
@@ -166,8 +171,10 @@ def pointing(coord, time, location):
     >>> altitude.round(1), parallactic.round(0)
     (<Quantity 69.1 deg>, <Quantity 6. deg>)
     """
-    from astropy.coordinates import HADec
+    from astropy.coordinates import EarthLocation, HADec
 
+    wanted = "the site of the telescope is needed, an EarthLocation"
+    check_type("location", location, EarthLocation, wanted, ParameterError)
     with offline():
         seen = coord.transform_to(HADec(obstime=time, location=location))
     _warn_of_uncovered(time)

@@ -329,7 +329,8 @@ def simulate_cubes(
     beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
-        np.random.default_rng, np.random.SeedSequence(check_seed(seed)).spawn(n_frames + 2)
+        np.random.default_rng,
+        np.random.SeedSequence(check_seed(seed, generator=False)).spawn(n_frames + 2),
     )
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)

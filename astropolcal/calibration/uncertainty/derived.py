@@ -397,6 +397,8 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     ------
     ChainError, ParameterError
         As `~astropolcal.chain.system_mueller`.
+    WavelengthRangeError
+        If a wavelength is beyond the calibrated ones.
 
     Examples
     --------
@@ -529,6 +531,8 @@ def derived_sky(calibration, q, u, positions, *, wavelength=None, chain=None, da
         If a stage has no position, or the chain no optic on a stage.
     ParameterError
         If the positions do not determine q and u, or the source is unphysical.
+    WavelengthRangeError
+        If a wavelength is beyond the calibrated ones.
 
     Examples
     --------
