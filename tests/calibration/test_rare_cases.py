@@ -14,7 +14,7 @@ from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.fit.calibrate import open_parameters, settled
 from astropolcal.calibration.fit.strategies import BinProblem
 from astropolcal.calibration.noise import noise_from_null_channel, noise_from_replicates
-from astropolcal.calibration.noise.weighting import Weighting, outlying_data, robust_sigma
+from astropolcal.calibration.noise.weighting import Weighting, outlying_data, robust_weighting
 from astropolcal.calibration.posterior import LogPosterior, Posterior
 from astropolcal.calibration.result.summary import _target_lines
 from astropolcal.calibration.uncertainty import derived_efficiency, derived_sky
@@ -145,7 +145,8 @@ def test_a_frame_at_odds_is_told_with_its_brightness(chain, data):
 
 def test_a_far_datum_is_noisy_and_a_near_one_is_not(cal):
     for loss in ["huber", "cauchy", "bisquare"]:
-        sigma, plain = (robust_sigma(cal.measurement, name) for name in (loss, "linear"))
+        kinds = (robust_weighting(cal.measurement, name) for name in (loss, "linear"))
+        sigma, plain = (weighting.sigma for weighting in kinds)
         # times sigma / scale it is the root of one over the weight: never below one
         ratio, size = sigma / plain, np.abs(cal.measurement.residuals()) / plain
         assert (ratio >= 1 - 1e-12).all(), loss

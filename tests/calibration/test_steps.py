@@ -221,6 +221,25 @@ def test_robust_loss_is_not_pulled(spoiled, loss):
     assert error(loss=loss) < 0.6 * error()
 
 
+@pytest.mark.slow
+def test_a_robust_fit_of_good_data_is_not_surer_than_least_squares():
+    """Weights that follow the residuals let a fit move more than weights that stay."""
+    chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)
+    chain["hwp"].theta.fixed = chain["derotator"].theta.fixed = True
+    frames = half_wave_plate_cycles(derotator=[45, 60, 75, 95, 117] * u.deg)
+    for errors in ("scatter", "white"):
+        stds = {"linear": [], "huber": [], "bisquare": []}
+        for seed in range(6):
+            data = simulate(chain, WAVELENGTH, frames, flux=1e6, seed=seed)
+            for loss, found in stds.items():
+                cal = calibrate(chain, data, loss=loss, errors=errors, cross_validate=False)
+                found.append(cal.covariance.stds)
+        for loss in ("huber", "bisquare"):
+            # in a hundred such runs errors as of weights that stay were 0.7 of the scatter
+            ratio = np.median(np.divide(stds[loss], stds["linear"]))
+            assert 0.9 < ratio < 1.4, (errors, loss, ratio)
+
+
 def test_outlying_pair_is_reported_and_kept(spoiled):
     cal = calibrate(*spoiled, loss="bisquare", cross_validate=False)
     table = outlying_data(cal)

@@ -39,11 +39,10 @@ from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
     Problem,
-    Weighting,
     describe,
     first_weighting,
     outlying_data,
-    robust_sigma,
+    robust_weighting,
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
 from astropolcal.calibration.uncertainty.covariance import (
@@ -141,8 +140,9 @@ def calibrate(
         the fit happens to end. The choice is recorded in ``settings``.
     loss : {"linear", "huber", "cauchy", "bisquare"}
         With another loss than the linear one, which is least squares, data that depart far
-        from the model count less. It sets the
-        noise of each datum, so ``weights`` counts for the first fit only.
+        from the model count less. It sets the noise of each datum, so ``weights`` counts for the
+        first fit only. Errors of parameters allow for weights that follow the residuals; a profile,
+        a bootstrap and samples take them as known, and may be a third narrower.
     fix : dict of str to `~astropy.units.Quantity` or None, optional
         Parameters to hold, ``"optic.parameter"``, at a value or (None) at
         that of the chain: another way to choose a gauge.
@@ -274,7 +274,7 @@ def _robust(measurement, fitter, loss, outcome):
     before = None
     for _ in range(_ROBUST_ROUNDS):
         # iteratively reweighted least squares, which every fitter can do
-        weighting = Weighting("given", robust_sigma(measurement, loss))
+        weighting = robust_weighting(measurement, loss)
         if before is not None and weighting.agrees(before):
             return outcome, weighting
         outcome = fit_once(measurement, weighting, fitter)

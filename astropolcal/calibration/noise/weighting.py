@@ -30,6 +30,8 @@ _FAR = 4.0
 TALL = 20_000
 # smallest weight, so that no datum is lost altogether
 _LEAST = 1e-4
+# step of residuals in units of the noise for the slope of their pull
+_SMALL = 1e-4
 
 #: Weight of a datum by its residual in units of the noise; the constants give 95 % of the
 #: efficiency of least squares for normal noise (Holland & Welsch 1977,
@@ -42,14 +44,21 @@ LOSSES = {
 }
 
 
-def robust_sigma(measurement, loss):
+def robust_weighting(measurement, loss):
     """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
     # that of a calibration from a file may be any text
     check_choice("loss", loss, LOSSES, FitError)
-    residuals = measurement.residuals()
-    scale = _scales(measurement, residuals)
+    residuals, n = measurement.residuals(), measurement.n_data
+    # the fit has taken its share from the residuals
+    taken = np.sqrt(n / max(n - measurement.free.size, 1))
+    scale = _scales(measurement, residuals) * taken
+    pulls = residuals / scale
+    weight = np.maximum(LOSSES[loss](pulls), _LEAST)
+    # what a datum pulls with is the residual times its weight
+    up, down = ((pulls + step) * LOSSES[loss](pulls + step) for step in (_SMALL, -_SMALL))
+    slope = (up - down) / (2 * _SMALL)
     # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
-    return scale / np.sqrt(np.maximum(LOSSES[loss](residuals / scale), _LEAST))
+    return Weighting(GIVEN, scale / np.sqrt(weight), slope / weight)
 
 
 def _scales(measurement, residuals):
@@ -161,8 +170,11 @@ class Weighting:
     determined it.
     """
 
-    def __init__(self, choice, sigma):
+    def __init__(self, choice, sigma, follows=None):
         self.choice, self.sigma = choice, sigma
+        #: By how much the pull of each datum grows with its residual, over that of a weight which
+        #: stays; None where weights do not depend on the residuals.
+        self.follows = follows
         #: Whether every datum has a noise.
         self.is_known = not np.isnan(sigma).any()
         #: Whether the noise comes from the residuals of the fit.
@@ -381,7 +393,7 @@ def weighting_of(calibration):
     if measurement.weighting is None:
         noise = settings.get("weights")
         if noise == GIVEN and settings.get("loss", "linear") != "linear":
-            noise = Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
+            noise = robust_weighting(measurement, settings["loss"])
         elif noise == GIVEN:
             # as far as `describe` has kept it
             kept = [value for part in settings["noise"] for value in part["sigma_percent"]]

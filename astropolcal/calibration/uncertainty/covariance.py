@@ -34,6 +34,8 @@ __all__ = ["Covariance"]
 _ASYMMETRY = 1e-6
 # directions that no residual pulls keep this share of the largest error, so that they stay known
 _LEAST = 1e-6
+# a robust loss makes no direction softer than this
+_STIFF = 0.05
 
 
 class Covariance:
@@ -331,12 +333,15 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
         return white_covariance(measurement, whitened, weighting)
     prior = whitened.along(whitened.prior_rows) * weighting.level
     slack = _inward(measurement, whitened)[-1] if whitened.held.any() else None
-    return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
+    return sandwich(measurement, whitened, weighting, scatter.middle() + prior.T @ prior, slack)
 
 
 def white_covariance(measurement, whitened, weighting):
     """Return the covariance of independent data with the noise that the fit assumed."""
     free, level = measurement.free, weighting.level
+    if weighting.follows is not None:
+        middle = level**2 * np.eye(whitened.errors.rank)
+        return sandwich(measurement, whitened, weighting, middle)
     # canonical to declared units: one factor for the row and one for the column
     declared = 1 / free.factors()
     matrix = whitened.covariance() * level**2 * np.outer(declared, declared)
@@ -346,11 +351,17 @@ def white_covariance(measurement, whitened, weighting):
     return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
-def sandwich(measurement, whitened, middle, slack=None):
+def sandwich(measurement, whitened, weighting, middle, slack=None):
     """Return the covariance from that of the pulls on the determined directions.
 
     ``slack`` has further directions, each one standard error long, in the steps of the problem.
     """
+    if weighting.follows is not None:
+        # with a robust loss a datum far from the model pulls less back than its weight says
+        slopes, lost = whitened.slopes, 1 - weighting.follows
+        stiff, axes = np.linalg.eigh(np.eye(len(middle)) - slopes.T @ (lost[:, None] * slopes))
+        back = (axes / np.maximum(stiff, _STIFF)) @ axes.T
+        middle = back @ middle @ back
     variances, vectors = np.linalg.eigh(middle)
     stds = np.sqrt(variances.clip(0))
     # with fewer groups than directions a sum of outer products is singular
