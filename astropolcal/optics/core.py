@@ -323,7 +323,12 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in self.param_names:
             parameter = getattr(self, key)
             self._check_unit(key, parameter.unit)
-            values.append(np.asarray(parameter.value) * canonical_factor(parameter.unit))
+            value = np.asarray(parameter.value)
+            if not np.isfinite(value).all():
+                raise ParameterError(
+                    f"{self.name or type(self).__name__}.{key} = {value} must be finite"
+                )
+            values.append(value * canonical_factor(parameter.unit))
         where = [self.param_names.index(key) for key in self._components]
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
         # such a diattenuation has no Mueller matrix

@@ -355,3 +355,19 @@ def test_a_wavelength_of_half_a_wave_keeps_the_branch_of_its_neighbours():
         start = charis.chain(derotator="linear", wavelength=wavelength)
         cal = calibrate(start, data, cross_validate=False)
         assert np.all(cal.chain["derotator"].retardance.value < -50), seed
+
+
+def test_a_sign_that_faint_light_does_not_tell_is_named():
+    charis, wavelength = instruments.get("charis"), [1200, 1700, 2200] * u.nm
+    chain = charis.chain(derotator="linear", wavelength=wavelength)
+    chain["hwp"].theta.fixed = chain["derotator"].theta.fixed = True
+    frames = half_wave_plate_cycles(derotator=[45, 62, 80, 95, 117] * u.deg)
+    for flux, named in ((1e3, 1), (1e6, 0)):
+        cal = calibrate(
+            chain, simulate(chain, wavelength, frames, flux=flux, seed=1002), cross_validate=False
+        )
+        # at 2.2 um the plate is half a wave, where the sign of the derotator changes little
+        words = [one for one in cal.identifiability.mirrors if "other sign, " in one]
+        assert len(words) == named, (flux, words)
+        assert all(one.startswith("derotator.retardance at 2200.0 nm") for one in words)
+        assert ("1 but for the sign" in cal.summary()) == bool(named)

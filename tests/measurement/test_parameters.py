@@ -7,7 +7,7 @@ import pytest
 
 from astropolcal import optics
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.measurement import Tie, parameter_table
+from astropolcal.measurement import Normal, Tie, parameter_table
 from astropolcal.measurement.parameters import FreeParameters, Slot
 from astropolcal.observations import Observations, example_table
 from astropolcal.observations.reading import common_wavelengths
@@ -137,6 +137,37 @@ def test_free_in_one_chain_and_fixed_in_another():
     chains = [two_optics(), two_optics(fixed={"retardance": True})]
     with pytest.raises(ParameterError, match=r"plate.retardance differs between datasets"):
         FreeParameters(chains, 3)
+
+
+def test_what_a_second_dataset_says_of_a_free_parameter_is_not_lost():
+    for what, value in (("bounds", (0, 10)), ("prior", Normal(1 * u.deg, 1 * u.deg))):
+        for i in (0, 1):
+            chains = [two_optics(), two_optics()]
+            setattr(chains[i]["plate"].retardance, what, value)
+            with pytest.raises(ParameterError, match=rf"differs between datasets in its {what}"):
+                FreeParameters(chains, 3)
+
+
+def test_what_is_held_or_follows_keeps_to_its_bounds():
+    chain = two_optics()
+    chain["wollaston"].efficiency = 1.3
+    chain["wollaston"].efficiency.fixed = True
+    with pytest.raises(ParameterError, match=r"wollaston.efficiency is held at 1.3.* 0 to 1"):
+        FreeParameters([chain], 3)
+    chain = two_optics()
+    chain["wollaston"].theta.bounds = (-10, 20)
+    chain["wollaston"].theta.fixed = chain["plate"].theta.fixed = False
+    for factor in (2.0, -2.0):
+        free = FreeParameters([chain], 3, {"wollaston.theta": Tie("plate.theta", factor)})
+        low, high = np.rad2deg([x[free.by_name["plate.theta"].start] for x in free.bounds()])
+        assert sorted(np.round([low * factor, high * factor], 9)) == [-10, 20], factor
+
+
+def test_values_that_are_not_finite_are_named():
+    chain = two_optics()
+    chain["plate"].theta.value = np.nan
+    with pytest.raises(ParameterError, match=r"plate.theta = nan must be finite"):
+        chain["plate"].mueller(1.6 * u.um)
 
 
 def test_different_shapes_in_two_chains():

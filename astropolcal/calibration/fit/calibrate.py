@@ -32,6 +32,7 @@ from astropolcal.calibration.fit.strategies import (
     outside_bounds,
     sequential,
     two_step,
+    undecided_signs,
 )
 from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
@@ -401,6 +402,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     residuals, weighting = measurement.residuals(vector), measurement.weighting
     view = view_of_measurement(measurement, vector, settings["instrument"])
     finding = complete(measurement, whitened, weighting.level, view)
+    finding.branches += undecided_signs(measurement)
+    finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
     lacking = None
     if settings["errors"] == "white":

@@ -64,6 +64,8 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
 # after so many evaluations
 _HOPELESS, _GLANCE = 100.0, 15
+# a sign is told by the data if chi-square, in units of the residuals, differs by more
+_UNDECIDED = 9.0
 # of data without noise, residuals below this are rounding
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -234,6 +236,43 @@ def _turned(wavelength, phases, low, high):
         for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
             if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
                 found[i] = other
+    return found
+
+
+def undecided_signs(measurement):
+    """Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
+
+    That is where the other sign, other phases of the wavelength refitted, is less than three
+    standard deviations worse. What fits exactly as well is a mirror solution anyway.
+    """
+    problem, vector, found = (
+        BinProblem(measurement, measurement.weighting),
+        measurement.vector(),
+        [],
+    )
+    if not problem.slots:
+        return found
+    costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
+    for row, low, high in problem.main_retardances():
+        slot, places = problem.slots[row], problem.elements[row]
+        turns = -vector[places] + 2 * np.pi * np.array([[1], [-1], [0]])
+        trial = vector.copy()
+        for other in turns:
+            inside = (low <= other) & (other <= high)
+            trial[places[inside]] = other[inside]
+        trial, new = problem.polish(trial)
+        moved = np.abs(np.remainder(trial[places] - vector[places] + np.pi, 2 * np.pi) - np.pi)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = new / costs
+            close = (ratio > 1 + _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
+        bins = np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0))
+        for i in bins:
+            nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
+            words = (
+                f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
+                f"sum of squares is {ratio[i]:.2f} times as large: the data do not tell the sign"
+            )
+            found.append({"words": words, "sky": None})
     return found
 
 

@@ -327,6 +327,8 @@ def _determined(calibration, free):
     good, names = _with_status(free, "determined")
     held, _ = _with_status(free, "by priors")
     more = f", {held} with priors" if held else ""
+    signs = sum("tell the sign" in words for words in calibration.identifiability.mirrors)
+    more += f", {signs} but for the sign" if signs else ""
     yield f"Determined  {good} of {total}{more}{': ' if good else ''}{names}"
     # what is open comes first
     bad = {s: _with_status(free, s) for s in (*STATUSES[3:6], STATUSES[2])}
