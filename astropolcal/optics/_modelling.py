@@ -148,6 +148,8 @@ class OpticParameter(Parameter):
     def bounds(self, value):
         unit = u.one if self.unit is None else self.unit
         plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
+        if any(b != b for b in plain):
+            raise ParameterError(f"bounds of {self.name} = {value}; allowed are numbers and None")
         Parameter.bounds.fset(self, plain)
 
 

@@ -156,6 +156,17 @@ def test_wrong_model_is_found(make, measurement):
     assert "the model misses something" in test.words
 
 
+def test_errors_that_stand_on_a_noise_given_are_held_against_it(chain, measurement):
+    data = measurement.datasets[0].observations
+    for factor, agrees in ((1.0, True), (0.1, False)):
+        noise = factor * measurement.sigma
+        cal = calibrate(chain, data, weights=noise, errors="white", cross_validate=False)
+        test = cal.fit["lack_of_fit"][0]
+        assert test["noise"] == "given"
+        assert (0.8 < test["times_noise"] < 1.2) == agrees
+        assert (not cal.verdict().cautions) == agrees
+
+
 def test_overestimated_noise_is_told(measurement):
     m = measurement.copy()
     m.sigma = 3 * m.sigma

@@ -180,9 +180,13 @@ def test_bad_input_is_refused(cal):
         ({"name": "hwp.w_sio2", "values": [1.6]}, ParameterError, "needs a unit"),
         ({"name": "hwp.w_sio2", "values": [1.6] * u.deg}, ParameterError, "not convertible"),
         ({"name": "hwp.w_sio2", "values": [-1] * u.mm}, ParameterError, "outside its bounds"),
+        ({"name": "hwp.w_sio2", "values": [np.nan] * u.mm}, ParameterError, "outside its bounds"),
     ]:
         with pytest.raises(error, match=message):
             profile(cal, **options)
+    for rise in (0, -1, np.nan):
+        with pytest.raises(ParameterError, match=f"rise = {rise}; allowed are numbers above 0"):
+            profile(cal, "hwp.w_sio2", n=3).interval(rise)
 
 
 def test_calibration_from_a_file_has_no_data(cal, tmp_path):

@@ -172,6 +172,8 @@ def test_constraints_can_be_given_when_the_optic_is_made():
     # and the class is not touched
     assert LinearRetarder().retardance.bounds == (-360, 360)
     assert LinearRetarder().theta.fixed
+    with pytest.raises(ParameterError, match="bounds of retardance"):
+        optic.retardance.bounds = (np.nan, 100)
 
 
 def test_parameters_of_different_lengths_are_refused():

@@ -36,8 +36,10 @@ from astropolcal.calibration.fit.strategies import (
 )
 from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
+from astropolcal.calibration.noise.estimates import noise_as_given
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
+    GIVEN,
     LOSSES,
     Problem,
     describe,
@@ -453,12 +455,17 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
 
 
 def _lack_of_fit(calibration, whitened):
-    """Hold the residuals against the noise that the table states, and that the frames show."""
-    found = []
+    """Hold the residuals against the noise given, stated in the table, and shown by the frames."""
+    measurement, found = calibration.measurement, []
     # as the table states it first
-    for noise in reversed([*known_noises(calibration.measurement)]):
+    noises = [*known_noises(measurement)][::-1]
+    weighting, settings = measurement.weighting, calibration.settings
+    if (weighting.choice, settings["loss"], settings["errors"]) == (GIVEN, "linear", "white"):
+        # all errors stand on it alone
+        noises.insert(0, noise_as_given(measurement, weighting.sigma))
+    for noise in noises:
         try:
-            test = lack_of_fit(calibration.measurement, calibration, noise, whitened=whitened)
+            test = lack_of_fit(measurement, calibration, noise, whitened=whitened)
         except AstropolcalError:
             continue  # too few data: nothing to hold against
         # unknown where no degree of freedom is left

@@ -45,7 +45,7 @@ class NoiseEstimate:
         NaN where it could not be estimated.
     dof : `~numpy.ndarray`
         Degrees of freedom of ``sigma``, infinite where it is known.
-    method : {"errors", "replicates", "null channel", "roughness"}
+    method : {"errors", "replicates", "null channel", "roughness", "given"}
         Where it comes from.
     words : str
         What it includes and what it does not.
@@ -114,6 +114,11 @@ def _of_cells(measurement, squares, dof, method, words):
 
 
 # ---- known ------------------------------------------------------------------------------
+
+
+def noise_as_given(measurement, sigma):
+    """Return the noise of every datum that a user has given, as an estimate."""
+    return _of_data(measurement, sigma, np.inf, "given", "as given to the fit")
 
 
 def noise_from_errors(measurement, *, gain=None, read_noise=0.0):

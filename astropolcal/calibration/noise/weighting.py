@@ -97,6 +97,8 @@ def outlying_data(calibration, limit=_FAR):
 
     Raises
     ------
+    ParameterError
+        If the limit is not above zero.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
 
@@ -113,6 +115,8 @@ def outlying_data(calibration, limit=_FAR):
     >>> len(outlying_data(cal))
     0
     """
+    if not limit > 0:
+        raise ParameterError(f"limit = {limit}; allowed are numbers above 0")
     live, rows = calibration.live_measurement(), []
     residuals = live.residuals()
     scaled = residuals / _scales(live, residuals)

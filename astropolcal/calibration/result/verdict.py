@@ -183,6 +183,8 @@ def _angles(calibration, free):
 def _excess(calibration):
     """Return by how many times the residuals exceed the noise for certain; 0 where they do not."""
     tests = calibration.fit.get("lack_of_fit") or []
+    # errors that stand on the noise given are as wrong as that
+    tests = [test for test in tests if test["noise"] == "given"] or tests
     times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
     # with several estimates of the noise that which excuses most
     return min(times) if times and len(times) == len(tests) else 0.0
@@ -398,7 +400,7 @@ def _mount(calibration, free, sky):
 HINT = "--full (full=True) adds tables per wavelength, the gauge and mirror solutions"
 _COLUMN = 28
 # estimates of the noise, in few words
-_NOISES = {"errors": "stated errors"}
+_NOISES = {"errors": "stated errors", "given": "the noise given"}
 
 
 def compact_lines(calibration, found, height=HEIGHT):

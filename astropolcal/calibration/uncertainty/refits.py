@@ -107,6 +107,8 @@ class Profile:
         low, high : `~astropy.units.Quantity` or float
             Infinite on a side where the profile stays below ``rise`` as far as it was followed.
         """
+        if not rise > 0:
+            raise ParameterError(f"rise = {rise}; allowed are numbers above 0")
         values = np.asarray(getattr(self.values, "value", self.values))
         unit = getattr(self.values, "unit", None)
         here = int(np.argmin(np.abs(values - getattr(self.best, "value", self.best))))
@@ -223,7 +225,8 @@ def profile(calibration, name, values=None, n=21):
         grid = np.unique(np.clip(grid, low, high))
     else:
         grid = np.unique(np.append(to_unit(values, unit, name), best))
-        if grid[0] < low or grid[-1] > high:
+        # what is not a number comes last, and is within no bounds
+        if not (grid[0] >= low and grid[-1] <= high):
             raise ParameterError(f"{name}: values outside its bounds {low:g} to {high:g}")
     chi2, vectors = _follow(refit, index, grid * factor, int(np.argmin(np.abs(grid - best))))
     rise = (chi2 - chi2.min()) / refit.weighting.level**2
