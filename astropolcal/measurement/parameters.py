@@ -164,15 +164,11 @@ def parameter_table(chains):
     return table
 
 
-def _check_held(name, parameters):
-    for parameter in parameters:
-        low, high = limits(parameter.bounds)
-        slack = ROUNDING * np.maximum(1.0, np.abs(parameter.value))
-        if np.any((parameter.value < low - slack) | (parameter.value > high + slack)):
-            raise ParameterError(
-                f"{name} is held at {parameter.value}; allowed are {low:.7g} to {high:.7g} "
-                f"{parameter.unit or ''}".rstrip()
-            )
+def is_outside(value, bounds):
+    """Return whether a value, or one of several, is beyond its bounds by more than rounding."""
+    low, high = limits(bounds)
+    slack = ROUNDING * np.maximum(1.0, np.abs(value))
+    return bool(np.any((value < low - slack) | (value > high + slack)))
 
 
 def with_own(chains, names, own, ties=None):
@@ -307,11 +303,8 @@ class FreeParameters:
             )
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
-        if first.fixed:
-            _check_held(name, parameters)
-            return
         # those of the first dataset count, and what another says would be lost
-        for what, told in (("bounds", limits), ("prior", _told)):
+        for what, told in (("bounds", limits), ("prior", _told)) if not first.fixed else ():
             if any(told(getattr(p, what)) != told(getattr(first, what)) for p in parameters[1:]):
                 raise ParameterError(
                     f"{name} differs between datasets in its {what}; give all chains the same"
@@ -370,14 +363,6 @@ class FreeParameters:
             # where the density is zero there is a bound, whichever is tighter
             low[slot.slice] = np.maximum(low[slot.slice], start)
             high[slot.slice] = np.minimum(high[slot.slice], end)
-        for name, (slot, factor, offset) in self._followers.items():
-            target = self._table[name][0]
-            ends = np.array(limits(target.bounds)) * canonical_factor(target.unit)
-            if factor:
-                # what follows keeps to its own bounds, too
-                start, end = np.sort((ends - offset) / factor)
-                low[slot.slice] = np.maximum(low[slot.slice], start)
-                high[slot.slice] = np.minimum(high[slot.slice], end)
         return low, high
 
     def factors(self):

@@ -442,7 +442,9 @@ def test_prior_without_unit_comes_back(path):
 
 def test_prior_of_something_else_is_not_written(calibration, path):
     changed = dataclasses.replace(calibration, chains=[c.copy() for c in calibration.chains])
-    changed.chains[0]["hwp"].w_sio2.prior = lambda value: -(value**2)
+    density = lambda value: -(value**2)  # noqa: E731
+    for chain in changed.chains:
+        chain["hwp"].w_sio2.prior = density
     assert_not_written(changed, path, "prior of hwp.w_sio2 is a function")
 
 

@@ -191,13 +191,13 @@ def test_what_follows_a_held_parameter_is_held_at_its_place(few, make):
     """In the first of the two steps a tie must count although its source does not move."""
     chain, truth, _ = few
     truth = truth.copy()
-    truth["derotator"].theta = (0.5 * 90.4 - 41) * u.deg
-    ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-41 * u.deg)}
+    truth["derotator"].theta = (0.5 * 90.4 - 40) * u.deg
+    ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-40 * u.deg)}
     data = make.observe(truth, wavelength=FEW, noise=False)
     cal = calibrate(chain, data, ties=ties, strategy="two-step", cross_validate=False)
     # the polarizer is 0.4 deg off in the first step; the derotator would be by 5 deg
     assert cal.stages[0]["residual_rms"] < 0.02
-    assert cal.chain["derotator"].theta.value == pytest.approx(4.2, abs=0.05)
+    assert cal.chain["derotator"].theta.value == pytest.approx(5.2, abs=0.05)
 
 
 def test_two_datasets_share_optics_and_halve_the_variance(make):
@@ -309,6 +309,9 @@ def test_start_outside_its_bounds_is_named(few):
         for fitter in (None, LMLSQFitter()):
             with pytest.raises(FitError, match=words):
                 calibrate(wrong, data, fitter=fitter)
+        held = {f"{optic}.{key}": parameter.quantity if key == "theta" else value}
+        with pytest.raises(FitError, match=rf"{optic}\.{key} is held at .*; allowed are "):
+            calibrate(chain, data, fix=held)
     # by a rounding error alone
     wrong = chain.copy()
     wrong["hwp"].theta.fixed, wrong["hwp"].theta.value = False, 5 + 1e-9

@@ -148,21 +148,6 @@ def test_what_a_second_dataset_says_of_a_free_parameter_is_not_lost():
                 FreeParameters(chains, 3)
 
 
-def test_what_is_held_or_follows_keeps_to_its_bounds():
-    chain = two_optics()
-    chain["wollaston"].efficiency = 1.3
-    chain["wollaston"].efficiency.fixed = True
-    with pytest.raises(ParameterError, match=r"wollaston.efficiency is held at 1.3.* 0 to 1"):
-        FreeParameters([chain], 3)
-    chain = two_optics()
-    chain["wollaston"].theta.bounds = (-10, 20)
-    chain["wollaston"].theta.fixed = chain["plate"].theta.fixed = False
-    for factor in (2.0, -2.0):
-        free = FreeParameters([chain], 3, {"wollaston.theta": Tie("plate.theta", factor)})
-        low, high = np.rad2deg([x[free.by_name["plate.theta"].start] for x in free.bounds()])
-        assert sorted(np.round([low * factor, high * factor], 9)) == [-10, 20], factor
-
-
 def test_values_that_are_not_finite_are_named():
     chain = two_optics()
     chain["plate"].theta.value = np.nan

@@ -59,7 +59,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitErro
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs
-from astropolcal.measurement.parameters import with_own
+from astropolcal.measurement.parameters import is_outside, limits, with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
@@ -261,6 +261,11 @@ def _check(measurement):
             f"{measurement.free.size} free parameters but only {measurement.n_data} data; "
             "fix some, or add frames"
         )
+    for name, parameters in parameter_table(measurement.chains).items():
+        for held in (p for p in parameters if p.fixed and is_outside(p.value, p.bounds)):
+            low, high = limits(held.bounds)
+            allowed = f"{low:.7g} to {high:.7g} {held.unit or ''}".rstrip()
+            raise FitError(f"{name} is held at {held.value}; allowed are {allowed}")
     for name in outside_bounds(measurement):
         free, i = measurement.free, measurement.free.names.index(name)
         unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]

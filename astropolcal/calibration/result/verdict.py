@@ -12,6 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.measurement.parameters import is_outside
 from astropolcal.words import HEIGHT, WIDTH, counted, p_words, shortened
 
 __all__ = ["Verdict"]
@@ -112,6 +113,9 @@ def verdict(calibration, targets=TARGETS):
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         cautions += [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
+        # a fit minds the bounds of what leads only
+        beyond = [n for n, e in known.items() if e["tied"] and is_outside(e["value"], e["bounds"])]
+        cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
         if any("disagree with the priors" in test["words"] for test in tests):
             cautions.append("data and priors disagree")
     advice = _next(calibration, free, wrong, sky)
