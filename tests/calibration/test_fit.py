@@ -6,6 +6,7 @@ import json
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling import Parameter
 from astropy.modeling.fitting import (
     DogBoxLSQFitter,
     LevMarLSQFitter,
@@ -14,11 +15,11 @@ from astropy.modeling.fitting import (
     TRFLSQFitter,
 )
 
-from astropolcal import instruments
+from astropolcal import instruments, optics
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import search_branches
 from astropolcal.calibration.result.summary import to_dict
-from astropolcal.chain import leaves
+from astropolcal.chain import insert_optic, leaves
 from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
@@ -519,3 +520,27 @@ def test_few_wavelengths_do_not_end_in_a_wrong_minimum():
         known = one.parameter_values()["hwp.w_sio2"]
         assert abs(known["value"] - truth["hwp"].w_sio2.value) < 5 * known["std"]
     assert max(found) < 1.5
+
+
+class Fading(optics.Optic):
+    """An optic of a user, whose derivative may be wrong."""
+
+    share = Parameter(default=0.9, bounds=(0, 1), description="what is left of Q and U")
+    wrong = 1.0
+
+    def _matrix(self, dispersion, share):
+        return np.eye(4) * np.where([[1, 0, 0, 1]], 1.0, np.asarray(share)[..., None, None])
+
+    def _derivatives(self, dispersion, share):
+        return (self.wrong * np.diag([0.0, 1.0, 1.0, 0.0]),)
+
+
+def test_wrong_derivatives_of_an_optic_of_a_user_are_refused(few):
+    chain, _, data = few
+    chain = insert_optic(chain, Fading(name="fading"), before="wollaston")
+    chain["wollaston"].efficiency.fixed = True
+    assert calibrate(chain, data, cross_validate=False).converged
+    for wrong in (0.0, 1.5, -1.0):
+        chain["fading"].wrong = wrong
+        with pytest.raises(FitError, match=r"fading.share: the derivative"):
+            calibrate(chain, data, cross_validate=False)

@@ -55,6 +55,7 @@ from astropolcal.calibration.uncertainty.covariance import (
 )
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
+from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
@@ -72,6 +73,8 @@ ERRORS = ("scatter", "white")
 GAUGES = ("minimal", None)
 _CHOICES = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS, "gauge": GAUGES}
 _ROBUST_ROUNDS = 50
+# the optics of this package are tested; step, in degrees, micrometres or percent, for others
+_OWN, _DIFFERENCE, _DIFFERS = __name__.partition(".")[0], 1e-4, 1e-2
 
 
 @in_one_thread
@@ -275,6 +278,26 @@ def _check(measurement):
         raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
     # fitters refuse a start that is outside by a rounding error, too
     measurement.stand_at(np.clip(measurement.vector(), *measurement.free.bounds()))
+    _check_derivatives(measurement)
+
+
+def _check_derivatives(measurement):
+    """Hold derivatives of optics from elsewhere against differences: all errors stand on them."""
+    found = (leaf for chain in measurement.chains for leaf in leaves(chain))
+    foreign = {leaf.name for leaf in found if type(leaf).__module__.partition(".")[0] != _OWN}
+    free, vector = measurement.free, measurement.vector()
+    for slot in (s for s in free.slots if s.name.partition(".")[0] in foreign):
+        step = np.zeros(free.size)
+        step[slot.slice] = _DIFFERENCE * physical_scale(free)[slot.slice]
+        change = (measurement.predict(vector + step) - measurement.predict(vector - step)) / 2
+        told = step @ measurement.jacobian(vector)
+        worst = int(np.argmax(np.abs(change - told)))
+        largest = max(np.abs(change).max(), np.abs(told).max())
+        if not abs(change[worst] - told[worst]) <= _DIFFERS * largest + _SILENT:
+            raise FitError(
+                f"{slot.name}: the derivative that the optic gives is not that of its matrix: "
+                f"data change by up to {change[worst]:.4g} a step, not {told[worst]:.4g}"
+            )
 
 
 def _robust(measurement, fitter, loss, outcome):
