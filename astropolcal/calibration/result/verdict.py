@@ -188,7 +188,7 @@ def _excess(calibration):
     """Return by how many times the residuals exceed the noise for certain; 0 where they do not."""
     tests = calibration.fit.get("lack_of_fit") or []
     # errors that stand on the noise given are as wrong as that
-    tests = [test for test in tests if test["noise"] == "given"] or tests
+    tests = [test for test in tests if test.get("noise") == "given"] or tests
     times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
     # with several estimates of the noise that which excuses most
     return min(times) if times and len(times) == len(tests) else 0.0
