@@ -79,7 +79,8 @@ class Identifiability:
         of the telescope.
     mirrors : list of str
         Discrete mirror solutions within the bounds; and the other hand of the whole instrument,
-        which bounds may exclude but no datum does, where it matters on sky.
+        which bounds may exclude but no datum does, where it matters on sky. Of a calibration also
+        signs of retardances that the data hardly tell.
     near_null : list of dict
         Directions that are determined so badly that it hardly counts: at the noise of the fit some
         parameter is uncertain by more than 5 deg, 0.05 mm or 5 %, or the singular value is more
