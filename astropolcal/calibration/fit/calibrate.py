@@ -171,7 +171,8 @@ def calibrate(
     FitError
         If there is nothing to fit, fewer data than free parameters, the weights are asked for where
         the table has no errors, the residuals of a wavelength tell no noise, a parameter starts
-        or is held outside its bounds, an optic gives wrong derivatives, or the two-step strategy has no polarized source.
+        or is held outside its bounds, an optic gives wrong derivatives, or the two-step
+        strategy has no polarized source.
     ChainError, ObservationError, ParameterError
         If chain and observations do not fit together, or a noise given is not a possible one.
 
