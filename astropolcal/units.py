@@ -68,7 +68,7 @@ def canonical_factor(unit):
 
 def to_unit(value, unit, name="value"):
     """
-    Return a value as floats in a unit; ``name`` is what messages call it.
+    Return a value as floats in a unit, NaN where masked; ``name`` is what messages call it.
 
     Plain numbers are accepted only where the unit is None or dimensionless.
     """
@@ -79,7 +79,7 @@ def to_unit(value, unit, name="value"):
     # parameters of astropy and columns of tables carry a unit without being quantities
     if isinstance(value, u.Quantity) or hasattr(value, "unit"):
         try:
-            return np.asarray(u.Quantity(value).to_value(unit), dtype=float)
+            return _known(np.asarray(u.Quantity(value).to_value(unit), dtype=float), value)
         except u.UnitConversionError:
             raise ParameterError(
                 f"{name} has unit {value.unit}, which is not convertible to "
@@ -94,7 +94,13 @@ def to_unit(value, unit, name="value"):
     # numpy makes NaN of None
     if np.isnan(found).any() and None in np.asarray(value, dtype=object).flat:
         raise ParameterError(f"{name} = {value!r} is not a number")
-    return found
+    return _known(found, value)
+
+
+def _known(found, value):
+    """Return floats with NaN where the value they were made of is masked; numpy drops the mask."""
+    mask = getattr(value, "mask", False)
+    return np.where(mask, np.nan, found) if np.any(mask) else found
 
 
 def angle_to_rad(value, name="angle"):

@@ -162,6 +162,10 @@ class ScienceFrames:
         for frames in self.source.batches():
             for beam in (0, 1):
                 found = self.source.fluxes(beam, frames, slice(w, w + 1))
+                if self.source.has_variances:
+                    # a bad pixel that says so must not count as light
+                    known = self.source.variances(beam, frames, slice(w, w + 1))
+                    found = np.where(np.isfinite(known), found, np.nan)
                 found = found.reshape(len(found), -1)
                 with np.errstate(invalid="ignore"):
                     sums = found @ weights
@@ -231,7 +235,11 @@ class ScienceFrames:
             # no light falls where there is no beam, and nothing is learnt from it
             left = np.broadcast_to(0.0, np.shape(right))
             variance_left = None if variance_right is None else np.broadcast_to(1.0, left.shape)
-        source = ArraySource(right, left, variance_right, variance_left, names)
+        # what the fluxes say of their unit, none else is known of plain numbers
+        own = getattr(right, "unit", None)
+        settings["unit"] = u.Unit(settings.get("unit") or own or u.adu)
+        given = variance_right, variance_left, names, settings["unit"]
+        source = ArraySource(right, left, *given)
         if position_angle is not None:
             options = {"centre": centre, "mirrored": mirrored, "order": order}
             source = TurnedSource(source, position_angle, **options)
@@ -260,9 +268,10 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
-        difference, total = np.asarray(difference), np.asarray(total)
+        # as floats: the sum of two integers may be beyond their type
+        difference, total = (1.0 * np.asanyarray(x) for x in (difference, total))
         # var(r - l) = var(r) + var(l), shared evenly as nothing else is known
-        half = None if variance is None else np.asarray(variance) / 2
+        half = None if variance is None else np.asanyarray(variance) / 2
         settings |= {"variance_right": half, "variance_left": half}
         beams = (total + difference) / 2, (total - difference) / 2
         return cls.from_arrays(*beams, *arguments, **settings)

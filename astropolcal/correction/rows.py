@@ -16,14 +16,17 @@ from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows, free_of, match_wavelengths
 from astropolcal.chain import join, leaves, stages, warn_beyond
-from astropolcal.exceptions import AstropolcalWarning, ChainError
+from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.observations.pointings import plain_states
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
-from astropolcal.units import length_to_um, wavelengths_of
+from astropolcal.units import length_to_um, to_unit, wavelengths_of
 
 __all__ = ["ideal_chain", "measurement_rows"]
+
+# four turns: a plate that follows the sky reaches three, degrees mostly are beyond
+_MOST_RADIAN = 8 * np.pi
 
 
 def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration", date=None):
@@ -140,7 +143,13 @@ def _placed(positions, wanted):
             )
         value = positions[name]
         if not isinstance(value, u.Quantity) and name not in COORDINATES:
-            value = np.asarray(value, dtype=float) * u.rad
+            value = to_unit(value, None, name)
+            if np.any(np.abs(value) > _MOST_RADIAN):
+                raise ParameterError(
+                    f"{name} = {np.abs(value).max():g} without a unit would be in radian; allowed "
+                    f"are {_MOST_RADIAN:.3g} at most, and angles with their unit, such as deg"
+                )
+            value = value * u.rad
         placed[name] = np.atleast_1d(finite_position(value, name))
     nodes = {name: len(v) for name, v in placed.items() if v.ndim == 2}
     if not nodes:

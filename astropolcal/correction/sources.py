@@ -25,16 +25,19 @@ class ArraySource:
     Beams as arrays, (n_frames, n_wavelengths, ...): in memory, mapped from disk, or of dask.
 
     At a time all frames of arrays in memory are read, those of a chunk of dask arrays, and one of
-    arrays on disk.
+    arrays on disk. Quantities are converted to ``unit``; what is masked has no value.
     """
 
-    def __init__(self, right, left, variance_right=None, variance_left=None, names=None):
-        self._beams = [_array(right), _array(left)]
-        given = [v is not None for v in (variance_right, variance_left)]
-        if any(given) != all(given):
+    def __init__(
+        self, right, left, variance_right=None, variance_left=None, names=None, unit=u.adu
+    ):
+        self._beams = [_array(right, "right", unit), _array(left, "left", unit)]
+        given = {"variance_right": variance_right, "variance_left": variance_left}
+        given = {name: value for name, value in given.items() if value is not None}
+        if len(given) == 1:
             raise ObservationError("variances of one beam only; both or none are needed")
-        self.has_variances = all(given)
-        self._variances = [_array(v) for v in (variance_right, variance_left) if v is not None]
+        self.has_variances = bool(given)
+        self._variances = [_array(value, name, unit**2) for name, value in given.items()]
         shapes = {array.shape for array in [*self._beams, *self._variances]}
         if len(shapes) > 1 or len(next(iter(shapes))) < 2:
             raise ObservationError(
@@ -59,12 +62,27 @@ class ArraySource:
         return np.asarray(self._beams[beam][frames, wavelengths])
 
     def variances(self, beam, frames, wavelengths):
-        """Return their variances."""
-        return np.asarray(self._variances[beam][frames, wavelengths])
+        """Return their variances, NaN where they are zero: of no measurement."""
+        found = np.asarray(self._variances[beam][frames, wavelengths], dtype=float)
+        if (found < 0).any():
+            frame = range(self.n_frames)[frames][np.argwhere(found < 0)[0, 0]]
+            raise ObservationError(
+                f"{self.names[frame]}: a variance is {found[found < 0][0]:g}; allowed are numbers "
+                "above zero, and zero or NaN where there is no value"
+            )
+        return np.where(found > 0, found, np.nan)
 
 
-def _array(values):
-    return values if hasattr(values, "dtype") and hasattr(values, "shape") else np.asarray(values)
+def _array(values, name, unit):
+    """Return numbers, in a unit if they have one, and NaN where they are masked."""
+    mask, plain = getattr(values, "mask", None), getattr(values, "unmasked", values)
+    if getattr(values, "unit", None) is not None:
+        plain = to_unit(u.Quantity(np.asarray(plain), values.unit), unit, name)
+    elif not (hasattr(plain, "dtype") and hasattr(plain, "shape")):
+        plain = np.asarray(plain)
+    if plain.dtype.kind not in "fiu":
+        raise ObservationError(f"{name}: values of type {plain.dtype}; numbers are needed")
+    return plain if mask is None or not np.any(mask) else np.where(mask, np.nan, plain)
 
 
 class TurnedSource:

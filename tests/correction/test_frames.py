@@ -277,3 +277,27 @@ def test_the_table_of_the_user_is_not_changed():
     table = TABLE.copy()
     frame_positions(instruments.get("charis"), table, TABLE_CHAIN)
     assert table.colnames == TABLE.colnames
+
+
+def test_light_in_pixels_that_are_known_bad_is_none():
+    """A cosmic ray that has no variance does not make its frame brighter."""
+    image = np.add.outer(np.arange(9.0), np.arange(9.0)) + 1
+    right, left = (share * np.ones((4, 2, 1, 1)) * image for share in (1.0, 2.0))
+    variances = [right.copy(), left.copy()]
+    right[2, 1, 4, 4], variances[0][2, 1, 4, 4] = 1e6, np.nan
+    given = dict(zip(("variance_right", "variance_left"), variances, strict=True))
+    frames = ScienceFrames.from_arrays(right, left, LAM, {"hwp": HWP}, **given)
+    rows = measurement_rows(CHAIN, {"hwp": HWP}, LAM)
+    np.testing.assert_allclose(frames.with_brightness(rows).scale, 1.0, atol=1e-9)
+
+
+def test_what_fluxes_and_wavelengths_say_counts():
+    flux = np.ones((4, 2))
+    assert ScienceFrames.from_arrays(flux * u.electron, flux, LAM, {"hwp": HWP}).unit == u.electron
+    # the sum of both is beyond the type
+    whole = np.full((4, 2), 30000, dtype=np.int16)
+    frames = ScienceFrames.from_differences(whole // 2, whole, LAM, {"hwp": HWP})
+    assert frames.source.fluxes(0, slice(None), slice(None)).tolist() == [[22500.0] * 2] * 4
+    for wrong in (None, [1.2, np.nan] * u.um, [0, 1.2] * u.um, [1.2, 1.6], [1.2, 1.6] * u.s):
+        with pytest.raises(ParameterError, match="wavelength"):
+            ScienceFrames.from_arrays(flux, flux, wrong, {"hwp": HWP})

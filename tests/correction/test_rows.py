@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.utils.masked import Masked
 
 from astropolcal import calibrate, load, optics
 from astropolcal.calibration.uncertainty import derived_mueller
@@ -142,6 +143,17 @@ def test_a_position_that_is_not_finite_is_refused(sky, charis, track, bad):
     positions["altitude"] = [70, bad, 70, 70] * u.deg
     with pytest.raises(ParameterError, match="altitude"):
         measurement_rows(sky, positions, charis.wavelength)
+
+
+def test_degrees_without_a_unit_and_masked_positions_are_refused(sky, charis, track):
+    _, positions = track(1)
+    plain = np.deg2rad(positions["altitude"].value)
+    for bad in (positions["altitude"].value, np.ma.array(plain, mask=[0, 1, 0, 0])):
+        with pytest.raises(ParameterError, match="altitude"):
+            measurement_rows(sky, positions | {"altitude": bad}, charis.wavelength)
+    bad = Masked(positions["altitude"], mask=[0, 1, 0, 0])
+    with pytest.raises(ParameterError, match="altitude"):
+        measurement_rows(sky, positions | {"altitude": bad}, charis.wavelength)
 
 
 def test_a_chain_without_stages_has_no_sky():

@@ -5,6 +5,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.utils.masked import Masked
 
 from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
@@ -79,6 +80,35 @@ def test_shapes_that_do_not_fit():
         variances = [None, None] if variance is None else [np.ones(variance)] * 2
         with pytest.raises(ObservationError, match=f"have shapes {shapes}; one shape"):
             ArraySource(np.ones(right), np.ones(left), *variances)
+
+
+def test_units_and_masks_of_arrays_count(images):
+    flux, variance = images
+    hidden = np.ma.array(flux[0], mask=flux[0] > 11)
+    for right in (hidden, Masked(flux[0], mask=hidden.mask), hidden.data * u.electron):
+        source = ArraySource(right, flux[1], *variance, unit=u.electron)
+        masked = np.broadcast_to(getattr(right, "mask", False), hidden.shape)
+        np.testing.assert_array_equal(np.isnan(source.fluxes(0, ALL, ALL)), masked)
+    thousands = ArraySource(flux[0] * (1000 * u.adu), flux[1])
+    np.testing.assert_allclose(thousands.fluxes(0, ALL, ALL), 1000 * flux[0])
+    for wrong, error in (
+        (flux[0] * u.electron, ParameterError),
+        (flux[0] + 1j, ObservationError),
+        (flux[0].astype(str), ObservationError),
+    ):
+        with pytest.raises(error, match="right"):
+            ArraySource(wrong, flux[1])
+
+
+def test_variances_that_are_none(images):
+    """Zero is that of no measurement, as in files; below zero there is none."""
+    flux, variance = images
+    variance[0, 1, 0, 2, 3] = 0.0
+    found = ArraySource(*flux, *variance).variances(0, ALL, ALL)
+    assert np.argwhere(np.isnan(found)).tolist() == [[1, 0, 2, 3]]
+    variance[0, 1, 0, 2, 3] = -4.0
+    with pytest.raises(ObservationError, match="frame 1: a variance is -4; allowed"):
+        ArraySource(*flux, *variance).variances(0, slice(1, 3), ALL)
 
 
 # ---- turned ----------------------------------------------------------------------------
