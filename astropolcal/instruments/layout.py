@@ -4,6 +4,7 @@ How the FITS files of an instrument look, and what their headers say in the unit
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
@@ -16,7 +17,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.observations.pointings import offline
-from astropolcal.units import iso_date, plain_number
+from astropolcal.units import iso_date, mjd_of, plain_number
 from astropolcal.words import check_choice
 
 __all__ = ["FileLayout", "ReadOut"]
@@ -442,18 +443,30 @@ def frame_time(header, layout):
 
     A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
     """
-    mjd = look_up([header], "mjd", layout)[1]
-    if mjd is not None:
-        return time_of(mjd)
-    return time_of(None, *(look_up([header], key, layout)[1] for key in ("date", "time")))
+    return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
+
+
+# local and universal dates differ by one day at most
+_DAYS_APART = 2.0
 
 
 # a header is asked for its time by several who want to know it
 @lru_cache(maxsize=4096, typed=True)
 def time_of(mjd=None, date=None, clock=None):
     """Return the time (UTC) that a number of days, or a date and a time of day, state, or None."""
-    if mjd is not None:
-        return in_calendar(Time(plain_number(mjd), format="mjd", scale="utc"))
+    if mjd is None:
+        return _by_calendar(date, clock)
+    time, stated = in_calendar(Time(plain_number(mjd), format="mjd", scale="utc")), None
+    mjd_of(time, "Modified Julian Date")
+    # a date that cannot be read contradicts nothing
+    with suppress(TypeError, ValueError):
+        stated = _by_calendar(date, None)
+    if stated is not None and abs(time.mjd - stated.mjd - 0.5) > _DAYS_APART:
+        raise ValueError(f"the Modified Julian Date {mjd} is {time.isot[:10]}, the date {date}")
+    return time
+
+
+def _by_calendar(date, clock):
     if date is None:
         return None
     day = iso_date(date)

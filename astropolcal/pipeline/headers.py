@@ -104,10 +104,12 @@ def _time(header, layout):
     """Return when a frame was taken, or None."""
     try:
         return frame_time(header, layout)
-    except (TypeError, ValueError):
-        mjd, date, clock = (_text(header, key, layout) for key in ("mjd", "date", "time"))
-        shown = mjd or f"{date} {clock or ''}".strip()
-        raise CalibrationFileError(f"the header's date {shown!r} cannot be understood") from None
+    except (TypeError, ValueError) as error:
+        known = (_text(header, key, layout) for key in ("mjd", "date", "time"))
+        shown = " ".join(filter(None, known))
+        raise CalibrationFileError(
+            f"the header's date {shown!r} cannot be understood: {one_line(error)}"
+        ) from None
 
 
 class FrameAngles:

@@ -12,6 +12,7 @@ import os
 import re
 import sqlite3
 import warnings
+import zlib
 from collections import namedtuple
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -106,6 +107,13 @@ class Index:
         headers say which it is.
         """
         base, keys = self._base, ", ".join(_COLUMNS)
+        # what was read for another instrument is read again
+        own = zlib.crc32((instrument or "").encode()) & 0x7FFFFFFF
+        (before,) = base.execute("PRAGMA application_id").fetchone()
+        if before != own:
+            base.execute("DELETE FROM frames")
+            base.execute(f"PRAGMA application_id = {own}")
+            base.commit()
         base.execute("CREATE TEMP TABLE seen (path TEXT PRIMARY KEY, size, changed)")
         with base:
             base.executemany("INSERT INTO seen VALUES (?, ?, ?)", _files(tree, besides))

@@ -203,10 +203,13 @@ def _check_header(frame, layout, source):
         for column in layout.stages
         if column in keywords and column not in values and not frame.errors
     ]
-    with suppress(ObservationError):
+    try:
         time = observation_time(values)
         values.setdefault("mjd", float(time.mjd))
         values.setdefault("date", time.isot[:10])
+    except ObservationError as error:
+        # without a time it is as good as any; not with a wrong one
+        frame.errors += [str(error)] if "mjd" in values else []
     # of stars `check_stars` looks
     on_plate = tracking_error(values, layout, on_sky=False) if source != "star" else None
     if abs(on_plate or 0.0) > layout.tracking_tolerance:
@@ -258,9 +261,13 @@ class Masters:
 
     def check(self, layout):
         """Read all files, so that one that does not fit is named before any frame is reduced."""
-        for path in filter(None, (self.dark, self.flat)):
-            for own in filter(None, (path, layout.left_file(path))):
-                _image(str(own), layout.file_shape)
+        for path in self.files(layout):
+            _image(path, layout.file_shape)
+
+    def files(self, layout):
+        """Return all files, those of left beams too."""
+        given = [path for path in (self.dark, self.flat) if path]
+        return [str(own) for path in given for own in (path, layout.left_file(path)) if own]
 
     def of_left(self, layout):
         """Return the files of the left beam."""
@@ -282,11 +289,16 @@ class Masters:
         return np.where(good, np.where(saturated, raw, cube), 0.0), good
 
 
-@lru_cache(maxsize=8)
 def _image(path, shape):
     """Return the first image of a file that has a shape, or that of one slice; NaN where bad."""
     if not Path(path).is_file():
         raise ParameterError(f"{path}: there is no such file")
+    return _read_image(path, shape, Path(path).stat().st_mtime_ns)
+
+
+# read once for all frames, and again when it has changed
+@lru_cache(maxsize=8)
+def _read_image(path, shape, changed):
     with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=False) as hdus:
         shapes = []
         for hdu in hdus:

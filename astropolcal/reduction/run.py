@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import re
+import warnings
 from collections import Counter
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
@@ -14,7 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
 from astropolcal.observations.grid import is_star
@@ -24,7 +30,8 @@ from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table
-from astropolcal.words import check_choice
+from astropolcal.version import version
+from astropolcal.words import check_choice, counted
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
@@ -153,6 +160,11 @@ def reduce_cubes(files, instrument, **options):
     ObservationError
         If no file can be used; the message says why.
 
+    Warns
+    -----
+    AstropolcalWarning
+        If files are left out or doubtful; `reduce_run` lists all of them.
+
     Examples
     --------
     >>> from astropolcal.reduction import reduce_cubes
@@ -161,7 +173,16 @@ def reduce_cubes(files, instrument, **options):
     ...
     astropolcal.exceptions.ObservationError: the file cannot be used: nowhere_00000001.fits: no such file
     """  # noqa: E501
-    return reduce_run(files, instrument, **options).observations
+    reduction = reduce_run(files, instrument, **options)
+    for words, told in (("left out", reduction.problems), ("doubtful", reduction.doubts)):
+        for path, why in list(told.items())[:1]:
+            warnings.warn(
+                f"{counted(len(told), 'file')} {words} (reduce_run lists all); the first is "
+                f"{path}: {'; '.join(why)}",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
+    return reduction.observations
 
 
 def reduce_run(
@@ -289,9 +310,14 @@ def reduce_run(
     if not frames:
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
+    middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     for frame in frames:
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
+        if abs(frame.values.get("mjd", np.nan) - middle) > 1:
+            frame.doubts.append(
+                "taken more than a day from the middle of the run; the table states one date"
+            )
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
@@ -361,8 +387,10 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     """Return the frames of all files in their order, from the journal or measured now."""
     settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
-    settings |= {"raw": task["raw"] is not None, "checked": False}
-    journal = Journal(resume, settings)
+    settings |= {"raw": repr(task["raw"]), "checked": False, "made by": version}
+    of_masters = (task["masters"] or Masters()).files(task["layout"])
+    settings["changed"] = [os.stat(path).st_mtime_ns for path in of_masters]
+    journal = Journal(resume, settings, task["layout"].left_file)
     found = {path: journal.done(path) for path in files}
     found = {path: frame for path, frame in found.items() if frame is not None}
     # a file that is named twice is measured once
@@ -576,12 +604,12 @@ class Journal:
     """
     Results of files as lines of JSON, written as they come; None keeps none.
 
-    A file counts as done if its name, size and time of change and the settings are those of the
-    journal. A line that was cut off is ignored.
+    A file counts as done if its name, size and time of change, those of the file of the left beam
+    (``left_file``) and the settings are those of the journal. A line that was cut off is ignored.
     """
 
-    def __init__(self, path, settings):
-        self.path = None if path is None else Path(path)
+    def __init__(self, path, settings, left_file=lambda path: None):
+        self.path, self._left_file = None if path is None else Path(path), left_file
         text = json.dumps(settings, sort_keys=True, default=repr)
         self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._known = {} if self.path is None else self._read()
@@ -603,10 +631,12 @@ class Journal:
 
     def _key(self, path):
         try:
-            state = os.stat(path)
+            files = [path, left] if (left := self._left_file(path)) else [path]
+            states = [os.stat(file) for file in files]
         except (OSError, ValueError):
             return None
-        return f"{Path(path).resolve()}|{state.st_size}|{state.st_mtime_ns}|{self._settings}"
+        told = "|".join(f"{state.st_size}|{state.st_mtime_ns}" for state in states)
+        return f"{Path(path).resolve()}|{told}|{self._settings}"
 
     def done(self, path):
         """Return the frame of a file that is done, else None."""

@@ -69,7 +69,7 @@ def run_archive(command, arguments):
     folder.mkdir(parents=True, exist_ok=True)
     # as workers need them, whose folder may be another
     settled = copy.copy(arguments)
-    for name in ("calibration", "raw"):
+    for name in ("calibration", "raw", "dark", "flat"):
         value = getattr(arguments, name, None)
         if value is not None:
             setattr(settled, name, type(value)(os.path.abspath(value)))
@@ -157,6 +157,10 @@ class _Work:
     def settings(self):
         """What a product depends on besides its files."""
         given = {k: v for k, v in vars(self.arguments).items() if k not in _DRIVING}
+        # what is no path is refused later
+        masters = [str(given.get(name) or "") for name in ("dark", "flat")]
+        if changed := [os.stat(p).st_mtime_ns for p in masters if os.path.isfile(p)]:
+            given["changed"] = changed
         return json.loads(json.dumps(given, sort_keys=True, default=str))
 
     def __call__(self, task):

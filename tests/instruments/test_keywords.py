@@ -118,8 +118,9 @@ def test_ranges_are_of_angles_gains_and_counts():
 def test_when_a_frame_was_taken():
     for header, expected in [
         ({"MJD": 60000.25}, "2023-02-25T06:00:00.000"),
-        # the number counts more than the text
-        ({"MJD": "60000.25", "DATE-OBS": "1999-01-01"}, "2023-02-25T06:00:00.000"),
+        # the number counts more than the text, such as a local date; what is no date counts nothing
+        ({"MJD": "60000.25", "DATE-OBS": "2023-02-24"}, "2023-02-25T06:00:00.000"),
+        ({"MJD": 60000.25, "DATE-OBS": "25.02.2023"}, "2023-02-25T06:00:00.000"),
         ({"DATE-OBS": "2025-07-15"}, "2025-07-15T00:00:00.000"),
         ({"DATE-OBS": "2025-07-15", "UT": "03:04:05.5"}, "2025-07-15T03:04:05.500"),
         ({"DATE-OBS": " 2025-07-15T01:02:03 ", "UT": "23:00:00"}, "2025-07-15T01:02:03.000"),
@@ -133,6 +134,12 @@ def test_header_without_a_date():
 
 
 def test_date_that_is_none():
-    for header in [{"MJD": "soon"}, {"DATE-OBS": "15.07.2025"}]:
-        with pytest.raises(ValueError, match=r"soon|15\.07\.2025"):
+    for header, word in [
+        ({"MJD": "soon"}, "soon"),
+        ({"DATE-OBS": "15.07.2025"}, r"15\.07\.2025"),
+        # a Julian Date, and two days of which nobody knows the right one
+        ({"MJD": 2460953.5}, "Modified Julian Date"),
+        ({"MJD": 60000.25, "DATE-OBS": "1999-01-01"}, "2023-02-25, the date 1999-01-01"),
+    ]:
+        with pytest.raises(ValueError, match=word):
             frame_time(header, LAYOUT)

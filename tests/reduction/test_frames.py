@@ -169,7 +169,7 @@ def test_observation_time():
         ({"date": "2025-11-03T06:00:00"}, 60982.25),
         ({"date": "20251103", "time": "06:00:00"}, 60982.25),
         # the number goes before the words
-        ({"mjd": 1.0, "date": "2025-11-03T06:00:00"}, 1.0),
+        ({"mjd": 60981.5, "date": "2025-11-03T06:00:00"}, 60981.5),
     ]:
         assert observation_time(values).mjd == pytest.approx(mjd), (values, mjd)
 

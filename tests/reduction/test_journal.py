@@ -63,6 +63,16 @@ def test_what_changed_is_not_done(cube, tmp_path):
         assert Journal(tmp_path / "run", settings).done(path) is None, change
 
 
+def test_a_left_beam_that_changed_is_not_done(cube, tmp_path):
+    path, frame = cube
+    left = tmp_path / "left.fits"
+    left.write_bytes(b"y")
+    Journal(tmp_path / "run", {}, lambda path: left).add(frame)
+    assert Journal(tmp_path / "run", {}, lambda path: left).done(path) is not None
+    left.write_bytes(b"yy")
+    assert Journal(tmp_path / "run", {}, lambda path: left).done(path) is None
+
+
 def test_order_of_settings_does_not_matter(cube, tmp_path):
     path, frame = cube
     write(tmp_path / "run", frame, a=1, b=2)

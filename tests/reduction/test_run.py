@@ -17,6 +17,7 @@ from reduction_lab import Small, expose, pair, reduce_frame_or_die, star_image, 
 from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
+    AstropolcalWarning,
     InstrumentError,
     ObservationError,
     ParameterError,
@@ -150,10 +151,28 @@ def test_shared_noise_goes_into_the_errors_of_difference_and_sum(tmp_path, small
         write_cube(tmp_path / f"CRSA{i:08d}_cube.fits", expose(image, LAYOUT, i), RET__ANG1=hwp)
         for i, hwp in enumerate(CYCLE)
     ]
-    own = reduce_cubes(paths, small)
-    shared = reduce_cubes(paths, small, background="outside")
+    # RET-POS1 is the same in all headers
+    with pytest.warns(AstropolcalWarning, match=r"4 files doubtful .*CRSA00000000.*RET-POS1"):
+        own = reduce_cubes(paths, small)
+    with pytest.warns(AstropolcalWarning, match="doubtful"):
+        shared = reduce_cubes(paths, small, background="outside")
     assert (own.covariance == 0).all()
     assert (shared.covariance > 0).all()
+
+
+def test_frames_of_other_days_and_files_left_out_are_told_of(tmp_path, small):
+    paths = flat_frames(tmp_path, CYCLE)
+    for path, mjd in zip(paths, (60871.3, 60871.31, 60953.3, 60953.31), strict=True):
+        fits.setval(path, "MJD", value=mjd)
+        fits.delval(path, "UTC-DATE")
+    doubts = reduce_run(paths, small).doubts
+    assert all("more than a day" in " ".join(doubts[str(path)]) for path in paths)
+    fits.setval(paths[0], "D_IMRANG", value="?")
+    with (
+        pytest.warns(AstropolcalWarning, match=f"1 file left out .*{paths[0].name}: D_IMRANG"),
+        pytest.warns(AstropolcalWarning, match="doubtful"),
+    ):
+        assert reduce_cubes(paths, small).n_frames == 3
 
 
 # --- bad input -------------------------------------------------------------------
@@ -317,6 +336,12 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
     np.testing.assert_allclose(np.median(ratio), np.median(flat), rtol=5e-3)
     spoilt = reduce_run(paths[1], small).observations
     assert abs(spoilt.flux_right / wanted.flux_right - 1).max() > 0.05
+    # a journal, and a session, know when a dark was made again
+    journal = {"resume": tmp_path / "journal"}
+    for level in (0.0, 30.0):
+        fits.writeto(masters["dark"], dark - level, overwrite=True)
+        again = reduce_run(paths[1], small, **masters, **journal).observations
+        np.testing.assert_allclose(again.flux_right > found.flux_right, level > 0)
     fits.writeto(tmp_path / "other.fits", np.ones((20, 20)))
     for path, words in (("other.fits", r"\(20, 20\); .* is needed"), ("none.fits", "no such file")):
         with pytest.raises(AstropolcalError, match=words):

@@ -4,7 +4,7 @@
 import hashlib
 import json
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import astropy.units as u
@@ -136,6 +136,17 @@ def test_a_corrupt_index_is_made_again(tmp_path):
     with closing(sqlite3.connect(path)) as base:
         base.execute("PRAGMA user_version = 99")
     assert indexed(tmp_path)[0] == (4, 4)
+
+
+def test_headers_are_read_again_for_another_instrument(tmp_path):
+    write_night(tmp_path / "tree", CYCLE, INSTRUME=None)
+    assert not indexed(tmp_path)[1]
+    for instrument in ("charis", "charis", "ircs"):
+        with closing(Index(tmp_path / "index.sqlite")) as index:
+            with suppress(AstropolcalError):
+                index.update(tmp_path / "tree", instrument=instrument, workers=1)
+            found = list(index.sequences(gap=1800))
+        assert [s.instrument for s in found] == (["charis"] if instrument == "charis" else [])
 
 
 def test_two_runs_at_a_time_are_refused(tmp_path):
