@@ -144,6 +144,23 @@ def build_grid(table, label):
     )
 
 
+def warn_of_copies(grid, label):
+    """Warn of frames with the same fluxes and errors to the last digit, which noise never makes."""
+    cells = np.stack([grid.flux_right, grid.flux_left, *grid.errors.values()], axis=1)
+    seen, copies = {}, []
+    for number, cell in zip(np.asarray(grid.frames["frame"]).tolist(), cells, strict=True):
+        if np.isfinite(cell).any() and (first := seen.setdefault(cell.tobytes(), number)) != number:
+            copies.append((number, first))
+    if copies and grid.errors:
+        warnings.warn(
+            f"{label}: {counted(len(copies), 'frame')} with exactly the fluxes of another one "
+            "(first: frame {} those of frame {}); copies make all errors too small, remove "
+            "them".format(*copies[0]),
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+
+
 def beams_as_frames(table, label):
     """
     Return a table with columns ``flux_NAME`` of other beams as one of a single ``flux``.

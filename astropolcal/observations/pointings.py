@@ -215,7 +215,7 @@ def sky_angles(observations, location=None):
     else:
         time, target = _times(observations), _target(observations)
         needed = {
-            "a column time": time,
+            "a column time (date and time of day)": time,
             "right_ascension and declination": target,
             "a site": location,
         }
@@ -227,7 +227,8 @@ def sky_angles(observations, location=None):
             )
         angles = tuple(angle.to_value(u.rad) for angle in pointing(target, time, location))
     altitude = angles[0]
-    low = altitude <= 0
+    # written so that NaN is low
+    low = ~(altitude > 0)
     if low.any():
         frame = int(np.argmax(low))
         raise ObservationError(
@@ -242,11 +243,17 @@ def _times(observations):
     if "time" not in frames.colnames:
         return None
     column = frames["time"]
+    if np.any(getattr(column, "mask", False)):
+        return None
     if isinstance(column, Time):
         return column
+    texts = np.asarray(column).astype(str)
+    # a date alone is no moment
+    if not np.all(np.char.find(texts, ":") > 0):
+        return None
     try:
         with offline():
-            return Time(np.asarray(column).astype(str), scale="utc")
+            return Time(texts, scale="utc")
     except ValueError:
         return None
 
@@ -257,13 +264,19 @@ def _target(observations):
     found = []
     for key in ("right_ascension", "declination"):
         if key in observations.frames.colnames:
-            angle = numeric_column(observations.frames, key, observations.name, u.deg)
+            angle = numeric_column(observations.frames, key, observations.name, u.deg) * u.deg
         else:
             angle = observations.meta.get(key)
         if angle is None:
             return None
-        found.append(u.Quantity(angle, u.deg))
-    return SkyCoord(*found)
+        try:
+            found.append(angle if isinstance(angle, u.Quantity) else sky_angle(key, angle) * u.deg)
+        except (TypeError, ValueError) as error:
+            raise ObservationError(f"{observations.name}: {key}: {one_line(error)}") from None
+    try:
+        return SkyCoord(*found)
+    except ValueError as error:
+        raise ObservationError(f"{observations.name}: {one_line(error)}") from None
 
 
 # ---- exposures -------------------------------------------------------------------------------

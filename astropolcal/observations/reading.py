@@ -236,6 +236,10 @@ _FILTERS = Path(__file__).parents[1] / "data" / "filters.ecsv"
 SAME_WAVELENGTH = 1e-5
 
 
+# by how much, relative, a wavelength that is stated may be off the middle of its filter
+_OF_FILTER = 0.07
+
+
 def nearest_bins(wavelength, grid):
     """Return the bin of a grid that is nearest to each wavelength, and which are off the grid."""
     nearest = np.abs(wavelength[:, None] - grid).argmin(axis=1)
@@ -288,14 +292,15 @@ def stated_wavelength(meta, label):
 
     By ``wavelength`` ("625 nm"), or by ``filter`` and ``instrument``.
     """
-    value = meta.get("wavelength")
-    if value is None and meta.get("filter") is None:
-        return None
-    if value is None:
+    value, named = meta.get("wavelength"), None
+    if meta.get("filter") is not None:
         try:
-            return filter_wavelength(meta.get("instrument"), meta["filter"])
+            named = filter_wavelength(meta.get("instrument"), meta["filter"])
         except ObservationError as error:
-            raise ObservationError(f"{label}: {error}") from None
+            if value is None:
+                raise ObservationError(f"{label}: {error}") from None
+    if value is None:
+        return named
     try:
         length = plain_number(value, u.Quantity)
         good = length.isscalar and length.to_value(u.um) > 0
@@ -304,6 +309,11 @@ def stated_wavelength(meta, label):
     if not good:
         raise ObservationError(
             f"{label}: wavelength = {value!r} in the meta; allowed is one length such as '625 nm'"
+        )
+    if named is not None and abs(length / named - 1) > _OF_FILTER:
+        raise ObservationError(
+            f"{label}: wavelength = {value!r} in the meta, but filter {meta['filter']!r} has "
+            f"{named:g}; which of both?"
         )
     return length
 

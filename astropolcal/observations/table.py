@@ -12,7 +12,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line
-from astropolcal.observations.grid import beam_variances, build_grid
+from astropolcal.observations.grid import beam_variances, build_grid, warn_of_copies
 from astropolcal.observations.observables import PAIRINGS, frame_groups
 from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
@@ -117,6 +117,11 @@ class Observations:
             If the file is absent, unreadable or inconsistent; the message is one
             line that names the file and the row or column.
 
+        Warns
+        -----
+        AstropolcalWarning
+            If cells are masked, or frames are copies of others.
+
         Examples
         --------
         >>> from astropolcal.observations import Observations
@@ -128,7 +133,9 @@ class Observations:
         table = read_ecsv(path)
         # it goes to terminals, pages and figures
         name = one_line(Path(path).stem, None) if name is None else name
-        return cls.from_table(table, name=name, path=path)
+        found = cls.from_table(table, name=name, path=path)
+        warn_of_copies(found._grid, found._label)
+        return found
 
     @classmethod
     def from_table(cls, table, *, name="table", path=None):

@@ -107,6 +107,31 @@ def test_angles_are_computed_from_time_target_and_site():
         np.testing.assert_allclose(parallactic, expected[1].to_value(u.rad), atol=1e-7)
 
 
+def test_targets_as_headers_write_them_and_what_is_none():
+    times = Time("2025-11-03T10:00") + np.arange(4) * 15 * u.s
+    hidden = times.copy()
+    hidden[2] = np.ma.masked
+    dates = np.array([text[:10] for text in times.isot])
+
+    def angles(right_ascension="05:20:00", declination=-1.0, time=times):
+        table = table_on_sky(altitude=None, time=time)
+        table.meta |= {"right_ascension": right_ascension, "declination": declination}
+        return sky_angles(Observations.from_table(table, name="night"), SUBARU)
+
+    for right_ascension in ("05:20:00", "80", 80 * u.deg, np.deg2rad(80) * u.rad):
+        np.testing.assert_allclose(angles(right_ascension), angles(80.0), atol=1e-9)
+    for wrong, word in (
+        ({"right_ascension": "east"}, "right_ascension"),
+        ({"right_ascension": np.nan}, "right_ascension"),
+        ({"declination": 100.0}, "-90"),
+        # half a night off, in silence
+        ({"time": dates}, "time of day"),
+        ({"time": hidden}, "time of day"),
+    ):
+        with pytest.raises(ObservationError, match=word):
+            angles(**wrong)
+
+
 def test_star_without_pointing_is_an_error_that_says_what_is_needed():
     with pytest.raises(
         ObservationError, match=r"night: a star needs its pointing.*missing: a column tim"

@@ -10,7 +10,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import EarthLocation, SkyCoord
-from astropy.table import QTable, Table
+from astropy.table import QTable, Table, vstack
 from astropy.utils.masked import Masked
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
@@ -28,6 +28,17 @@ def from_file(table, folder):
     path = folder / "night.ecsv"
     table.write(path, format="ascii.ecsv", overwrite=True)
     return Observations.read(path)
+
+
+def test_copies_of_frames_in_a_file_are_told_of(table, tmp_path):
+    rng = np.random.default_rng(1)
+    for name in ("flux_right", "flux_left"):
+        table[name] *= rng.uniform(0.9, 1.1, len(table))
+    from_file(table, tmp_path)
+    again = table[table["frame"] == 2]
+    again["frame"] = 7
+    with pytest.warns(AstropolcalWarning, match="1 frame with exactly .*frame 7 those of frame 2"):
+        from_file(vstack([table, again]), tmp_path)
 
 
 def refuse(table, match):

@@ -93,6 +93,14 @@ def test_what_is_no_length_is_refused():
             stated_wavelength({"wavelength": value}, "night")
 
 
+def test_a_wavelength_that_contradicts_the_filter_is_refused():
+    meta = {"wavelength": "625 nm", "filter": "775-50", "instrument": "VAMPIRES"}
+    with pytest.raises(ObservationError, match=r"night: .*625 nm.*'775-50' has 775 nm"):
+        stated_wavelength(meta, "night")
+    # of a filter that nobody knows the wavelength counts
+    assert stated_wavelength(meta | {"filter": "Z"}, "night") == 625 * u.nm
+
+
 def test_unknown_filter_of_a_table_names_the_table():
     rows = {name: [1.0, 3.0] * u.adu for name in ("single_difference", "single_sum")}
     angles = {"hwp": [0, 45] * u.deg, "derotator": [90, 90] * u.deg}
