@@ -196,6 +196,11 @@ def correct(
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
     found = corrected_planes(frames.source, solution, by_variance, **division)
     n = len(components)
+    if not np.isfinite(found[:n]).any():
+        raise ObservationError(
+            f"{frames.names[0]} and the others: no pixel has values, and variances above zero, in "
+            "frames enough to determine Q and U"
+        )
     known = {key: getattr(solution, key) for key in _OF_SOLUTION}
     known |= {key: getattr(frames, key) for key in _OF_FRAMES}
     return Corrected(

@@ -237,7 +237,7 @@ class _WholeCubes:
         return np.stack(scaled)
 
     def variances(self, beam, frames, wavelengths):
-        """Return their variances, NaN where the weight or the error is zero."""
+        """Return their variances, NaN where the weight or the error is zero or infinite."""
         known = [
             self._variance(beam, i, wavelengths) * self._scale[beam, i] ** 2
             for i in range(self.n_frames)[frames]
@@ -251,7 +251,8 @@ class _WholeCubes:
         power = 2 if self._weights == "error" else -1
 
         def squared(known):
-            return np.where(known > 0, known**power, np.nan)
+            # no measurement is without noise, nor is one that is all noise a measurement
+            return np.where((known > 0) & (known < np.inf), known**power, np.nan)
 
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._read(beam, i, wavelengths, 1, squared)

@@ -45,7 +45,8 @@ def named_by_date(calibrations):
         if calibrations.problems:
             path, reason = next(iter(calibrations.problems.items()))
             raise ParameterError(f"{path}: {reason}")
-        calibrations = calibrations.entries
+        # what was superseded is no other state of the instrument
+        calibrations = calibrations._in_force()
     named = []
     for i, item in enumerate(calibrations):
         if isinstance(item, tuple):

@@ -121,6 +121,10 @@ def _start(entry):
 
 def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     """Return what is to be said of the calibrations of an instrument and a mode."""
+    gone = {digest for entry in entries for digest in entry.supersedes}
+    left_out = [f"{e.name} is superseded" for e in entries if e.content_hash in gone]
+    entries = [entry for entry in entries if entry.content_hash not in gone]
+    left_out += [f"{e.name} has no date" for e in entries if e.validity.valid_from is None]
     dated = [e for e in entries if e.validity.valid_from is not None]
     content = {
         "instrument": instrument,
@@ -138,7 +142,7 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
         ],
         "courses": [],
         "events": [],
-        "left_out": [f"{e.name} has no date" for e in entries if e.validity.valid_from is None],
+        "left_out": left_out,
     }
     try:
         found = courses(dated, events=events)

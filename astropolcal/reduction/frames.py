@@ -2,6 +2,7 @@
 """Files of frames: headers, cubes and fluxes, or the reason why there are none."""
 
 import hashlib
+import re
 import warnings
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,12 @@ from astropy.io import fits
 from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
-from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.fitscheck import open_fits, primary_header, readable_fits
 from astropolcal.instruments.layout import card_value
 from astropolcal.pipeline.headers import told_beam
@@ -431,6 +437,7 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
         if frame.errors:
             way = ways["raw"] if raw is None and layout.raw_columns else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
+    _check_one_target(files, found)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
         centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
@@ -445,6 +452,26 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
         beam_detectors(file, layout, f.values, f.unit) for file, f in zip(files, found, strict=True)
     ]
     return _angles(found), centre, exposure / np.median(exposure) if differ else None, detectors
+
+
+def _check_one_target(files, frames):
+    """Refuse frames with the same data, and warn of frames of different objects."""
+    seen, objects = {}, {}
+    for file, frame in zip(files, frames, strict=True):
+        first = seen.setdefault(frame.digest, file) if getattr(frame, "digest", "") else file
+        if first != file:
+            raise ObservationError(f"{file}: the same data as {first}; leave one of them out")
+        name = frame.values.get("object")
+        if name:
+            # written now so, now so
+            objects.setdefault(re.sub(r"[^\w+-]|_", "", name).casefold(), (name, file))
+    if len(objects) > 1:
+        (one, first), (other, second) = list(objects.values())[:2]
+        warnings.warn(
+            f"{first} is of object {one!r}, {second} of {other!r}: corrected as one",
+            AstropolcalWarning,
+            stacklevel=4,
+        )
 
 
 def _survey(files, layout, raw, find):

@@ -22,7 +22,7 @@ from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.result.calibration import Validity, validity_of, with_validity
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.pipeline import fetch, import_context
+from astropolcal.pipeline import fetch, health, import_context, parameter_history
 from astropolcal.pipeline import library as module
 from astropolcal.pipeline.library import Entry, Library
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -701,6 +701,12 @@ def test_what_is_superseded_is_kept_but_not_chosen(calibration, years):
     assert years.find("charis", date="2026-01-01").name == "2025.asdf"
     assert "2026.asdf" in years.table()["name"]
     assert Library(years.source).find("charis", date="2026-01-03").name == "again.asdf"
+    # nor is it a state of the instrument
+    names = {"2025.asdf", "again.asdf", "2027.asdf"}
+    assert set(parameter_history(years)["calibration"]) == names
+    (group,) = health(years)["groups"]
+    assert {each["name"] for each in group["calibrations"]} == names
+    assert "2026.asdf is superseded" in group["left_out"]
     with refused("supersedes: no 'gone.asdf'"):
         years.add(calibration, supersedes="gone.asdf", valid_from="2031-01-01")
 

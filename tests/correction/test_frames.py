@@ -12,7 +12,7 @@ from astropy.table import MaskedColumn, QTable
 from astropy.utils.masked import Masked
 
 from astropolcal import instruments, optics
-from astropolcal.correction import ScienceFrames, measurement_rows
+from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.correction.frames import frame_positions
 from astropolcal.exceptions import ObservationError, ParameterError
 
@@ -301,3 +301,11 @@ def test_what_fluxes_and_wavelengths_say_counts():
     for wrong in (None, [1.2, np.nan] * u.um, [0, 1.2] * u.um, [1.2, 1.6], [1.2, 1.6] * u.s):
         with pytest.raises(ParameterError, match="wavelength"):
             ScienceFrames.from_arrays(flux, flux, wrong, {"hwp": HWP})
+
+
+def test_fluxes_without_any_variance_are_no_measurement():
+    flux = np.ones((4, 2)) + 0.01 * np.arange(8).reshape(4, 2)
+    given = dict.fromkeys(("variance_right", "variance_left"), np.zeros((4, 2)))
+    frames = ScienceFrames.from_arrays(flux, flux, LAM, {"hwp": HWP}, **given)
+    with pytest.raises(ObservationError, match="no pixel has values"):
+        correct(CHAIN, frames, brightness="given")

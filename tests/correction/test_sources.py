@@ -217,6 +217,18 @@ def test_weights_of_another_shape_are_none(tmp_path):
     assert not CubeFiles([path], [(3, 3), (3, 2)], 3).has_variances
 
 
+def test_an_infinite_weight_is_none(tmp_path):
+    path, weight = tmp_path / "a.fits", np.full((2, 6, 6), 4.0)
+    weight[0, 3, 3] = np.inf
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 6, 6))), fits.ImageHDU(weight)]
+    fits.HDUList(hdus).writeto(path)
+    for weights, variance in (("inverse variance", 0.25), ("error", 16.0)):
+        source = CubeFiles([path], [(3, 3), (3, 3)], 3, weights=weights)
+        found = source.variances(0, ALL, ALL)[0]
+        assert np.isnan(found[0, 1, 1]), weights
+        assert np.all(found[1] == variance), weights
+
+
 def test_centres_outside_the_image(cameras):
     for centre, words in [
         ((13.6, 6), r"right beam's centre \[13.6, 6.0\] is outside the image of 14 x 12 pixels"),

@@ -371,6 +371,20 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     assert [c.tolist() for c in centres] == [[[70.0, 85.0]] * 2] * 2
 
 
+def test_copies_and_other_objects_among_science_frames(monkeypatch):
+    def told(*frames):
+        found = [SimpleNamespace(errors=[], unit="adu", **one) for one in frames]
+        monkeypatch.setattr(frame_files, "_survey", lambda *_: found)
+        return survey_frames([f"{i}.fits" for i in range(len(found))], CHARIS.files, centre=(5, 5))
+
+    one, other = ({"values": {"hwp": 0.0, "object": name}} for name in ("HD 1", "HD_2"))
+    told(one, {"values": {"object": "hd1"} | one["values"]})
+    with pytest.warns(AstropolcalWarning, match=r"0\.fits is of object 'HD 1', 1\.fits of 'HD_2'"):
+        told(one, other)
+    with pytest.raises(ObservationError, match=r"1\.fits: the same data as 0\.fits"):
+        told(one | {"digest": "a"}, one | {"digest": "a"})
+
+
 # ---- options -----------------------------------------------------------------------------
 
 
