@@ -255,11 +255,11 @@ def distinct(positions):
     # dates as numbers, and states by their numbers
     positions = {k: mjd_of(v, k) if k == "time" else v for k, v in positions.items()}
     numbers = {name: _numbers(position) for name, position in positions.items()}
-    counts = [len(number) for number in numbers.values() if number.ndim]
-    if len({*counts} - {1}) > 1:
-        # refused where the matrices are made
-        return positions, np.zeros((), dtype=int)
-    count = max(counts, default=1)
+    counts = {name: len(number) for name, number in numbers.items() if number.ndim}
+    if len({*counts.values()} - {1}) > 1:
+        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise ParameterError(f"positions: {told}; one number of frames is allowed")
+    count = max(counts.values(), default=1)
     columns = [np.broadcast_to(number, (count, *number.shape[1:])) for number in numbers.values()]
     rows = np.column_stack(columns or [np.zeros((1, 0))])
     _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)

@@ -44,6 +44,7 @@ from astropolcal.pipeline.headers import (
     told_beam,
 )
 from astropolcal.pipeline.library import Entry, Library
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
 __all__ = ["LoadedCalibration", "SystemMueller", "load"]
@@ -469,7 +470,9 @@ class LoadedCalibration:
         ParameterError
             If the cube has another shape, or the angles of the plate do not tell Q and U apart.
         """
-        given, (headers, _) = np.array(stokes, dtype=float), _headers(header)
+        # a copy, NaN where it is masked
+        given = np.array(to_unit(stokes, getattr(stokes, "unit", None), "stokes"))
+        headers, _ = _headers(header)
         options |= {"header": headers or None, "positions": positions}
         beams = [self.system_mueller(beam=b, **options) for b in ("right", "left")]
         if hwp is None and headers:

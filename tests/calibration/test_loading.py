@@ -522,6 +522,18 @@ def test_stokes_cubes_that_cannot_be_corrected(loaded):
         loaded.correct(cube)
 
 
+def test_masked_pixels_of_a_cube_and_positions_of_other_frames_give_no_numbers(loaded):
+    headers = [HEADER | {"RET-ANG1": angle} for angle in (0.0, 45.0, 22.5, 67.5)]
+    hidden = np.ma.array(np.ones((3, 3, 2, 2)), mask=False)
+    hidden[1, 0, 0, 0] = np.ma.masked
+    stokes, _ = loaded.correct(hidden, headers)
+    assert np.isnan(stokes[:, 0, 0, 0]).all()
+    assert np.isfinite(stokes[:, 1:]).all()
+    positions = {"hwp": [0, 1, 2] * u.deg, "derotator": [60, 61] * u.deg}
+    with pytest.raises(ParameterError, match="positions: 3 of hwp, 2 of derotator; one number"):
+        loaded.system_mueller(positions=positions, light="internal")
+
+
 def test_laws_in_wavelength_allow_others_within_the_range(tmp_path):
     from astropolcal import optics
 
