@@ -196,11 +196,6 @@ def correct(
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
     found = corrected_planes(frames.source, solution, by_variance, **division)
     n = len(components)
-    if not np.isfinite(found[:n]).any():
-        raise ObservationError(
-            f"{frames.names[0]} and the others: no pixel has values, and variances above zero, in "
-            "frames enough to determine Q and U"
-        )
     known = {key: getattr(solution, key) for key in _OF_SOLUTION}
     known |= {key: getattr(frames, key) for key in _OF_FRAMES}
     return Corrected(
@@ -358,6 +353,11 @@ def corrected_planes(
 
         # an error comes out here, and ends what has not begun
         list(pool.map(work, range(0, size, chunk)))
+    if not np.isfinite(out[:n]).any():
+        raise ObservationError(
+            f"{source.names[0]} and the others: no pixel has values, and variances above zero, in "
+            "frames enough to determine Q and U"
+        )
     return out
 
 
