@@ -147,7 +147,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     depends_on_beam = False
     #: True for an optic whose mount may name one of `COORDINATES`, which are not angles.
     takes_numbers = False
-    # parameters that are the components of a diattenuation
+    # parameters that are the components of a diattenuation, or an efficiency
     _components = ()
     # laws that parameters follow, by their names, and where this copy stands for them
     _follows, _places = {}, {}
@@ -333,8 +333,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
         # such a diattenuation has no Mueller matrix
         if np.any(length > 1 + _ROUNDING):
+            what = self._components[0] if len(where) == 1 else "diattenuation"
             raise ParameterError(
-                f"{self.name or type(self).__name__}: the diattenuation is {np.max(length):.4g}; "
+                f"{self.name or type(self).__name__}: the {what} is {np.max(length):.4g}; "
                 "allowed is 1 at most"
             )
         return values

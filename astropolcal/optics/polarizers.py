@@ -273,6 +273,7 @@ class WollastonPrism(_BeamOptic, _LinearOptic):
     """
 
     splits_light = True
+    _components = ("efficiency",)
 
     efficiency = Parameter(default=1.0, bounds=(0, 1), description="modulation efficiency")
 
