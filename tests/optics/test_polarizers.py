@@ -15,6 +15,7 @@ from astropolcal.optics import (
     LinearPolarizer,
     LinearRetarder,
     VectorDiattenuator,
+    WollastonPrism,
 )
 
 EPSILON = st.floats(-1, 1)
