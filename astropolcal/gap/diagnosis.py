@@ -295,7 +295,8 @@ def diagnose(
     elif wrong:
         say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
         kept = without_frames(observations, wrong)
-        fresh = nominal_model(base.chains, kept)
+        # a fit that the frames had bent need not find back
+        fresh = nominal_model(base.start, kept, other=base.chains)
         groups = frame_groups(kept) if cross_validate else None
         # with noise and effects of its own
         again = Model(fresh.problem, fresh.fit, base.added)

@@ -11,7 +11,9 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.fit.strategies import BinProblem, few_frames, search_branches
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.cells import FINITE
@@ -60,6 +62,8 @@ class Model:
     added: dict = field(default_factory=dict)
     #: The calibration that was made for it, None where it began with another one.
     calibration: Calibration | None = None
+    #: Chains with the values from which a nominal model was fitted, None of others.
+    start: list | None = None
 
     @property
     def chains(self):
@@ -340,13 +344,17 @@ class Linear:
         return self.model.problem.n_data - float(np.sum(self.tangent**2))
 
 
-def nominal_model(chains, observations, calibration=None):
-    """Fit the nominal chains in both channels, from a calibration that is made if none is given."""
+def nominal_model(chains, observations, calibration=None, other=None):
+    """
+    Fit the nominal chains in both channels, from a calibration that is made if none is given.
+
+    ``other`` holds the same chains with other values, from which the fit may start, too.
+    """
     if calibration is None:
         calibration = nominal_calibration(chains, observations)
     problem = GapProblem(calibration.chains, observations)
     problem.settle_noise()
-    found = _lowest(problem, chains)
+    found = _lowest(problem, [chains] if other is None else [chains, other])
     # in turn: the residuals of a better fit tell the noise better
     for _ in range(_ROUNDS - 1):
         problem.settle_noise(found.coefficients)
@@ -362,19 +370,34 @@ def nominal_model(chains, observations, calibration=None):
             "check the angles, the optics in the beam and the starting values"
         )
     made = calibration if isinstance(calibration, Calibration) else None
-    return Model(problem, found, calibration=made)
+    return Model(problem, found, calibration=made, start=chains)
 
 
-def _lowest(problem, chains):
-    """Fit from the calibration and, where noise does not explain what is left, from the chains."""
+def _lowest(problem, starts):
+    """
+    Fit from the calibration and, where noise does not explain what is left, from the starts.
+
+    In the double differences, which the calibration fits, noise or a fault may have put a
+    wavelength into the wrong mirror branch: single differences often tell.
+    """
     found = problem.fit()
-    if stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > NOISE:
-        return found
-    known = parameter_table(chains)
-    vector = problem.vector(problem.start)
-    for slot in problem.free.slots:
-        value = np.ravel(known[slot.name][0].value) * slot.factor
-        vector[slot.slice] = value if value.size in (1, slot.size) else vector[slot.slice]
+    for chains in starts:
+        if stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > NOISE:
+            break
+        vector = problem.vector(found.coefficients)
+        for name, (known, *_) in parameter_table(chains).items():
+            slot, value = problem.free.by_name.get(name), np.ravel(known.value)
+            if slot is not None and value.size in (1, slot.size):
+                vector[slot.slice] = value * slot.factor
+        found = _lower(problem, vector, found)
+    told = first_weighting(problem.measurement, None)
+    bins = BinProblem(*few_frames(problem.measurement, told))
+    vector, moved = search_branches(bins, problem.vector(found.coefficients))
+    return _lower(problem, vector, found) if moved.any() else found
+
+
+def _lower(problem, vector, found):
+    """Return the lower of two fits, that which starts from a vector and one that is known."""
     other = problem.fit(np.clip(problem.coefficients(vector), problem.low, problem.high))
     return other if other.converged and other.chi2 < found.chi2 else found
 
@@ -416,7 +439,7 @@ def starting_model(calibration, observations, library, say):
             edited = found[0][1].edit(chains, _context(observations)).chains
             best = nominal_calibration(edited, observations)
             if _misfit(best) < _FAR_BETTER * _misfit(made):
-                return _with_alternative(observations, made, best, found)
+                return _with_alternative(observations, edited, made, best, found)
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
 
@@ -457,9 +480,9 @@ def _may_be_wrong(calibration):
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
-def _with_alternative(observations, given, best, found):
+def _with_alternative(observations, edited, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
-    model = nominal_model(best.chains, observations, best)
+    model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)
     residual = problem.residual(problem.start)

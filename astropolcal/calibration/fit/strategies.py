@@ -391,7 +391,7 @@ def joint(measurement, weighting, fitter, search, options=None):
     best = _descend(measurement, weighting, *how)
     if not search or not stands_out(measurement):
         return best
-    found, problem = measurement.vector(), BinProblem(*_thinned(measurement, weighting))
+    found, problem = measurement.vector(), BinProblem(*few_frames(measurement, weighting))
     least = np.sum(problem.residuals(found) ** 2)
     for promised, start in other_laws(problem, found, origin)[:_STARTS]:
         if promised > _HOPELESS * least:
@@ -439,7 +439,7 @@ def stands_out(measurement):
 
 def _descend(measurement, weighting, fitter, search, options, origin, is_searched=False):
     """Fit everything; go on as long as some bin finds a better mirror branch."""
-    small, noise = _thinned(measurement, weighting)
+    small, noise = few_frames(measurement, weighting)
     if search and not is_searched:
         stage("looking for where to start")
         problem = BinProblem(small, noise)
@@ -463,7 +463,7 @@ def _descend(measurement, weighting, fitter, search, options, origin, is_searche
         # the last word belongs to the fit of all parameters, not to a search by bin
         if not search or not left:
             break
-        small, noise = _thinned(measurement, weighting)
+        small, noise = few_frames(measurement, weighting)
         better, moved = search_branches(BinProblem(small, noise), small.vector(), origin)
         if not moved.any():
             break
@@ -478,7 +478,7 @@ def _smoothed(measurement, weighting, fitter, outcome):
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
     well. Any error of the model then decides between them; their neighbours tell which is true.
     """
-    problem, found = BinProblem(*_thinned(measurement, weighting)), measurement.vector()
+    problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
     start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
     for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
         where = problem.elements[row]
@@ -501,7 +501,7 @@ def _smoothed(measurement, weighting, fitter, outcome):
     return outcome, weighting
 
 
-def _thinned(measurement, weighting):
+def few_frames(measurement, weighting):
     """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
     if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
         return measurement, weighting
