@@ -17,6 +17,7 @@ import numpy as np
 
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
 from astropolcal.gap.cells import Cell, count_runs, split_run
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -169,7 +170,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
-    best = _merged(task, best)
+    best = _with_axes(task, _merged(task, best))
     best, scans = _exchanged(task, best, first)
     best = replace(best, model=best.model.polished())
     if changes:
@@ -206,6 +207,41 @@ def _merged(task, best):
                 state = _State(model, [*others, one], best.evidence + gained)
                 found = max(found, state, key=lambda s: s.evidence - ENOUGH * len(s.chosen))
     return found
+
+
+def _with_axes(task, best):
+    """
+    Return the set with an optic of any axis in place of what two components change twice a turn.
+
+    An optic that turns with a stage has a second harmonic of it in each component of a static
+    frame: four numbers for the two components in its own frame.
+    """
+    temper = max(1.0, best.model.mean_square)
+    stages = {leaf.stage: leaf.name for chain in task.base.trains for leaf in leaves(chain)}
+    for pair in combinations([one for one in best.chosen if one.cell is not None], 2):
+        kinds, patterns = ({getattr(o.cell, key) for o in pair} for key in ("kind", "dependence"))
+        stem, (word, _, rest) = min(kinds).rpartition("_")[0], min(patterns).partition(":")
+        stage, _, number = rest.partition(":")
+        oblique = len(patterns) == 1 and kinds == {f"{stem}_h", f"{stem}_d"}
+        if not oblique or (word, number) != ("harmonic", "2") or stage not in stages:
+            continue
+        names = [f"in:{stages[stage]}/{kind}/constant" for kind in sorted(kinds)]
+        chosen = [one for one in best.chosen if one not in pair]
+        # the first once more, as its law was chosen while the second was missing
+        for name in [*names, names[0]]:
+            chosen = [one for one in chosen if one.name != name]
+            seen = scan(task.fitted(chosen, best.model, **_QUICK), temper=temper)
+            fresh = next((one for one in seen.candidates if one.name == name), None)
+            if fresh is None or fresh.evidence < ENOUGH:
+                break
+            chosen = [*chosen, seen.freer(fresh)]
+        else:
+            model = task.fitted(chosen, best.model, **_QUICK)
+            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
+            dearer = sum(o.cost(temper) for o in chosen) - sum(o.cost(temper) for o in best.chosen)
+            if lost + dearer < 0:
+                best = _State(model, chosen, best.evidence - lost - dearer)
+    return best
 
 
 def _best_of(found, most):
@@ -630,10 +666,16 @@ def _refits(task, best, chosen):
     return loss
 
 
+def _is_twin(one, other):
+    """Return whether two cells do the same to these data."""
+    near = abs(one.statistic - other.statistic) <= _SAME * other.statistic
+    return near and one.rank == other.rank and not (one.is_named or other.is_named)
+
+
 def _members(chosen, beside, loss):
     """Return the chosen candidate and its aliases, with probabilities that sum to one."""
     rivals = beside.candidates
-    own = next((one for one in rivals if one.name == chosen.name), chosen)
+    seen = own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
     farthest = _FAR * max(own.size, 1.0)
     top = max([own.evidence, *(one.evidence for one in rivals if one.size <= farthest)])
@@ -662,6 +704,9 @@ def _members(chosen, beside, loss):
             is_same = is_same and lost < 1
         if is_same:
             weight = max(weight, _ALIAS)
+        if chosen.degree != seen.degree == one.degree and _is_twin(one, seen):
+            # what cannot be told apart with a law cannot be without one either
+            weight = max(weight, np.exp(min(one.evidence - seen.evidence, 0.0)))
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())

@@ -93,6 +93,16 @@ def test_two_planted_causes_are_both_found_and_left_out_frames_agree():
 
 
 @pytest.mark.slow
+def test_an_axis_between_those_of_an_optic_turns_with_it():
+    """In a static frame both components would change twice in a turn."""
+    setup = SETUPS["charis"]()
+    cells = [Cell("in:derotator", f"diattenuation_{axis}", "constant") for axis in "hd"]
+    setup.truth = setup.with_cell(cells[0], 0.006)
+    found = chosen(setup, setup.observed(setup.with_cell(cells[1], 0.005), seed=2))
+    assert {group.best.name for group in found.groups} == {cell.name for cell in cells}
+
+
+@pytest.mark.slow
 def test_a_name_is_given_where_it_does_as_well_as_its_cell():
     setup = SETUPS["charis"]()
     observations = setup.observed(setup.with_effect("beam_gain", imbalance=0.005))
@@ -134,6 +144,19 @@ def test_equally_probable_aliases_have_one_order():
         members = _members(best, Scan(rivals), None)
         orders.add(tuple(one.cell.place for one, _ in members))
     assert orders == {("source", "telescope", "after:hwp", "in:hwp")}
+
+
+def test_what_is_alike_with_a_law_is_alike_without_one():
+    """The law of the chosen cell alone was let go of: what others gain by that is not known."""
+
+    def candidate(place, statistic, evidence, degree=2):
+        cell, spectrum = Cell(place, "rotation", "constant"), (np.ones(1), np.ones(1), 1.0)
+        return Candidate(None, cell, statistic, 3, evidence, 0.0, spectrum, degree)
+
+    seen = [candidate("source", 2e3, 800.0), candidate("in:hwp", 1.9e3, 799.0)]
+    seen += [candidate("after:hwp", 2e3 + 1e-4, 799.0), candidate("telescope", 2.4e3, 990.0)]
+    members = _members(candidate("source", 2.8e3, 1100.0, 4), Scan(seen), None)
+    assert [one.cell.place for one, _ in members] == ["source", "telescope", "after:hwp"]
 
 
 @pytest.mark.long
