@@ -8,13 +8,14 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.chain import leaves
-from astropolcal.gap.model import NOISE
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
 __all__ = []
 
+#: Residuals less probable than this are no noise.
+NOISE = 1e-3
 #: Largest degree in wavelength of the law of a beam's factor.
 BEAM_DEGREE = 2
 # a direction of which the nominal model takes up all but this share is not seen

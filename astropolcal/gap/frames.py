@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._frame_looks import DIGITS, Frame, Group, Look, Trial, angle_stages
-from astropolcal.gap.model import NOISE, Model, nominal_calibration
+from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Trial, angle_stages
+from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
 

@@ -46,8 +46,6 @@ _FAR_BETTER, _ALIKE = 0.5, 1.1
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
 _FEW = 3
-#: A fit whose residuals are less probable than this may sit in a wrong minimum
-NOISE = 1e-3
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -375,15 +373,13 @@ def nominal_model(chains, observations, calibration=None, other=None):
 
 def _lowest(problem, starts):
     """
-    Fit from the calibration and, where noise does not explain what is left, from the starts.
+    Fit from the calibration and from the starts; return the lowest.
 
     In the double differences, which the calibration fits, noise or a fault may have put a
     wavelength into the wrong mirror branch: single differences often tell.
     """
     found = problem.fit()
     for chains in starts:
-        if stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > NOISE:
-            break
         vector = problem.vector(found.coefficients)
         for name, (known, *_) in parameter_table(chains).items():
             slot, value = problem.free.by_name.get(name), np.ravel(known.value)

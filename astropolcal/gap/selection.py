@@ -75,6 +75,8 @@ _SHAKY = 0.5
 _WANDERING, _TURNS_IT, _WITH_TIME = 0.65, ("rotation", "depolarization_d"), ("time", "step")
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
+# correlations of neighbours above so many standard errors are real
+_CORRELATED = 3.0
 # share of the gap that an answer may leave before it is doubtful
 _LEFT = 0.1
 
@@ -284,6 +286,10 @@ def _checked(task, best):
 def _worse(best, steps, history, groups):
     """Return the numbers of causes that are impossible or contradicted by left-out frames."""
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
+    if not impossible and steps[0].model.p_value > _NOISE:
+        # the residuals are no larger than noise: a pattern in them may be that of the noise itself
+        enough = ENOUGH * _alike(best.model)
+        impossible = [i for i, o in enumerate(best.chosen) if o.evidence < enough > ENOUGH]
     if impossible or groups is None:
         return impossible[-1:]
     pairs = zip(pairwise(history), steps[1:], strict=True)
@@ -299,6 +305,23 @@ def _worse(best, steps, history, groups):
         or _worsens(whole, foreseen(best.model.without([best.chosen[i].name]), groups), scatter)
     ]
     return found[-1:] if few else found
+
+
+def _alike(model):
+    """
+    Return how many neighbouring wavelengths have the same residuals, 1 if they are independent.
+
+    Noise that is correlated from one wavelength to the next repeats itself so often (as an
+    autoregressive process of first order): evidence counts it as data each time.
+    """
+    both, each, count = 0.0, 0.0, 1
+    for channel, rows in zip(model.problem.channels, model.problem.segments, strict=True):
+        left = model.residual[rows].reshape(channel.shape)[channel.told]
+        both += np.sum(left[1:] * left[:-1])
+        each += np.sum(left**2)
+        count += left.size
+    same = both / max(each, 1e-300)
+    return (1 + same) / (1 - same) if same > _CORRELATED / np.sqrt(count) else 1.0
 
 
 def _worsens(after, before, scatter):

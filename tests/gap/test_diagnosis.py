@@ -20,6 +20,7 @@ from astropolcal.gap.model import thinned
 from astropolcal.gap.report import to_dict
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.measurement import Measurement
+from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -174,6 +175,22 @@ def test_a_wrong_sign_is_found(name, effect):
     found = diagnose(setup.nominal, observations, **QUICK)
     assert found.causes[0].effect.kind == "discrete"
     assert effect in names(found.causes[0])
+
+
+@pytest.mark.slow
+def test_noise_that_neighbouring_wavelengths_share_has_no_cause():
+    """It is no larger than stated, and its patterns repeat themselves."""
+    rng, table = np.random.default_rng(4), data.observed(flux=1e12, seed=4).to_table()
+    near = np.exp(-(np.subtract.outer(np.arange(7), np.arange(7)) ** 2) / 4)
+    near /= np.linalg.norm(near, axis=0)
+    for beam in ("flux_right", "flux_left"):
+        flux = table[beam].value
+        sigma = 1e-3 * np.sqrt(np.mean(flux) * flux)
+        noise = rng.normal(size=(len(table) // 7, 7)) @ near
+        table[beam] = (flux + noise.ravel() * sigma) * table[beam].unit
+        table[f"{beam}_err"] = sigma * table[beam].unit
+    found = diagnose(data.chain(), Observations.from_table(table, name="lamp"))
+    assert (found.verdict, found.causes) == ("none", [])
 
 
 @pytest.mark.slow
