@@ -260,7 +260,7 @@ def _words(fault, told, beam):
     finest = max(fault.error, abs(fault.value - told) / 30)
     digits = int(np.clip(np.ceil(1 - np.log10(finest)), 1, 4))
     stood, told = (f"{angle:.{digits}f} deg" for angle in (fault.value, told))
-    return f"{name} stood at {stood}, not at {told} as the table says"
+    return f"its data are those of {name} at {stood}, not at {told} as the table says"
 
 
 def _exchanges(place, frames, trials):

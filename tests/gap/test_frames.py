@@ -269,7 +269,7 @@ def test_frame_of_a_single_beam_is_named_with_what_its_design_can_tell():
     assert fault.what == "plate angle" or "cannot tell" in fault.words
     (fault,) = found_of_single(False, factor=0.95, at=[20])
     assert (fault.frame, fault.what, fault.value) == (20, "unknown", None)
-    assert "calibrator stood at" in fault.words
+    assert "calibrator at" in fault.words
     assert "its brightness is off" in fault.words
     assert fault.words.endswith("its design cannot tell")
 
