@@ -242,10 +242,8 @@ def _cells(probes, temper):
     laws = {degree: law_basis(probes.problem.wavelength, degree) for degree in _DEGREES}
     found = []
     for (place, kind), slopes in probes.slopes.items():
-        whole, names = (
-            Reduced(probes, slopes, laws[_DEGREES[-1]]),
-            probes.dependences_of(place, kind),
-        )
+        whole = Reduced(probes, slopes, laws[_DEGREES[-1]])
+        names = probes.dependences_of(place, kind)
         if (place, kind) in probes.bends:
             names = [name for name in names if name != "constant"]
             constant = Cell(place, kind, "constant")

@@ -245,11 +245,8 @@ def undecided_signs(measurement):
     That is where the other sign, other phases of the wavelength refitted, is less than three
     standard deviations worse. What fits exactly as well is a mirror solution anyway.
     """
-    problem, vector, found = (
-        BinProblem(measurement, measurement.weighting),
-        measurement.vector(),
-        [],
-    )
+    problem = BinProblem(measurement, measurement.weighting)
+    vector, found = measurement.vector(), []
     if not problem.slots:
         return found
     costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
