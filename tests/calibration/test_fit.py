@@ -302,7 +302,7 @@ def test_start_outside_its_bounds_is_named(few):
     assert calibrate(chain, data, cross_validate=False).converged
     for optic, key, value, words in (
         ("hwp", "theta", 9, r"hwp\.theta starts at 9; allowed are -5 to 5 deg"),
-        ("wollaston", "efficiency", 1.5, r"wollaston\.efficiency.* at 1\.5; allowed are 0 to 1$"),
+        ("wollaston", "efficiency", -0.5, r"wollaston\.efficiency.* at -0\.5; allowed are 0 to 1$"),
     ):
         wrong = chain.copy()
         parameter = getattr(wrong[optic], key)
