@@ -4,7 +4,7 @@
 import hashlib
 import re
 import warnings
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -408,9 +408,12 @@ def read_night(files, instrument):
             # the first file of each mode, to be named
             modes.setdefault(values["filter"], file)
         moments[str(file)] = None
-        # whether it is needed depends on the calibration
-        with suppress(ObservationError):
+        try:
             moments[str(file)] = observation_time(values).isot
+        except ObservationError as error:
+            # whether a time is needed depends on the calibration; a wrong one is refused
+            if "mjd" in values:
+                raise ObservationError(f"{file}: {error}") from None
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")

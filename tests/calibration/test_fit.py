@@ -310,9 +310,6 @@ def test_start_outside_its_bounds_is_named(few):
         for fitter in (None, LMLSQFitter()):
             with pytest.raises(FitError, match=words):
                 calibrate(wrong, data, fitter=fitter)
-        held = {f"{optic}.{key}": parameter.quantity if key == "theta" else value}
-        with pytest.raises(FitError, match=rf"{optic}\.{key} is held at .*; allowed are "):
-            calibrate(chain, data, fix=held)
     # by a rounding error alone
     wrong = chain.copy()
     wrong["hwp"].theta.fixed, wrong["hwp"].theta.value = False, 5 + 1e-9

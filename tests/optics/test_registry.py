@@ -511,9 +511,18 @@ CASES = {
         horizontal=COMPONENT,
         diagonal=COMPONENT,
     ),
-    "WollastonPrism": case(optics.WollastonPrism, wollaston("right"), efficiency=FRACTION),
+    "WollastonPrism": case(
+        optics.WollastonPrism,
+        wollaston("right"),
+        smooth={"efficiency": SMOOTH},
+        efficiency=FRACTION,
+    ),
     "WollastonPrism, left": case(
-        optics.WollastonPrism, wollaston("left"), settings={"beam": "left"}, efficiency=FRACTION
+        optics.WollastonPrism,
+        wollaston("left"),
+        smooth={"efficiency": SMOOTH},
+        settings={"beam": "left"},
+        efficiency=FRACTION,
     ),
 }
 HOW = (

@@ -278,9 +278,16 @@ def test_frames_of_another_set_up(night, tmp_path):
     for keywords, message in [
         ([("FILTNAME", "J", "K")], "is in mode 'J', .* in 'K': correct apart"),
         ([("FILTNAME", "J")], "in mode 'J', but .*charis.asdf holds for .*--filter 'broadband"),
-        ([("MJD", 60950.5, 60800.5)], "nbs was in the beam in .*, and not in "),
         (
-            [("MJD", 60800.5), ("FILTNAME", "broadband JHK")],
+            [("MJD", 60800.5)],
+            "cube.fits: time: the Modified Julian Date 60800.5 is 2025-05-05, the ",
+        ),
+        (
+            [("MJD", 60950.5, 60800.5), ("UTC-DATE", "2025-10-02", "2025-05-05")],
+            "nbs was in the beam in .*, and not in ",
+        ),
+        (
+            [("MJD", 60800.5), ("UTC-DATE", "2025-05-05"), ("FILTNAME", "broadband JHK")],
             "switcher was installed between the data",
         ),
     ]:

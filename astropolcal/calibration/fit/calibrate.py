@@ -60,7 +60,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitErro
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs
-from astropolcal.measurement.parameters import is_outside, limits, with_own
+from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
 from astropolcal.version import version
@@ -171,8 +171,8 @@ def calibrate(
     FitError
         If there is nothing to fit, fewer data than free parameters, the weights are asked for where
         the table has no errors, the residuals of a wavelength tell no noise, a parameter starts
-        or is held outside its bounds, an optic gives wrong derivatives, or the two-step
-        strategy has no polarized source.
+        outside its bounds, an optic gives wrong derivatives, or the two-step strategy has no
+        polarized source.
     ChainError, ObservationError, ParameterError
         If chain and observations do not fit together, or a noise given is not a possible one.
 
@@ -265,11 +265,6 @@ def _check(measurement):
             f"{measurement.free.size} free parameters but only {measurement.n_data} data; "
             "fix some, or add frames"
         )
-    for name, parameters in parameter_table(measurement.chains).items():
-        for held in (p for p in parameters if p.fixed and is_outside(p.value, p.bounds)):
-            low, high = limits(held.bounds)
-            allowed = f"{low:.7g} to {high:.7g} {held.unit or ''}".rstrip()
-            raise FitError(f"{name} is held at {held.value}; allowed are {allowed}")
     for name in outside_bounds(measurement):
         free, i = measurement.free, measurement.free.names.index(name)
         unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]
