@@ -20,7 +20,7 @@ from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
 from astropolcal.gap.cells import Cell, count_runs, split_run
-from astropolcal.gap.shrinkage import foreseen, stability
+from astropolcal.gap.shrinkage import foreseen, frame_groups, stability
 
 __all__ = []
 
@@ -39,10 +39,10 @@ _NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 10.0
 _MOST = 8
-# of several runs each by itself, and all together for each of them
-_MOST_ALONE, _MOST_TOGETHER = 6, 10
-# what a nominal model has of an optic that turns, with the degree of the law in wavelength
-_OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
+# for each of several runs together
+_MOST_TOGETHER = 10
+# what a nominal model has of an optic that turns
+_OF_OPTIC = ("retardance_h", "retardance_d", "rotation")
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
@@ -165,7 +165,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     most = _MOST if runs < 2 or not cells else _MOST // 2
     best = _search(task, _State(base), first, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
-        best = _apart(base, first, say)
+        best = _apart(task, first)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, 0.0, [_errors(base, groups)])
@@ -366,34 +366,48 @@ def _distinct(candidates, most):
     return found
 
 
-def _apart(base, first, say):
+def _apart(task, first):
     """Return the set of the causes that each run needs by itself."""
-    chosen = []
+    base, chosen = task.base, []
     for i, name in enumerate(first.probes.runs):
-        say(f"{name} by itself")
+        task.say(f"{name} by itself")
         alone = base.of_dataset(i)
-        seen = _scanned(alone, [], True)
-        state = _search(
-            _Task(alone, [], True, None, say, has_runs=True), _State(alone), seen, _MOST_ALONE
-        )
+        groups = None if task.groups is None else frame_groups(alone.observations)
+        alone = _Task(alone, [], True, groups, task.say)
+        state = _search(alone, _State(alone.base), _scanned(alone.base, [], True), _MOST)
         of_all = [first.probes.run_of(one.cell) is None for one in state.chosen]
         chosen += [
             replace(one, cell=one.cell.in_run(name)) if everywhere else one
             for one, everywhere in zip(state.chosen, of_all, strict=True)
         ]
-    say("all runs together")
+    task.say("all runs together")
     names = {one.name for one in chosen}
     nominal = [one for one in _nominal_changes(first) if one.name not in names]
-    model = base.with_effects([one.recipe for one in (*chosen, *nominal)], **_QUICK)
-    temper = max(1.0, model.mean_square)
-    for one in nominal:
-        lost = 0.5 * (model.without([one.name]).chi2 - model.fit.chi2) / temper
-        if lost > one.cost(temper) + ENOUGH:
-            chosen.append(one)
-    model = base.with_effects([one.recipe for one in chosen], like=model, **_QUICK)
+    model = task.fitted([*chosen, *nominal], base, **_QUICK)
+    chosen += _needed(model, nominal)
+    model = task.fitted(chosen, model, **_QUICK)
     temper = max(1.0, model.mean_square)
     gained = 0.5 * (base.fit.chi2 - model.fit.chi2) / temper
     return _State(model, chosen, gained - sum(one.cost(temper) for one in chosen))
+
+
+def _needed(model, causes):
+    """Return those causes of a model that have evidence beside the others, the least dropped."""
+    temper, left, dropped = max(1.0, model.mean_square), list(causes), []
+
+    def evidence(one):
+        lost = model.without([*dropped, one.name]).chi2 - model.without(dropped).chi2
+        return 0.5 * lost / temper - one.cost(temper)
+
+    # one at a time: of two that do the same, the other is needed once the first is gone
+    while left:
+        found = {one.name: evidence(one) for one in left}
+        least = min(found, key=found.get)
+        if found[least] > ENOUGH:
+            break
+        dropped.append(least)
+        left = [one for one in left if one.name != least]
+    return left
 
 
 def _nominal_changes(first):
@@ -401,7 +415,14 @@ def _nominal_changes(first):
     probes, found = first.probes, []
     places = list(dict.fromkeys(place for place, _ in probes.slopes))
     own = [place for place in places if place.startswith("in:")]
-    kinds = [(place, *kind) for place in own for kind in _OF_OPTIC]
+    # the angle of an optic is one number, what a model has per wavelength is free there
+    slots = probes.problem.free.slots
+    bends = {f"in:{slot.name.split('.')[0]}" for slot in slots if slot.per_wavelength}
+    kinds = [
+        (place, kind, 2 if kind == "rotation" and place not in bends else None)
+        for place in own
+        for kind in _OF_OPTIC
+    ]
     kinds += [(place, "rotation", 0) for place in places if place == "source"]
     # the efficiency of the splitter, as seen in front of it
     behind = [p for p in places if p[:6] == "after:" and len(probes.slopes[p, "rotation"]) > 1]
