@@ -9,6 +9,7 @@ import gap_data as data
 import numpy as np
 import pytest
 
+from astropolcal import instruments
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap import diagnose
@@ -24,9 +25,9 @@ from astropolcal.scripts.main import main
 JULY, OCTOBER = "July: 15", "October 5"
 
 
-def with_cell(*cells):
-    """Return the usual chain with cells of certain sizes, each (place, kind, dependence, size)."""
-    chains = [data.chain()]
+def with_cell(*cells, chain=None):
+    """Return a chain with cells of certain sizes, each (place, kind, dependence, size)."""
+    chains = [data.chain() if chain is None else chain]
     for *cell, size in cells:
         edit = CellEffect(Cell(*cell)).edit(chains, Context(data.WAVELENGTH.to_value(u.um)))
         chains = edit.chains
@@ -231,6 +232,45 @@ def test_a_perturbation_keeps_its_run():
     one = Perturbation(kind="rotation", dependence=f"time/dataset:{JULY}", name="x")
     assert one.copy().dependence == f"time/dataset:{JULY}"
     assert one.mount == "sequence"
+
+
+@pytest.mark.long
+def test_two_runs_are_described_together_as_well_as_apart():
+    planted = {
+        JULY: [
+            ("detector", "gain", "constant", 0.02),
+            ("after:derotator", "retardance_d", "constant", 0.1),
+            ("after:hwp", "retardance_h", "harmonic:derotator:1", 0.05),
+        ],
+        OCTOBER: [
+            ("detector", "gain", "harmonic:derotator:1", -0.02),
+            ("in:hwp", "retardance_d", "harmonic:hwp:1", 0.05),
+            ("in:derotator", "rotation", "harmonic:derotator:2", 0.02),
+        ],
+    }
+    runs = []
+    for seed, (name, cells) in enumerate(planted.items(), 3):
+        chain = instruments.get("charis").chain(wavelength=data.WAVELENGTH)
+        if name == OCTOBER:
+            # what the nominal model has for both runs together is not the same either
+            derotator = next(leaf for leaf in leaves(chain) if leaf.name == "derotator")
+            rng = np.random.default_rng(2)
+            for key in ("horizontal", "circular"):
+                parameter = getattr(derotator, key)
+                parameter.value = parameter.value + rng.normal(0, 3, 7)
+        runs.append(data.observed(with_cell(*cells, chain=chain), seed=seed, name=name))
+    nominal = instruments.get("charis").chain(wavelength=data.WAVELENGTH)
+    apart = [diagnose(nominal, run).gap_after_percent for run in runs]
+    found = diagnose(nominal, runs)
+    assert found.gap_after_percent < 1.2 * np.sqrt(np.mean(np.square(apart)))
+    assert 0.8 < found.improved.mean_square < 1.2
+    names = {cause.name for cause in found.causes}
+    assert {
+        f"in:derotator/{kind}/dataset:{OCTOBER}" for kind in ("retardance_h", "rotation")
+    } <= names
+    # so many causes are no names
+    assert found.verdict == "unexplained"
+    assert max(cause.probability for cause in found.causes) < 0.1
 
 
 def test_words_of_a_change_that_is_doubtful():
