@@ -17,8 +17,8 @@ from astropy.modeling import CompoundModel
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.mueller import act, turned
 from astropolcal.optics import COORDINATES, Optic
-from astropolcal.optics.core import FLUXES, PLACES, finite_position
 from astropolcal.optics.laws import law_of
+from astropolcal.optics.positions import FLUXES, PLACES, finite_position
 from astropolcal.words import did_you_mean
 
 __all__ = [

@@ -9,7 +9,7 @@ from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
-from astropolcal.optics.core import finite_position
+from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator, splits
 from astropolcal.units import check_seed, length_to_um, wavelengths_of
 from astropolcal.words import check_type

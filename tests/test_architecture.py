@@ -13,6 +13,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -343,6 +344,20 @@ def test_import_contract_holds():
         "an import breaks the contract of setup.cfg; move what both sides need to the lower "
         f"layer, or import a heavy library higher up:\n{result.stdout}\n{result.stderr}"
     )
+
+
+def test_no_two_modules_import_each_other(sources):
+    """In functions neither; only a name that is looked up by a string may lead upward."""
+    trees = {_module_name(PACKAGE / name): tree for name, (_, tree) in sources.items()}
+    graph = {name: set() for name in trees}
+    for name, tree in trees.items():
+        for node in (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)):
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                graph[name].add(full if full in trees else node.module)
+    # raises CycleError, which shows the circle
+    order = list(TopologicalSorter(graph).static_order())
+    assert order.index("astropolcal.mueller") < order.index("astropolcal.scripts.main")
 
 
 def test_map_shows_contract_and_imports(monkeypatch):

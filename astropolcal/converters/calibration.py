@@ -19,7 +19,7 @@ from astropolcal.calibration.identifiability.analysis import Identifiability
 from astropolcal.calibration.result.calibration import DatasetRecord, validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
-from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS
+from astropolcal.converters import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.converters.nodes import (
     check_posterior,
     checksum,

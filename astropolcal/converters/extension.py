@@ -12,18 +12,14 @@ from importlib.resources import files
 from asdf.extension import Converter, ManifestExtension
 from asdf.resource import DirectoryResourceMapping
 
+from astropolcal.converters import CALIBRATION_TAG, CALIBRATION_TAGS
+
 __all__ = []
 
 # of schemas, which are named by URI; tags begin with tag:astropolcal.org instead
 _BASE = "asdf://astropolcal.org/astropolcal"
 #: The list of all tags and the schemas they obey.
 MANIFEST_URI = f"{_BASE}/manifests/astropolcal-1.0.0"
-
-#: Versions of the schema of calibrations that can be read, oldest first; the newest is written.
-CALIBRATION_TAGS = tuple(
-    f"tag:astropolcal.org:astropolcal/calibration-{version}" for version in ("1.0.0", "1.1.0")
-)
-CALIBRATION_TAG = CALIBRATION_TAGS[-1]
 
 #: Module of `astropolcal.optics` in which each optic is defined. It repeats the
 #: registry, so that ASDF can find a converter without importing the optics.
@@ -95,7 +91,7 @@ class ChainConverter(Converter):
     """Leave chains to the converter of astropy's compound models, which are read as chains."""
 
     tags = ()
-    types = ["astropolcal.optics._modelling.Chain"]
+    types = ["astropolcal.optics.core.Chain"]
 
     def select_tag(self, obj, tags, ctx):
         return None

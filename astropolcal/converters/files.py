@@ -24,12 +24,8 @@ from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
 from asdf.extension import ExtensionProxy
 from asdf.resource import ResourceMappingProxy
 
-from astropolcal.converters.extension import (
-    CALIBRATION_TAG,
-    CALIBRATION_TAGS,
-    get_extensions,
-    get_resource_mappings,
-)
+from astropolcal.converters import CALIBRATION_TAG, CALIBRATION_TAGS
+from astropolcal.converters.extension import get_extensions, get_resource_mappings
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
 from astropolcal.version import version as our_version

@@ -19,7 +19,7 @@ from astropolcal.chain import join, leaves, stages, warn_beyond
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.observations.pointings import plain_states
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.core import finite_position
+from astropolcal.optics.positions import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
 from astropolcal.units import length_to_um, to_unit, wavelengths_of
 

@@ -20,8 +20,8 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.problem import GapProblem
-from astropolcal.optics.core import COORDINATES
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
+from astropolcal.optics.positions import COORDINATES
 
 __all__ = []
 

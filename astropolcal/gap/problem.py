@@ -18,7 +18,7 @@ from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonorm
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
-from astropolcal.optics.core import FLUXES
+from astropolcal.optics.positions import FLUXES
 
 __all__ = []
 

@@ -30,7 +30,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.core import MOVES, PLACES
+from astropolcal.optics.positions import MOVES, PLACES
 from astropolcal.units import angle_to_rad, mjd_of, plain_number
 from astropolcal.words import check_choice, check_type
 

@@ -7,7 +7,7 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.core import COORDINATES, Optic
+from astropolcal.optics.core import Optic
 from astropolcal.optics.mirrors import KMirror, MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
     DriftRetarder,
@@ -33,6 +33,7 @@ from astropolcal.optics.polarizers import (
     VectorDiattenuator,
     WollastonPrism,
 )
+from astropolcal.optics.positions import COORDINATES
 from astropolcal.optics.retarders import (
     EllipticalRetarder,
     LinearRetarder,

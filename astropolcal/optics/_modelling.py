@@ -9,20 +9,16 @@ fitter asks every model of a compound for its units, and astropy's ``Mapping`` h
 Bounds and ties do, because astropy drops their units.
 """
 
-import inspect
 from collections import defaultdict
 from copy import copy, deepcopy
-from functools import reduce
-from operator import or_
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
+from astropy.modeling import FittableModel, Parameter
 from astropy.modeling.utils import _ConstraintsDict
 
-from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.units import length_to_um, to_unit
-from astropolcal.words import html
 
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
@@ -49,43 +45,6 @@ class Setting:
     def __set__(self, optic, value):
         checked = self.check(value, f"{type(optic).__name__}.{self.name}")
         optic.__dict__[f"_{self.name}"] = checked
-
-
-class KeywordOnly(type(FittableModel)):
-    """Keeps astropy from giving each optic an ``__init__`` with positional parameters."""
-
-    def __init__(cls, name, bases, members, **kwargs):
-        # astropy's metaclass writes an __init__ for every class whose members have none
-        super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
-        # and its own ``|`` into every class
-        cls.__or__ = joined
-        for parameter in cls._parameters_.values():
-            if type(parameter) is Parameter:
-                parameter.__class__ = OpticParameter
-                if any(isinstance(bound, u.Quantity) for bound in parameter.bounds):
-                    parameter.bounds = parameter.bounds
-        # those of the bases first
-        cls._declared_settings = {
-            key: setting
-            for base in reversed(cls.__mro__)
-            for key, setting in vars(base).items()
-            if isinstance(setting, Setting)
-        }
-        # every keyword that the optic takes, with its default
-        found = {}
-        # theta is declared first, in the base, and is what a user gives last
-        for key in (*cls.param_names[1:], "theta"):
-            parameter = inspect.getattr_static(cls, key)
-            unit = parameter.unit
-            found[key] = parameter.default if unit is None else parameter.default * unit
-        found |= {key: setting.default for key, setting in cls._declared_settings.items()}
-        for base in cls.__mro__:
-            if isinstance(base, KeywordOnly):
-                found |= getattr(base.__init__, "__kwdefaults__", None) or {}
-        kind = inspect.Parameter.KEYWORD_ONLY
-        cls.__signature__ = inspect.Signature(
-            [inspect.Parameter(key, kind, default=default) for key, default in found.items()]
-        )
 
 
 def phase(description):
@@ -194,11 +153,6 @@ def values_text(model):
     )
 
 
-def joined(left, right):
-    """Return ``left | right`` of two models as a chain."""
-    return Chain("|", left, right) if isinstance(right, Model) else NotImplemented
-
-
 class OwnUnits:
     """A model whose parameters keep their units in a fit; their values are numbers in these."""
 
@@ -254,83 +208,6 @@ class ScalarParameters(OwnUnits, FittableModel):
     def _parameter_units_for_data_units(self, input_units, output_units):
         units = {name: self.__dict__[name].unit for name in self._param_names}
         return {name: unit for name, unit in units.items() if unit is not None}
-
-
-class Chain(OwnUnits, CompoundModel):
-    """
-    What ``|`` makes of optics, and of optics and other models of astropy.
-
-    Any of astropy's fitters takes one of one input and one output. Its parameters keep their units
-    in a fit, and their values are numbers in these.
-    """
-
-    def without_units_for_data(self, **data):
-        """Return the chain as a fitter takes it: itself, once data and parameters are checked."""
-        for key in self.param_names:
-            if np.size(getattr(self, key).value) > 1:
-                raise ParameterError(
-                    f"{key} has one value per wavelength, and no fitter of astropy takes a model "
-                    "with such a parameter, not even a fixed one; astropolcal.calibrate does"
-                )
-        inputs = [
-            data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
-            for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()
-        ]
-        outcome = self(*inputs)
-        key = self.outputs[0]
-        given, own = (getattr(value, "unit", u.one) for value in (data[key], outcome))
-        if isinstance(data[key], u.Quantity) and given != own:
-            raise ParameterError(
-                f"{key} is in {given}, but the chain gives {str(own) or 'plain numbers'}"
-            )
-        return self
-
-    def __setattr__(self, attr, value):
-        if attr in (self.__dict__.get("_param_names") or ()):
-            # the optic checks value and unit
-            index, key = self._param_map[attr]
-            setattr(self._leaflist[index], key, value)
-        else:
-            super().__setattr__(attr, value)
-
-    def __iter__(self):
-        return iter(self._leaflist)
-
-    def _repr_html_(self):
-        from astropy.table import Table
-
-        rows = [
-            (i, m.name or "", type(m).__name__, getattr(m, "mount", None) or "", values_text(m))
-            for i, m in enumerate(self)
-        ]
-        names = ("place", "name", "kind", "mount", "parameters")
-        return html(" | ".join(row[1] or row[2] for row in rows), Table(rows=rows, names=names))
-
-    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
-        """Return a model of one input that draws what the chain does; see `Optic.curve`."""
-        from astropolcal.optics.curves import curve_of
-
-        return curve_of(self, list(self), what, element, against, wavelength, **positions)
-
-    def __getitem__(self, index):
-        if not isinstance(index, slice):
-            return super().__getitem__(index)
-        # astropy finds only what is one branch of its tree
-        models = self._leaflist[self._whole(index)]
-        if index.step not in (None, 1) or not models:
-            raise ChainError(f"no optics at {index} of a chain of {len(self._leaflist)}")
-        return reduce(or_, models)
-
-    def _whole(self, index):
-        """Return a slice by number; a name as its stop is the last optic, as astropy has it."""
-        start, stop = (
-            self._str_index_to_int(end) if isinstance(end, str) else end
-            for end in (index.start, index.stop)
-        )
-        return slice(start, stop + 1 if isinstance(index.stop, str) else stop)
-
-
-Chain.__or__ = joined
 
 
 def deep_copied(optic, memo):

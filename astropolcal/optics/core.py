@@ -11,74 +11,76 @@ frame's header and is never a parameter.
 import inspect
 from abc import abstractmethod
 from copy import copy
+from functools import reduce
+from operator import or_
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling import FittableModel, InputParameterError, Parameter
+from astropy.modeling import CompoundModel, FittableModel, InputParameterError, Model, Parameter
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, blank, rotation_generator, turn
 from astropolcal.optics._modelling import (
-    KeywordOnly,
+    OpticParameter,
+    OwnUnits,
+    Setting,
     add_parameters,
     deep_copied,
-    joined,
     values_text,
 )
-from astropolcal.units import canonical_factor, length_to_um, mjd_of, to_unit
-from astropolcal.words import did_you_mean
+from astropolcal.optics.curves import curve_of
+from astropolcal.optics.positions import COORDINATES, PLACES, finite_position
+from astropolcal.units import canonical_factor, length_to_um, to_unit
+from astropolcal.words import did_you_mean, html
 
-__all__ = ["COORDINATES", "Optic"]
-
-#: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
-#: over the one in the frame before.
-FLUXES = ("flux", "total_flux", "previous_flux")
-
-#: By how much an angle changes from one frame to the next.
-RATES = ("parallactic_rate", "derotator_rate")
-
-#: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
-MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
-
-
-#: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
-#: Julian Date (UTC), and the place in the field.
-PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
-
-
-class _Coordinates(tuple):
-    """Names of positions that are numbers; ``PLACES`` and ``"COLUMN=STATE"`` are among them."""
-
-    __slots__ = ()
-
-    def __contains__(self, name):
-        known = tuple.__contains__(self, name) or name in PLACES
-        return known or (isinstance(name, str) and "=" in name)
-
-
-#: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
-#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
-#: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
-#: has that state and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian
-#: Date or `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
-COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
-
-
-def finite_position(value, name, stage=None):
-    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
-    stage = stage or name
-    if stage == "time":
-        return mjd_of(value, name)
-    position = to_unit(value, PLACES.get(stage) if stage in COORDINATES else u.rad, name)
-    if not np.all(np.isfinite(position)):
-        raise ParameterError(f"{name} = {value} must be finite")
-    return position
-
+__all__ = ["Optic"]
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
 
 # a fit may pass a bound by so much
 _ROUNDING = 1e-9
+
+
+def joined(left, right):
+    """Return ``left | right`` of two models as a chain."""
+    return Chain("|", left, right) if isinstance(right, Model) else NotImplemented
+
+
+class KeywordOnly(type(FittableModel)):
+    """Keeps astropy from giving each optic an ``__init__`` with positional parameters."""
+
+    def __init__(cls, name, bases, members, **kwargs):
+        # astropy's metaclass writes an __init__ for every class whose members have none
+        super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
+        # and its own ``|`` into every class
+        cls.__or__ = joined
+        for parameter in cls._parameters_.values():
+            if type(parameter) is Parameter:
+                parameter.__class__ = OpticParameter
+                if any(isinstance(bound, u.Quantity) for bound in parameter.bounds):
+                    parameter.bounds = parameter.bounds
+        # those of the bases first
+        cls._declared_settings = {
+            key: setting
+            for base in reversed(cls.__mro__)
+            for key, setting in vars(base).items()
+            if isinstance(setting, Setting)
+        }
+        # every keyword that the optic takes, with its default
+        found = {}
+        # theta is declared first, in the base, and is what a user gives last
+        for key in (*cls.param_names[1:], "theta"):
+            parameter = inspect.getattr_static(cls, key)
+            unit = parameter.unit
+            found[key] = parameter.default if unit is None else parameter.default * unit
+        found |= {key: setting.default for key, setting in cls._declared_settings.items()}
+        for base in cls.__mro__:
+            if isinstance(base, KeywordOnly):
+                found |= getattr(base.__init__, "__kwdefaults__", None) or {}
+        kind = inspect.Parameter.KEYWORD_ONLY
+        cls.__signature__ = inspect.Signature(
+            [inspect.Parameter(key, kind, default=default) for key, default in found.items()]
+        )
 
 
 class Optic(FittableModel, metaclass=KeywordOnly):
@@ -649,8 +651,6 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         >>> found.w_sio2.quantity.round(4)
         <Quantity 1.65 mm>
         """
-        from astropolcal.optics.curves import curve_of
-
         return curve_of(self, [self], what, element, against, wavelength, **positions)
 
     def with_parameters(self, **values):
@@ -819,3 +819,81 @@ def with_value(parameter, value):
 
 def _singular(matrix):
     return np.any(np.linalg.cond(matrix) > 1e12)
+
+
+# ---- chains --------------------------------------------------------------------------------------
+
+
+class Chain(OwnUnits, CompoundModel):
+    """
+    What ``|`` makes of optics, and of optics and other models of astropy.
+
+    Any of astropy's fitters takes one of one input and one output. Its parameters keep their units
+    in a fit, and their values are numbers in these.
+    """
+
+    def without_units_for_data(self, **data):
+        """Return the chain as a fitter takes it: itself, once data and parameters are checked."""
+        for key in self.param_names:
+            if np.size(getattr(self, key).value) > 1:
+                raise ParameterError(
+                    f"{key} has one value per wavelength, and no fitter of astropy takes a model "
+                    "with such a parameter, not even a fixed one; astropolcal.calibrate does"
+                )
+        inputs = [
+            data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
+            for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()
+        ]
+        outcome = self(*inputs)
+        key = self.outputs[0]
+        given, own = (getattr(value, "unit", u.one) for value in (data[key], outcome))
+        if isinstance(data[key], u.Quantity) and given != own:
+            raise ParameterError(
+                f"{key} is in {given}, but the chain gives {str(own) or 'plain numbers'}"
+            )
+        return self
+
+    def __setattr__(self, attr, value):
+        if attr in (self.__dict__.get("_param_names") or ()):
+            # the optic checks value and unit
+            index, key = self._param_map[attr]
+            setattr(self._leaflist[index], key, value)
+        else:
+            super().__setattr__(attr, value)
+
+    def __iter__(self):
+        return iter(self._leaflist)
+
+    def _repr_html_(self):
+        from astropy.table import Table
+
+        rows = [
+            (i, m.name or "", type(m).__name__, getattr(m, "mount", None) or "", values_text(m))
+            for i, m in enumerate(self)
+        ]
+        names = ("place", "name", "kind", "mount", "parameters")
+        return html(" | ".join(row[1] or row[2] for row in rows), Table(rows=rows, names=names))
+
+    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
+        """Return a model of one input that draws what the chain does; see `Optic.curve`."""
+        return curve_of(self, list(self), what, element, against, wavelength, **positions)
+
+    def __getitem__(self, index):
+        if not isinstance(index, slice):
+            return super().__getitem__(index)
+        # astropy finds only what is one branch of its tree
+        models = self._leaflist[self._whole(index)]
+        if index.step not in (None, 1) or not models:
+            raise ChainError(f"no optics at {index} of a chain of {len(self._leaflist)}")
+        return reduce(or_, models)
+
+    def _whole(self, index):
+        """Return a slice by number; a name as its stop is the last optic, as astropy has it."""
+        start, stop = (
+            self._str_index_to_int(end) if isinstance(end, str) else end
+            for end in (index.start, index.stop)
+        )
+        return slice(start, stop + 1 if isinstance(index.stop, str) else stop)
+
+
+Chain.__or__ = joined

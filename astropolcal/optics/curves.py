@@ -12,7 +12,7 @@ import numpy as np
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.mueller import inverse, plane, turned
 from astropolcal.optics._modelling import ScalarParameters
-from astropolcal.optics.core import COORDINATES, finite_position
+from astropolcal.optics.positions import COORDINATES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 

@@ -15,7 +15,7 @@ from astropy.modeling.polynomial import Polynomial1D, Polynomial2D, PolynomialMo
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics._modelling import OpticParameter, with_values
-from astropolcal.optics.core import COORDINATES, FLUXES, PLACES
+from astropolcal.optics.positions import COORDINATES, FLUXES, PLACES
 from astropolcal.units import canonical_factor, iso_date, mjd_of, to_unit
 
 __all__ = []

@@ -36,7 +36,7 @@ from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import numeric_column
-from astropolcal.optics.core import PLACES
+from astropolcal.optics.positions import PLACES
 
 __all__ = []
 

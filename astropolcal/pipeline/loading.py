@@ -34,7 +34,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.fitscheck import primary_header
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.core import PLACES, finite_position
+from astropolcal.optics.positions import PLACES, finite_position
 from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,

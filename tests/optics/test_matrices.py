@@ -24,7 +24,7 @@ from astropolcal.mueller import (
     turn,
 )
 from astropolcal.optics import OPTICS
-from astropolcal.optics.core import COORDINATES, FLUXES, MOVES, RATES, finite_position
+from astropolcal.optics.positions import COORDINATES, FLUXES, MOVES, RATES, finite_position
 
 MATRIX = arrays(float, (4, 4), elements=st.floats(-1, 1))
 ANGLE = st.floats(-3, 3)

@@ -1,0 +1,56 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Positions at which a frame was taken: angles of stages, and what else optics and laws depend on.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import mjd_of, to_unit
+
+__all__ = ["COORDINATES"]
+
+#: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
+#: over the one in the frame before.
+FLUXES = ("flux", "total_flux", "previous_flux")
+
+#: By how much an angle changes from one frame to the next.
+RATES = ("parallactic_rate", "derotator_rate")
+
+#: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
+MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
+
+
+#: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
+#: Julian Date (UTC), and the place in the field.
+PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
+
+
+class _Coordinates(tuple):
+    """Names of positions that are numbers; ``PLACES`` and ``"COLUMN=STATE"`` are among them."""
+
+    __slots__ = ()
+
+    def __contains__(self, name):
+        known = tuple.__contains__(self, name) or name in PLACES
+        return known or (isinstance(name, str) and "=" in name)
+
+
+#: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
+#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
+#: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
+#: has that state and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian
+#: Date or `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
+COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
+
+
+def finite_position(value, name, stage=None):
+    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
+    stage = stage or name
+    if stage == "time":
+        return mjd_of(value, name)
+    position = to_unit(value, PLACES.get(stage) if stage in COORDINATES else u.rad, name)
+    if not np.all(np.isfinite(position)):
+        raise ParameterError(f"{name} = {value} must be finite")
+    return position
