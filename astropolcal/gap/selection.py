@@ -20,7 +20,7 @@ from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
 from astropolcal.gap.cells import Cell, count_runs, split_run
-from astropolcal.gap.shrinkage import foreseen, frame_groups, stability
+from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
 
@@ -372,7 +372,8 @@ def _apart(task, first):
     for i, name in enumerate(first.probes.runs):
         task.say(f"{name} by itself")
         alone = base.of_dataset(i)
-        groups = None if task.groups is None else frame_groups(alone.observations)
+        # of groups of all runs those that it has: by itself it may have too few
+        groups = task.groups and (task.groups[0], [task.groups[1][i]])
         alone = _Task(alone, [], True, groups, task.say)
         state = _search(alone, _State(alone.base), _scanned(alone.base, [], True), _MOST)
         of_all = [first.probes.run_of(one.cell) is None for one in state.chosen]
