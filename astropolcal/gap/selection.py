@@ -39,7 +39,7 @@ _NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 10.0
 _MOST = 8
-# for each of several runs together
+# of several runs together, for each run
 _MOST_TOGETHER = 10
 # what a nominal model has of an optic that turns
 _OF_OPTIC = ("retardance_h", "retardance_d", "rotation")
@@ -395,19 +395,16 @@ def _apart(task, first):
 def _needed(model, causes):
     """Return those causes of a model that have evidence beside the others, the least dropped."""
     temper, left, dropped = max(1.0, model.mean_square), list(causes), []
-
-    def evidence(one):
-        lost = model.without([*dropped, one.name]).chi2 - model.without(dropped).chi2
-        return 0.5 * lost / temper - one.cost(temper)
-
     # one at a time: of two that do the same, the other is needed once the first is gone
     while left:
-        found = {one.name: evidence(one) for one in left}
-        least = min(found, key=found.get)
-        if found[least] > ENOUGH:
+        now = model.without(dropped).chi2
+        lost = [model.without([*dropped, one.name]).chi2 - now for one in left]
+        pairs = zip(lost, left, strict=True)
+        evidence = [0.5 * more / temper - one.cost(temper) for more, one in pairs]
+        least = int(np.argmin(evidence))
+        if evidence[least] > ENOUGH:
             break
-        dropped.append(least)
-        left = [one for one in left if one.name != least]
+        dropped.append(left.pop(least).name)
     return left
 
 
@@ -418,9 +415,9 @@ def _nominal_changes(first):
     own = [place for place in places if place.startswith("in:")]
     # the angle of an optic is one number, what a model has per wavelength is free there
     slots = probes.problem.free.slots
-    bends = {f"in:{slot.name.split('.')[0]}" for slot in slots if slot.per_wavelength}
+    varied = {f"in:{slot.name.partition('.')[0]}" for slot in slots if slot.per_wavelength}
     kinds = [
-        (place, kind, 2 if kind == "rotation" and place not in bends else None)
+        (place, kind, 2 if kind == "rotation" and place not in varied else None)
         for place in own
         for kind in _OF_OPTIC
     ]
