@@ -600,7 +600,7 @@ def add_to_library(folder, number, same, out):
         out.put((number, repr(error)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("same", [False, True])
 def test_several_processes_add_to_one_library(tmp_path, same):
     calibration()

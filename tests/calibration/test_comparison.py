@@ -165,7 +165,7 @@ def drawn(calibration, n, seed=1):
     return np.array(found)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_errors_are_the_scatter_over_the_covariance(calibration):
     table = compare([calibration])
     scatter = drawn(calibration, 100).std(axis=0)

@@ -104,7 +104,7 @@ def test_errors_are_as_large_as_the_deviations():
     assert wrong <= 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ten_years_of_a_recoating_a_drift_and_a_replaced_plate_are_told_apart():
     chains = [
         CHARIS.chain(source, derotator="linear", wavelength=GRID)

@@ -234,7 +234,7 @@ def test_linear_normal_posterior(linear):
     assert abs(correlation) < 5 * (posterior.autocorrelation_times.max() / (32 * 1100)) ** 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_linear_normal_posterior_with_a_prior():
     prior = (0.78, 0.005)
     cal = make_calibration(False, wollaston__efficiency=Normal(*prior))
