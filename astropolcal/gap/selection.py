@@ -19,7 +19,7 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
-from astropolcal.gap.cells import Cell, count_runs, split_run
+from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -48,31 +48,29 @@ _OF_OPTIC = ("retardance_h", "retardance_d", "rotation")
 _WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
-# but this, where the freedom of the best costs more (log evidence): two simple ones may do better
-_HALF, _DEAR = 0.5, 30.0
+# of a single cause with more freedom than this (log evidence) two simple ones may do better
+_DEAR = 30.0
 # the evidence ranks sets of at most so many causes, if these leave more than noise
 _BY_EVIDENCE = 2
 # names are asked for beside so many causes
 _NAMES = 2
-# and so many times as many where all of these are impossible
-_MORE = 3
+# of so many of the best rivals those that have names are asked for
+_AMONG = 12
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
-# a rival whose statistic is as near as this share is fitted in full, where it is as large as that
-_NEAR, _BENT = 0.03, 500.0
-# and so is one that needs a size so many times as far from the usual
+# a rival that needs a size so many times as far from the usual is fitted in full
 _FAR = 3.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
-# needs: of three, 12 of 54 causes were right in 934 challenges, of four 1 of 12, of more 2 of 69
-_UNLISTED = (0.0, 0.02, 0.08, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
-# the same where one of several causes is not asked for in every part of the data: of two such, 22
-# of 48 causes were right in another 1,000 challenges, of two stable ones 175 of 188
+# needs: of two that differ 433 of 438 causes were right in 680 challenges, of three 12 of 54 in
+# another 934, of four 1 of 12, of more 2 of 69
+_UNLISTED = (0.0, 0.02, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
+# the same where both of two causes are of a kind, and where they are at the same place too, so that
+# one thing changes in a way that no table has: 85 of 106 and 11 of 26 such causes were right
+_OF_A_KIND, _ONE_THING = 0.18, 0.55
+# the same where one of several causes is not asked for in every part of the data: 23 of 52
 _SHAKY = 0.5
-# and where both of two causes turn the polarization and change with time, as an axis that wanders
-# does: 6 of 18 such causes were right in 3,400 challenges
-_WANDERING, _TURNS_IT, _WITH_TIME = 0.65, ("rotation", "depolarization_d"), ("time", "step")
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # correlations of neighbours above so many standard errors are real
@@ -433,7 +431,7 @@ def _nominal_changes(first):
 
 def _search(task, best, first, most_causes):
     """Return the best set of causes."""
-    states, spare, known = [best], [], {} if best.chosen else {best.outline: first}
+    states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
         task.say(f"looking for cause {k + 1}, at most {most_causes}")
@@ -442,37 +440,26 @@ def _search(task, best, first, most_causes):
         width, most = (part[min(step, len(part) - 1)] for part in (_WIDTH, _FITTED))
         least = best.evidence + ENOUGH
         fitted = _extensions(task, states, known, most, least)
-        # what led may be at its end where another set is not
-        fitted = fitted or _extensions(task, spare, known, most, least)
         if not fitted:
             break
         is_doubtful = task.groups and k >= _BY_EVIDENCE
         fitted = _by_left_out_frames(fitted, least, task.groups) if is_doubtful else fitted
-        best, states, spare = fitted[0], fitted[:width], fitted[width:] if is_doubtful else []
+        best, states = fitted[0], fitted[:width]
         if best.model.p_value > REMAINDER and not best.is_dear:
             # what is left may be noise: one look beside the best set will tell
-            states, spare = states[:1], []
+            states = states[:1]
     return best
 
 
 def _extensions(task, states, known, most, least):
     """Return sets with one cause more that have enough evidence, fitted in full, best first."""
-    if not states:
-        return []
     k = len(states[0].chosen)
     # what takes many causes has no names; they are asked for once more at the end
     names = task.library if k <= _NAMES or not task.cells else ()
     for state in states:
         if state.outline not in known:
             known[state.outline] = _scanned(state.model, names, task.cells)
-    instead, fitted = partial(_in_place, replace(task, library=names)), []
-    for several in (most, _MORE * most):
-        # what is impossible is passed over, and is not the end of the search
-        grown = _grown(states, known, several)
-        fitted = _fitted(grown[:most] if several == most else grown[most:], instead)
-        if fitted:
-            break
-    fitted.sort(key=preference)
+    fitted = sorted(_fitted(_grown(states, known, most)[:most]), key=preference)
     return fitted if fitted and fitted[0].evidence >= least else []
 
 
@@ -489,14 +476,13 @@ def _by_left_out_frames(states, least, groups):
     return sorted(enough, key=lambda state: foreseen(state.model, groups).typical_percent)
 
 
-def _fitted(grown, instead):
+def _fitted(grown):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
-        share = _HALF if any(other.is_dear for other in found) else _PROMISING
-        if promised - state.evidence < share * (most - state.evidence):
+        if promised - state.evidence < _PROMISING * (most - state.evidence):
             break
-        one = _extended(promised, state, added, instead)
+        one = _extended(promised, state, added)
         if one is not None:
             found.append(one)
             most = max(most, one.evidence)
@@ -529,20 +515,15 @@ def _continuations(found, most):
     return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
 
 
-def _extended(evidence, state, added, instead):
-    """Return a set with more causes, fitted in full, None where that is impossible."""
+def _extended(evidence, state, added):
+    """Return a set with more causes, fitted in full, None where one is of impossible size."""
     model = state.model.with_effects([one.recipe for one in added], **_QUICK)
     chosen = [*state.chosen, *added]
     # what the full fit gains over the linear promise
     gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
     evidence += 0.5 * gained / max(1.0, model.mean_square)
-    impossible = [one for one in chosen if not model.is_physical(one.name)]
-    if not impossible:
-        return _State(model, chosen, evidence)
-    if impossible[0] in added or len(impossible) > 1:
-        return None
-    # what was possible before is driven to its limit by what is added: another is in its place
-    return instead(impossible[0], _State(model, chosen, evidence))
+    possible = all(model.is_physical(one.name) for one in chosen)
+    return _State(model, chosen, evidence) if possible else None
 
 
 def _in_place(task, one, state):
@@ -625,7 +606,7 @@ def _rivals_beside(found, own, library):
     Each is a name where that does as well.
     """
     few = _best_of(found, _FITTED[1])
-    named = [one for one in _distinct(found.candidates, _MORE * _FITTED[1]) if one.is_named]
+    named = [one for one in _distinct(found.candidates, _AMONG) if one.is_named]
     few += [found.freer(one, named) for one in named[: _FITTED[-1]]]
     mine = [found.freer(one) for one in found.candidates if one.name == own.name][:1]
     names = [
@@ -660,8 +641,8 @@ def _unlisted(base, best, stable):
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
         prior = max(prior, _SHAKY)
-    if len(best.chosen) == 2 and all(_may_wander(one.cell) for one in best.chosen):
-        prior = max(prior, _WANDERING)
+    if len(best.chosen) == 2:
+        prior = max(prior, _if_alike(*(one.cell for one in best.chosen)))
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))
     after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size
@@ -670,12 +651,13 @@ def _unlisted(base, best, stable):
     return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
-def _may_wander(cell):
-    return (
-        cell is not None
-        and cell.kind in _TURNS_IT
-        and split_run(cell.dependence)[0].startswith(_WITH_TIME)
-    )
+def _if_alike(one, other):
+    """Return the probability that two causes are one that no table has, from what they are."""
+    if one is None or other is None:
+        return 0.0
+    stems = {cell.kind.partition("_")[0] for cell in (one, other)}
+    same = (one.place, one.kind) == (other.place, other.kind)
+    return _ONE_THING if same else _OF_A_KIND if len(stems) == 1 else 0.0
 
 
 def _grouped(task, best, steps, scans, unlisted, stable):
@@ -731,10 +713,9 @@ def _members(chosen, beside, loss):
         weight = np.exp(min(one.evidence - top, 0.0))
         # where nothing but the usual sizes tells two apart, the data do not
         is_same = one.rank <= own.rank and one.statistic >= (1 - _SAME) * promised
-        is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
         is_far = (is_same or weight >= _ALIAS) and one.size > farthest
-        if loss is not None and (is_bent or is_far):
-            # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
+        if loss is not None and is_far:
+            # at a size far from usual derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
                 known[key] = 0.5 * loss(one) / beside.temper
