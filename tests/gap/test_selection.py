@@ -159,6 +159,18 @@ def test_what_is_alike_with_a_law_is_alike_without_one():
     assert [one.cell.place for one, _ in members] == ["source", "telescope", "after:hwp"]
 
 
+@pytest.mark.slow
+def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
+    """An axis that wanders looks like two errors of its encoder."""
+    made = make_challenge(7, kind="mechanism", snr=25, fault={"what": "wander"})
+    observations, chains, case = made
+    diagnosis = diagnose(chains, observations)
+    assert {cause.cell.kind for cause in diagnosis.causes} == {"rotation"}
+    assert len(diagnosis.causes) == 2
+    assert max(cause.probability for cause in diagnosis.causes) < 0.5
+    assert score_answer(case, to_dict(diagnosis)) == "right"
+
+
 @pytest.mark.long
 def test_pairs_that_a_greedy_search_gets_wrong():
     """Two of three causes that are one, and one of much freedom in place of two simple ones."""
