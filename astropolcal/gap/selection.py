@@ -48,8 +48,8 @@ _OF_OPTIC = ("retardance_h", "retardance_d", "rotation")
 _WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
-# of a single cause with more freedom than this (log evidence) two simple ones may do better
-_DEAR = 30.0
+# but this, where the freedom of the best costs more (log evidence): two simple ones may do better
+_HALF, _DEAR = 0.5, 30.0
 # the evidence ranks sets of at most so many causes, if these leave more than noise
 _BY_EVIDENCE = 2
 # names are asked for beside so many causes
@@ -480,7 +480,8 @@ def _fitted(grown):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
-        if promised - state.evidence < _PROMISING * (most - state.evidence):
+        share = _HALF if any(other.is_dear for other in found) else _PROMISING
+        if promised - state.evidence < share * (most - state.evidence):
             break
         one = _extended(promised, state, added)
         if one is not None:
