@@ -133,7 +133,7 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("data", help="folder of the published tables")
     parser.add_argument("docs", help="folder of the table")
-    parser.add_argument("--count", type=int, default=120, help="challenges")
+    parser.add_argument("--count", type=int, default=90, help="challenges")
     arguments = parser.parse_args(arguments)
     os.environ["OMP_NUM_THREADS"] = "1"
     jobs = [(number, rule) for number in _RUNS for rule in RULES]
