@@ -205,6 +205,8 @@ class Place:
 
 
 _KEEPS = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)
+# frame optics that mix what they get in every state
+_MODULATES = (optics.FerroelectricLiquidCrystal, optics.StateRetarder)
 
 
 def places(chain):
@@ -227,9 +229,14 @@ def places(chain):
             out.append(Place(f"in:{optic.name}", None, optic.name, optic.mount, theta))
             out.append(Place(f"after:{optic.name}", None, optic.name))
         # one that is static and mixes what it gets makes the place downstream of it another one
-        elif optic.stage is None and not isinstance(optic, _KEEPS) and optic in between:
+        elif optic in between and _mixes(optic):
             out.append(Place(f"after:{optic.name}", None, optic.name))
     return out
+
+
+def _mixes(optic):
+    is_static = optic.stage is None and not isinstance(optic, _KEEPS)
+    return is_static or isinstance(optic, _MODULATES)
 
 
 # ---- dependences -------------------------------------------------------------------------------
