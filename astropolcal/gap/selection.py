@@ -29,7 +29,7 @@ _RETEMPERED = 400
 # fits on the way to the answer need not be carried to the end
 _QUICK = {"steps": 24, "share": 1e-3}
 # of so many causes two may be one that was not seen while the others were missing
-_MERGED = (3, 4)
+_MERGED = (2, 4)
 # log evidence by which a name may be behind its cell, and a rival has to be ahead
 _AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
@@ -60,7 +60,9 @@ _AMONG = 12
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
-# a rival that needs a size so many times as far from the usual is fitted in full
+# a rival whose statistic is as near as this share is fitted in full, where it is as large as that
+_NEAR, _BENT = 0.03, 500.0
+# and so is one that needs a size so many times as far from the usual
 _FAR = 3.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs: of two that differ 433 of 438 causes were right in 680 challenges, of three 12 of 54 in
@@ -714,9 +716,10 @@ def _members(chosen, beside, loss):
         weight = np.exp(min(one.evidence - top, 0.0))
         # where nothing but the usual sizes tells two apart, the data do not
         is_same = one.rank <= own.rank and one.statistic >= (1 - _SAME) * promised
+        is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
         is_far = (is_same or weight >= _ALIAS) and one.size > farthest
-        if loss is not None and is_far:
-            # at a size far from usual derivatives do not tell what is alike
+        if loss is not None and (is_bent or is_far):
+            # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
                 known[key] = 0.5 * loss(one) / beside.temper
