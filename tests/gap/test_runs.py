@@ -21,6 +21,7 @@ from astropolcal.gap.runs import changes, distinct, paragraph
 from astropolcal.optics import LinearRetarder, Perturbation
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.scripts.main import main
+from astropolcal.simulation import half_wave_plate_cycles
 
 JULY, OCTOBER = "July: 15", "October 5"
 
@@ -234,8 +235,8 @@ def test_a_perturbation_keeps_its_run():
     assert one.mount == "sequence"
 
 
-@pytest.mark.long
-def test_two_runs_are_described_together_as_well_as_apart():
+def two_runs(*tables, flux=1e6):
+    """Return a run of July and one of October, with three faults each."""
     planted = {
         JULY: [
             ("detector", "gain", "constant", 0.02),
@@ -258,7 +259,26 @@ def test_two_runs_are_described_together_as_well_as_apart():
             for key in ("horizontal", "circular"):
                 parameter = getattr(derotator, key)
                 parameter.value = parameter.value + rng.normal(0, 3, 7)
-        runs.append(data.observed(with_cell(*cells, chain=chain), seed=seed, name=name))
+        options = {"name": name, "flux": flux, "table": tables[seed - 3] if tables else None}
+        runs.append(data.observed(with_cell(*cells, chain=chain), seed=seed, **options))
+    return runs
+
+
+@pytest.mark.long
+def test_runs_of_two_derotator_angles_each_are_described_together():
+    """By itself neither has enough of them to leave one out."""
+    angles = [45, 70] * u.deg, [95, 120] * u.deg
+    plate = [0, 22.5, 45, 67.5] * u.deg
+    runs = two_runs(*(half_wave_plate_cycles(plate, derotator=a) for a in angles), flux=1e10)
+    found = diagnose(instruments.get("charis").chain(wavelength=data.WAVELENGTH), runs)
+    assert found.verdict == "unexplained"
+    assert found.improved.mean_square < 0.1 * found.nominal.mean_square
+    assert len(found.causes) > 4
+
+
+@pytest.mark.long
+def test_two_runs_are_described_together_as_well_as_apart():
+    runs = two_runs()
     nominal = instruments.get("charis").chain(wavelength=data.WAVELENGTH)
     apart = [diagnose(nominal, run).gap_after_percent for run in runs]
     found = diagnose(nominal, runs)
