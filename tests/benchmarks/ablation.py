@@ -26,7 +26,7 @@ from astropolcal.gap.challenge import make_challenge, score_answer
 RULES = {
     "all rules": {},
     "several sets side by side": {"selection._WIDTH": (1,)},
-    "only promising sets are fitted": {"selection._PROMISING": -np.inf},
+    "only promising sets are fitted": {"selection._PROMISING": 0.0},
     "one cause with much freedom is weighed against two": {"selection._DEAR": np.inf},
     "two of up to four causes are tried as one": {"selection._MERGED": (99, 4)},
     "more than two causes are ranked by left-out frames": {"selection._BY_EVIDENCE": 99},

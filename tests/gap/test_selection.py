@@ -1,9 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The choice of causes: planted cells are found, with their place and a probability."""
 
+import importlib
+import runpy
+from pathlib import Path
+
 import gap_data as data
 import numpy as np
 import pytest
+from astropy.table import Table
 from gap_setups import SETUPS
 
 from astropolcal.gap._numbers import Fitted
@@ -171,6 +176,17 @@ def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
     assert len(diagnosis.causes) == 2
     assert max(cause.probability for cause in diagnosis.causes) < 0.5
     assert score_answer(case, to_dict(diagnosis)) == "right"
+
+
+def test_the_table_of_the_rules_is_that_of_the_benchmark():
+    repository = Path(__file__).resolve().parents[2]
+    script = runpy.run_path(str(repository / "tests" / "benchmarks" / "ablation.py"))
+    table = Table.read(repository / "docs" / "challenge_rules.csv", format="csv")
+    assert list(table["Without the rule"]) == list(script["RULES"])
+    for constants in script["RULES"].values():
+        for path in constants:
+            module, _, name = path.partition(".")
+            assert hasattr(importlib.import_module(f"astropolcal.gap.{module}"), name), path
 
 
 @pytest.mark.long
