@@ -19,7 +19,7 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
-from astropolcal.gap.cells import Cell, count_runs
+from astropolcal.gap.cells import Cell, count_runs, split_run
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -656,7 +656,9 @@ def _unlisted(base, best, stable):
 
 def _if_alike(one, other):
     """Return the probability that two causes are one that no table has, from what they are."""
-    if one is None or other is None:
+    # what is in one run has nothing to do with what is in another
+    runs = {split_run(cell.dependence)[1] for cell in (one, other) if cell is not None}
+    if one is None or other is None or len(runs - {None}) > 1:
         return 0.0
     stems = {cell.kind.partition("_")[0] for cell in (one, other)}
     same = (one.place, one.kind) == (other.place, other.kind)
