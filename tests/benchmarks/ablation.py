@@ -48,8 +48,11 @@ RULES = {
         "selection._NEAR": -1.0,
     },
     "many causes are one that no table has": {"selection._UNLISTED": (0.0, *[0.02] * 8)},
-    "two of a kind are": {"selection._OF_A_KIND": 0.0, "selection._ONE_THING": 0.0},
-    "two that are not in all parts of the data are": {"selection._SHAKY": 0.0},
+    "two of a kind are one that no table has": {
+        "selection._OF_A_KIND": 0.0,
+        "selection._ONE_THING": 0.0,
+    },
+    "two not in all parts of the data are one that no table has": {"selection._SHAKY": 0.0},
     "what is left lowers all probabilities": {"selection._LEFT": np.inf},
     "noise is measured again beside the causes": {"diagnosis._TOO_QUIET": -1.0},
 }
