@@ -55,17 +55,14 @@ def _draw_gap(axes, diagnosis):
     )
     axes.fill_between(*floor, color="0.85", label="noise")
     axes.semilogy(*before, "s--", color=VERMILION, markerfacecolor="none", label="derotator linear")
-    axes.semilogy(*after, "o-", color=BLUE, label="with both causes")
+    axes.semilogy(*after, "o-", color=BLUE, label="with this cause")
     axes.set(title="3. Diagnose: what a model lacks", ylabel="gap (%)", xlabel="wavelength (nm)")
     axes.set_ylim(bottom=0.02)
     axes.set_yticks([0.1, 1], ["0.1", "1"])
-    words = {
-        "derotator_45_retardance": "45° retardance",
-        "derotator_circular_retardance": "circular retardance",
-    }
-    causes = "\n".join(f"{words[c.name]}: {100 * c.probability:.0f} %" for c in diagnosis.causes)
+    (cause,) = diagnosis.causes
+    named = {"derotator_elliptical_retardance": "45° and circular\nretardance"}[cause.name]
     axes.legend(
-        title=f"derotator lacks\n{causes}\n",
+        title=f"derotator lacks\n{named}: {100 * cause.probability:.0f} %\n",
         loc="center left",
         bbox_to_anchor=(1, 0.5),
         title_fontproperties={"weight": "bold", "size": 10},
