@@ -228,7 +228,7 @@ def places(chain):
             theta = float(np.deg2rad(np.mean(optic.theta.value)))
             out.append(Place(f"in:{optic.name}", None, optic.name, optic.mount, theta))
             out.append(Place(f"after:{optic.name}", None, optic.name))
-        # one that is static and mixes what it gets makes the place downstream of it another one
+        # one that does not turn and mixes what it gets makes the place downstream another one
         elif optic in between and _mixes(optic):
             out.append(Place(f"after:{optic.name}", None, optic.name))
     return out
