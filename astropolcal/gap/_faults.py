@@ -10,7 +10,23 @@ from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.words import check_choice
 
 _FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
-_MECHANISMS = ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes")
+_MECHANISMS = (
+    "smear", "ghost", "hysteresis", "wander", "jitter", "fringes", "course", "stray light",
+    "crosstalk",
+)  # fmt: skip
+# of these the angle of a stage is wrong
+_MOVED = ("hysteresis", "wander", "jitter")
+# what a perturbation does through a run where no table has it: t from 0 to 1, angle of a stage,
+# angles of both, a phase, a number from 0 to 1, and a random walk of unit steps
+_COURSES = {
+    "swings": lambda t, s, both, phase, x, walk: np.cos(2 * np.pi * (2 + 2 * x) * t + phase),
+    "settles": lambda t, s, both, phase, x, walk: np.exp(-t / (0.1 + 0.3 * x)),
+    "for a while": lambda t, s, both, phase, x, walk: (x / 2 < t) & (t < x / 2 + 0.3),
+    "two states": lambda t, s, both, phase, x, walk: np.sign(walk),
+    "both stages": lambda t, s, both, phase, x, walk: np.cos(both[0] + phase) * np.cos(both[1]),
+    "third harmonic": lambda t, s, both, phase, x, walk: np.cos(3 * s + phase),
+    "bends": lambda t, s, both, phase, x, walk: np.abs(np.sin(s + phase)),
+}
 # the largest size: radian, or a share
 _LARGEST, _LARGEST_SHARE = 0.2, 0.3
 # what the nominal model takes up leaves less than this share of itself
@@ -95,11 +111,25 @@ class Fault:
         what = self._choose("what", _MECHANISMS)
         self.largest = _LARGEST_SHARE
         self.stage = str(rng.choice(("hwp", "derotator")))
-        if what in ("hysteresis", "wander", "jitter"):
+        if what in _MOVED:
             self.told["stage"] = self.stage
             self._angles = [self._wandering(clean, rng) for clean in self.bench.clean]
         elif what == "ghost":
             self.told["optic"] = self.stage
+        elif what == "course":
+            self._choose("place", self.bench.places)
+            self._choose("kind", ACTIONS)
+            law, waves = self._smooth(rng), self._courses(rng)
+            self._shapes = [wave[:, None] * law for wave in waves]
+        elif what in ("stray light", "crosstalk"):
+            # of a reflection that turns with a stage
+            self.told["stage"], phase = self.stage, rng.uniform(0, 2 * np.pi)
+            turn, law = rng.choice((1, 2)), self._smooth(rng)
+            angles = [clean.position(self.stage) for clean in self.bench.clean]
+            self._shapes = [
+                (1 + np.cos(turn * angle[:, None] + phase)) * (1 + 0.3 * law) / 2
+                for angle in angles
+            ]
         elif what == "fringes":
             self.told["place"] = str(rng.choice(self.bench.places[2:]))
             self.told["kind"] = str(rng.choice(("retardance_h", "diattenuation_h")))
@@ -107,6 +137,25 @@ class Fault:
             turn = rng.choice((1, 2, 4))
             angles = [clean.position(self.stage) for clean in self.bench.clean]
             self._shapes = [np.cos(phase + turn * angle[:, None]) for angle in angles]
+
+    def _smooth(self, rng):
+        """Return a random law in wavelength; its largest value is one."""
+        n = self.bench.law.shape[1]
+        law = self.bench.law @ (rng.normal(0, 1, n) / (1 + np.arange(n)))
+        return law / np.abs(law).max()
+
+    def _courses(self, rng):
+        """Return what no dependence of the table is through each run, the largest of them one."""
+        course, phase = self._choose("course", _COURSES), rng.uniform(0, 2 * np.pi)
+        self.told["stage"], number, found = self.stage, rng.random(), []
+        for clean in self.bench.clean:
+            both = [clean.position(stage) for stage in ("hwp", "derotator")]
+            time, walk = np.linspace(0, 1, clean.n_frames), rng.normal(0, 1, clean.n_frames)
+            wave = _COURSES[course](
+                time, clean.position(self.stage), both, phase, number, np.cumsum(walk)
+            )
+            found.append(np.asarray(wave, dtype=float))
+        return [wave / max(np.abs(wave).max() for wave in found) for wave in found]
 
     def _wandering(self, clean, rng):
         """Return errors of an angle through a run, the largest one."""
@@ -151,14 +200,14 @@ class Fault:
     def kicks(self, dataset):
         """Return place, kind and exponents (F, W) of small Mueller matrices."""
         told = self.told
-        if told["type"] == "cell" or told.get("what") == "fringes":
+        if told["type"] == "cell" or told.get("what") in ("fringes", "course"):
             return [(told["place"], told["kind"], self.amplitude * self._shapes[dataset])]
         return []
 
     def moves(self, dataset):
         """Return errors of the angles of stages, radian."""
         told = self.told
-        if told["type"] == "mechanism" and "stage" in told:
+        if told.get("what") in _MOVED:
             return {told["stage"]: self.amplitude * self._angles[dataset]}
         if told["type"] != "frame" or dataset != self.place or "angle" not in told["what"]:
             return {}
@@ -191,6 +240,11 @@ class Fault:
             return flux + np.array(beams)[:, None, None] * added
         if told.get("what") == "ghost":
             return flux + self.amplitude * bench.path(dataset, skip=told["optic"])
+        if told.get("what") in ("stray light", "crosstalk"):
+            # light of nowhere in one beam, or of each beam in the other
+            stray = told["what"] == "stray light"
+            other = np.array([np.median(flux), 0])[:, None, None] if stray else flux[::-1]
+            return flux + self.amplitude * self._shapes[dataset] * other
         if told["type"] != "frame" or dataset != self.place or "angle" in told["what"]:
             return flux
         flux, i, j = flux.copy(), told["frame"], told["with"]

@@ -14,7 +14,7 @@ from astropolcal.chain import system_mueller, with_beam
 from astropolcal.exceptions import GapError
 from astropolcal.gap import challenge
 from astropolcal.gap._bench import ACTIONS, Bench
-from astropolcal.gap._faults import Fault
+from astropolcal.gap._faults import _COURSES, _MECHANISMS, Fault
 from astropolcal.gap.challenge import (
     KINDS,
     ChallengeResult,
@@ -74,9 +74,14 @@ def test_each_kind_of_fault_stands_out_as_asked():
             assert fault["absorbed"] or fault["snr"] < 21, kind
         assert [one.name for one in data] == ["polarized", "unpolarized"]
         assert json.loads(json.dumps(case)) == case
-    for what in ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes"):
-        fault = {"what": what}
-        assert make_challenge(2, kind="mechanism", fault=fault, setup=LEAST)[2]["snr"] > 5, what
+    mechanisms = [{"what": what} for what in _MECHANISMS]
+    mechanisms += [
+        {"what": "course", "place": "source", "kind": "rotation", "course": course}
+        for course in _COURSES
+    ]
+    for fault in mechanisms:
+        case = make_challenge(2, kind="mechanism", fault=fault, setup=LEAST)[2]
+        assert case["snr"] > 5, fault
     for what in ("hwp angle", "derotator angle", "exchanged", "one beam"):
         fault = {"what": what, "frame": 4, "dataset": "polarized"}
         case = make_challenge(2, kind="frame", fault=fault, setup=LEAST)[2]
