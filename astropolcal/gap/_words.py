@@ -274,7 +274,7 @@ def sentences(content):
     """Return frames to distrust, what causes the gap, how large it is, and what is left."""
     faults = [fault["words"].rstrip(".") for fault in content["frames"]]
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
-    rest = (part(content) for part in (_what, _how_large, _what_is_left, _on_sky))
+    rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
     return [words for words in (first, *rest) if words]
 
 
@@ -297,7 +297,21 @@ def _what(content):
         text += f"none of the {content['n_effects']} causes that were tried explains the gap."
     where = content["where_left"] or content["where"]
     of = "what is left" if content["where_left"] else "the gap"
-    return f"{text} {where_words(where[0], of)}." if where else text
+    return f"{text} {where_words(where[0], of)}." if where and not _instead(content) else text
+
+
+def _instead(content):
+    """Return what one perturbation of any course does in place of the causes."""
+    found = [one for one in content["where"] if one["axis"] == "course"]
+    if not found or content["verdict"] == "none":
+        return ""
+    those = "this" if len(content["causes"]) == 1 else "these together"
+    other = found[-1]["detail"].partition(",")[0]
+    more = f" These data do not tell it from the same of {other}." if len(found) > 1 else ""
+    return (
+        f"It may be one thing instead: {found[0]['detail']}. That does as well as {those} and "
+        f"explains {share(found[0]['share'])} of the gap.{more}"
+    )
 
 
 def where_words(entry, of=None):

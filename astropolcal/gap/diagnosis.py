@@ -130,6 +130,9 @@ class Diagnosis:
         How it was asked.
     nested : HeldOut or None
         Errors on groups of frames that took no part in the choice of the causes.
+    courses : list of Course
+        Of which one may be in place of all causes: a perturbation whose course through the run no
+        dependence describes.
 
     Examples
     --------
@@ -157,6 +160,7 @@ class Diagnosis:
     frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
     nested: object = None
+    courses: list = field(default_factory=list)
     #: What `astropolcal.gap.report.to_dict` has worked out, None before it was asked.
     content: dict | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -392,6 +396,7 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
         seconds=time.perf_counter() - started,
         frames=frames,
         settings={"unlisted": selection.unlisted},
+        courses=selection.courses,
     )
 
 

@@ -114,7 +114,7 @@ def _worked_out(diagnosis):
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
-        "where": locate(nominal),
+        "where": [*_courses(diagnosis), *locate(nominal)],
         "where_left": [] if same or noisy else locate(improved),
         "left_share": 0.0 if noisy else left,
         "causes": causes,
@@ -139,6 +139,22 @@ def _nominal(model):
     chains = dict.fromkeys(" | ".join(leaf.name for leaf in leaves(c)) for c in model.chains)
     free = ", ".join(slot.name for slot in model.problem.free.slots)
     return f"{'; '.join(chains)}. Free: {free}"
+
+
+def _courses(diagnosis):
+    """Return what may be in place of all causes, as places where the gap lies."""
+    model = diagnosis.nominal
+    excess = max(model.fit.chi2 - model.linear.freedom, 1e-300)
+    return [
+        {
+            "axis": "course",
+            "detail": one.words,
+            "share": min(one.lowered / excess, 1.0),
+            "p_value": one.p_value,
+            "kind": "place",
+        }
+        for one in diagnosis.courses
+    ]
 
 
 def _double(fitted, before, after):

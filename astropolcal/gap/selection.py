@@ -14,12 +14,14 @@ from functools import partial
 from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.special import expit
 
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
-from astropolcal.gap.cells import Cell, count_runs, split_run
+from astropolcal.gap.cells import Cell, count_runs
+from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -68,9 +70,15 @@ _FAR = 3.0
 # needs: of two that differ 433 of 438 causes were right in 680 challenges, of three 12 of 54 in
 # another 934, of four 1 of 12, of more 2 of 69
 _UNLISTED = (0.0, 0.02, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
-# the same where both of two causes are of a kind, and where they are at the same place too, so that
-# one thing changes in a way that no table has: 85 of 106 and 11 of 26 such causes were right
-_OF_A_KIND, _ONE_THING = 0.18, 0.55
+# the same where one course that no table has does as well as several causes do together, and below
+# how many standard deviations it does: within 3 were 10 of 118 answers to pairs, all right, and 40
+# of 63 to mechanisms, of whose 80 causes 6 were right
+_ONE_COURSE, _AS_WELL = 0.65, 4.0
+# and where it does better than causes do, which were one or two: 22 more answers to mechanisms, of
+# whose 37 causes 4 were right, and none to pairs
+_BETTER_COURSE, _BETTER = 0.85, -3.0
+# from this probability on it is told
+_MAY_BE = 0.3
 # the same where one of several causes is not asked for in every part of the data: 23 of 52
 _SHAKY = 0.5
 # above this mean square the residuals are no noise
@@ -109,7 +117,8 @@ class Selection:
     The causes in the order in which they were added, and the model with all of them.
 
     ``scan`` is the evidence beside the base, ``unlisted`` the probability of a cause that no table
-    has, and ``history`` the errors on left-out frames of the base and after each cause.
+    has, and ``history`` the errors on left-out frames of the base and after each cause. One of the
+    ``courses`` may be in place of all causes; for several runs none is asked for.
     """
 
     groups: list
@@ -117,6 +126,7 @@ class Selection:
     scan: object
     unlisted: float
     history: list
+    courses: list = field(default_factory=list)
 
 
 @dataclass
@@ -182,9 +192,17 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best = _possible(task, best, scans)
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
-    unlisted = _unlisted(base, best, stable)
+    task.say("one perturbation of any course")
+    rivals = courses(best.model, [one.name for one in best.chosen]) if runs < 2 else []
+    chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
+    unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
-    return Selection(found, best.model, first, unlisted, history)
+    alike = [
+        one
+        for one, chance in zip(rivals, chances, strict=True)
+        if chance > _MAY_BE and one.behind < rivals[0].behind + 1
+    ]
+    return Selection(found, best.model, first, unlisted, history, alike)
 
 
 def _errors(model, groups):
@@ -633,7 +651,7 @@ def _gains(new, fresh, old, one):
     return lost < max(one.cost(scale) - fresh.cost(scale), 0.0) + _CLEARLY
 
 
-def _unlisted(base, best, stable):
+def _unlisted(base, best, stable, instead):
     """
     Return the probability that the gap has a cause that no table has.
 
@@ -644,8 +662,7 @@ def _unlisted(base, best, stable):
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
         prior = max(prior, _SHAKY)
-    if len(best.chosen) == 2:
-        prior = max(prior, _if_alike(*(one.cell for one in best.chosen)))
+    prior = max(prior, instead)
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))
     after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size
@@ -654,15 +671,10 @@ def _unlisted(base, best, stable):
     return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
-def _if_alike(one, other):
-    """Return the probability that two causes are one that no table has, from what they are."""
-    # what is in one run has nothing to do with what is in another
-    runs = {split_run(cell.dependence)[1] for cell in (one, other) if cell is not None}
-    if one is None or other is None or len(runs - {None}) > 1:
-        return 0.0
-    stems = {cell.kind.partition("_")[0] for cell in (one, other)}
-    same = (one.place, one.kind) == (other.place, other.kind)
-    return _ONE_THING if same else _OF_A_KIND if len(stems) == 1 else 0.0
+def _of_course(count, behind):
+    """Return the probability that so many causes are one of a course that no table has."""
+    better = _BETTER_COURSE * expit(2 * (_BETTER - behind))
+    return max(better, _ONE_COURSE * expit(_AS_WELL - behind) if count > 1 else 0.0)
 
 
 def _grouped(task, best, steps, scans, unlisted, stable):

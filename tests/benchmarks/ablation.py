@@ -48,9 +48,9 @@ RULES = {
         "selection._NEAR": -1.0,
     },
     "many causes are one that no table has": {"selection._UNLISTED": (0.0, *[0.02] * 8)},
-    "two of a kind are one that no table has": {
-        "selection._OF_A_KIND": 0.0,
-        "selection._ONE_THING": 0.0,
+    "one course that does as well is in place of them": {
+        "selection._ONE_COURSE": 0.0,
+        "selection._BETTER_COURSE": 0.0,
     },
     "two not in all parts of the data are one that no table has": {"selection._SHAKY": 0.0},
     "what is left lowers all probabilities": {"selection._LEFT": np.inf},

@@ -1,0 +1,127 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""
+One perturbation of any course through the run, in place of the causes that were found.
+
+The table of dependences is a list, and nature does not read it. So at each place and for each kind
+the perturbation gets another size in every frame: :math:`c_f l(\lambda)`, a course c and a smooth
+law l in wavelength, beside all that model and lamp take up. Each of the two is fitted while the
+other is held, in turn (alternating least squares). Where one such course explains the data as well
+as several causes do together, these may be one thing that no table has.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import block_diag
+
+from astropolcal.gap.cells import Cell, Probes, Reduced
+from astropolcal.gap.problem import law_basis
+
+__all__ = []
+
+# degree of the law in wavelength
+_DEGREE = 2
+# rounds for every place and kind, and for so many of the best
+_ROUNDS, _MORE, _BEST = 1, 5, 6
+# what lowers chi-square by less than this share more is the same
+_SAME = 1e-4
+# a direction of which model and lamp leave less than this is theirs
+_ABSORBED = 1e-6
+
+
+@dataclass
+class Course:
+    """
+    A perturbation with a size of its own in every frame.
+
+    Parameters
+    ----------
+    place, kind : str
+        As in `Cell`.
+    reduced : Reduced
+        Sums over the wavelengths of its derivatives.
+    law : `~numpy.ndarray`
+        Coefficients of the law in wavelength.
+    wave : list of `~numpy.ndarray`
+        The course in each dataset, (F,).
+    lowered, freedom : float, int
+        By how much it lowers chi-square, and by how many directions.
+    behind : float
+        By how much it does worse than the causes that were found, beyond what its larger freedom
+        gains from noise, in standard deviations of that.
+    """
+
+    place: str
+    kind: str
+    reduced: Reduced
+    law: np.ndarray
+    wave: list = field(default_factory=list)
+    lowered: float = 0.0
+    freedom: int = 0
+    behind: float = np.inf
+
+    @property
+    def words(self):
+        """What it is, in words."""
+        what = Cell(self.place, self.kind, "constant").title
+        return f"{what}, with a course through the run that no table has"
+
+    @property
+    def p_value(self):
+        """Probability that noise alone lowers chi-square so much, for this place and kind alone."""
+        return float(stats.chi2.sf(self.lowered, self.freedom))
+
+    def fit(self, rounds):
+        """Fit law and course in turn, until nothing is gained."""
+        if not self.wave:
+            self._fit_wave()
+        for _ in range(rounds):
+            (gram,), (target,) = self.reduced.normal([wave[None, None] for wave in self.wave])
+            law, before = np.linalg.lstsq(gram, target)[0], self.lowered
+            self.law = law / (np.linalg.norm(law) or 1.0)
+            self._fit_wave()
+            if self.lowered <= (1 + _SAME) * before:
+                break
+
+    def _fit_wave(self):
+        reduced, law = self.reduced, self.law
+        gram = np.concatenate([law @ (g @ law).T for g in reduced.gram])
+        seen = np.concatenate([law @ part for part in reduced.seen])
+        taken = np.hstack([seen, block_diag(*(law @ part for part in reduced.lamps))])
+        told = gram > _ABSORBED * gram.max()
+        root = np.sqrt(gram[told])
+        target = np.concatenate([t @ law for t in reduced.target])[told] / root
+        left, strength, _ = np.linalg.svd(taken[told] / root[:, None], full_matrices=False)
+        # (1 - t t^T)^-1 of what is left of each direction, nothing of what is taken up whole
+        rest = 1 - strength**2
+        is_open = rest > _ABSORBED
+        factor = np.where(is_open, 1 / np.where(is_open, rest, 1.0) - 1, -1.0)
+        solved = target + left @ (factor * (left.T @ target))
+        wave = np.zeros(len(gram))
+        wave[told] = solved / root
+        self.wave = np.split(wave, np.cumsum([len(g) for g in reduced.gram])[:-1])
+        self.lowered = float(target @ solved)
+        self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
+
+
+def courses(model, names):
+    """Return the courses in place of some causes of a fitted model, the best first."""
+    probes, base = Probes(model, names), model.without(names)
+    basis = law_basis(probes.problem.wavelength, _DEGREE)
+    constant = np.linalg.lstsq(basis, np.ones(len(basis)))[0]
+    found = [
+        Course(place, kind, Reduced(probes, slopes, basis), constant / np.linalg.norm(constant))
+        for (place, kind), slopes in probes.slopes.items()
+    ]
+    for one in found:
+        one.fit(_ROUNDS)
+    found.sort(key=lambda one: one.freedom - one.lowered)
+    for one in found[:_BEST]:
+        one.fit(_MORE)
+    # to first order, as the courses are
+    lost, temper = base.chi2 - model.fit.chi2, max(1.0, model.mean_square)
+    for one in found:
+        freer = max(one.freedom - (base.freedom - model.linear.freedom), 1.0)
+        one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
+    return sorted(found, key=lambda one: one.behind)

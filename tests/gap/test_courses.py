@@ -1,0 +1,64 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""One perturbation of any course through the run, in place of several causes."""
+
+import gap_data as data
+import numpy as np
+import pytest
+
+from astropolcal.gap.cells import Probes
+from astropolcal.gap.challenge import make_challenge, score_answer
+from astropolcal.gap.courses import courses
+from astropolcal.gap.diagnosis import diagnose
+from astropolcal.gap.problem import law_basis
+from astropolcal.gap.report import to_dict
+
+
+def answered(seed, **how):
+    """Return diagnosis, JSON and score of a challenge."""
+    observations, chains, case = make_challenge(seed, **how)
+    diagnosis = diagnose(chains, observations)
+    content = to_dict(diagnosis)
+    return diagnosis, content, score_answer(case, content)
+
+
+def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
+    model = data.fitted(data.observed(data.with_effect("derotator_diattenuation", x_0=0.01)))
+    probes = Probes(model)
+    channel, rows = probes.problem.channels[0], probes.problem.segments[0]
+    basis = law_basis(probes.problem.wavelength, 2)
+    for one in courses(model, ())[::9]:
+        slope = probes.slopes[one.place, one.kind][0]
+        sizes = (basis @ one.law)[probes.problem.datasets[0].bins][:, None]
+        # a column of its own for each frame
+        table = np.zeros((len(probes.residual), slope.shape[2]))
+        for i, frame in enumerate(np.eye(slope.shape[2])):
+            table[rows, i] = channel.whiten(slope * sizes * frame).ravel()
+        table -= probes.tangent @ (probes.tangent.T @ table)
+        size, _, rank, _ = np.linalg.lstsq(table, probes.residual, rcond=1e-3)
+        assert one.lowered == pytest.approx(np.sum((table @ size) ** 2), rel=1e-4), one.words
+        assert one.freedom == rank + basis.shape[1] - 1, one.words
+
+
+@pytest.mark.slow
+def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
+    for course, place, kind in (
+        ("both stages", "after:hwp", "diattenuation_d"),
+        ("swings", "in:derotator", "retardance_h"),
+        ("third harmonic", "after:derotator", "diattenuation_h"),
+    ):
+        fault = {"what": "course", "course": course, "place": place, "kind": kind}
+        diagnosis, content, score = answered(3, kind="mechanism", snr=20, fault=fault)
+        assert score == "right", course
+        assert max((cause.probability for cause in diagnosis.causes), default=0) < 0.5, course
+        where = [(one.place, one.kind) for one in diagnosis.courses]
+        assert (place, kind) in where, (course, where)
+        assert content["verdict"] == "unexplained"
+        assert content["where"][0]["share"] > 0.9, course
+        assert any("course through the run" in line for line in content["sentences"]), course
+
+
+@pytest.mark.slow
+def test_two_causes_are_no_course():
+    diagnosis, _, score = answered(5, kind="pair", snr=40)
+    assert (score, len(diagnosis.causes), diagnosis.courses) == ("right", 2, [])
+    assert min(cause.probability for cause in diagnosis.causes) > 0.9
