@@ -100,7 +100,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             units = (card_value(one, "BUNIT") for one in (header, primary))
             unit = next((one for one in units if one is not None), None)
             # per file: gain and exposure time may change within a night
-            detector = detector_of(layout, unit, frame.values.get("exposure_time"), frame.values)
+            detector = detector_of(layout, unit, frame.values)
             if layout.beam_files:
                 detector, cube = match_beams(frame, layout, cube, detector)
             frame.unit = detector.unit.to_string()
@@ -352,13 +352,12 @@ def match_beams(frame, layout, cube, detector):
             keyword = layout.keywords["camera"]
             frame.errors.append(f"{keyword} = {camera:g}, its name says {mark!r}")
     # each camera is read out in its own way
-    unit, exposure = detector.unit.to_string(), other.values.get("exposure_time")
-    left = detector_of(layout, unit, exposure, other.values)
+    left = detector_of(layout, other.unit or detector.unit.to_string(), other.values)
     # to the electrons of the right one: single differences compare both beams
-    if left.gain != detector.gain:
+    if (factor := left.units_of(detector)) != 1.0:
         # the left image is the first half of the columns
         first = np.arange(cube.shape[-1]) < cube.shape[-1] // 2
-        cube = cube * np.where(first, left.gain / detector.gain, 1.0)
+        cube = cube * np.where(first, factor, 1.0)
     return replace(detector, left=left.in_units_of(detector)), cube
 
 
@@ -366,11 +365,13 @@ def beam_detectors(path, layout, values, unit=None):
     """
     Return the detectors of the right and the left beam, the same where one file holds both.
 
-    ``values`` are those of the right beam's header, ``unit`` the BUNIT of both.
+    ``values`` are those of the right beam's header, and ``unit`` its BUNIT.
     """
-    left = layout.left_file(path)
-    both = (values, values if left is None else read_header(left, layout).values)
-    return [detector_of(layout, unit, known.get("exposure_time"), known) for known in both]
+    right, left = detector_of(layout, unit, values), layout.left_file(path)
+    if left is None:
+        return right, right
+    other = read_header(left, layout)
+    return right, detector_of(layout, other.unit or unit, other.values)
 
 
 # ---- science frames, before their light is measured ---------------------------------------------

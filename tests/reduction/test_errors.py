@@ -82,7 +82,7 @@ def test_gain_counts_electrons_of_one_unit_of_the_data():
         ("kadu", None, 2000.0),
         ("adu/min", 60.0, 2.0),
     ]:
-        found = detector_of(layout(), unit, seconds)
+        found = detector_of(layout(), unit, {"exposure_time": seconds})
         assert found.gain == pytest.approx(gain), (unit, seconds, gain)
         # 10 electrons of read noise, saturated at 4e4 adu
         assert found.read_noise * found.gain == pytest.approx(10.0), (unit, seconds, gain)

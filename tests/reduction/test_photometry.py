@@ -403,7 +403,7 @@ def test_detector_in_the_unit_of_the_header():
         ("adu / s", 10.0, 20.0, 0.5),
         ("electron/s", 10.0, 10.0, 1.0),
     ]:
-        detector = detector_of(LAYOUT, unit, seconds)
+        detector = detector_of(LAYOUT, unit, {"exposure_time": seconds})
         assert detector.gain == pytest.approx(gain), (unit, seconds, gain, noise)
         assert detector.read_noise == pytest.approx(noise), (unit, seconds, gain, noise)
         # the same number of electrons, whatever the unit
