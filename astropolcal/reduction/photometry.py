@@ -66,6 +66,8 @@ class Photometry:
 
 # ---- errors of fluxes ----------------------------------------------------------------------------
 
+# a pixel counts as full from this part of the saturation on
+_FULL = 1 - 5e-7
 # variance of a median over that of a mean, for normal noise and many pixels
 _MEDIAN = np.pi / 2
 
@@ -142,13 +144,13 @@ def detector_of(layout, unit=None, values=None):
     if rate and exposure_time is None:
         raise ObservationError(f"BUNIT = {unit!r} is a rate, and the exposure time is unknown")
     counts = 1 * own * (exposure_time * u.s if rate else 1)
-    how = layout.read_out(values)
-    if counts.unit.is_equivalent(u.adu):
-        counts = counts * how.gain * u.electron / u.adu
-    electrons = float(counts.to_value(u.electron))
-    # saturation and noise in electrons, which no unit of the file changes
-    full, noise = how.saturation * how.gain / electrons, how.read_noise / electrons
-    exposures = values.get("exposures", 1.0)
+    how, exposures = layout.read_out(values), values.get("exposures", 1.0)
+    # electrons are those of all exposures of which a pixel is the mean
+    gain = how.gain * u.electron / u.adu if counts.unit.is_equivalent(u.adu) else exposures
+    electrons = float((counts * gain).to_value(u.electron))
+    # saturation and noise in electrons, which no unit of the file changes; a pixel that is full
+    # may be rounded down, as files in other units have it in single precision
+    full, noise = _FULL * how.saturation * how.gain / electrons, how.read_noise / electrons
     return Detector(own, electrons, noise, full, how.excess_noise, exposures)
 
 
