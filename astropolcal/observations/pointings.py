@@ -213,7 +213,7 @@ def sky_angles(observations, location=None):
     if "altitude" in there and "parallactic" in there:
         angles = observations.position("altitude"), observations.position("parallactic")
     else:
-        time, target = _times(observations), _target(observations)
+        time, target = _times(observations.frames), _target(observations)
         needed = {
             "a column time (date and time of day)": time,
             "right_ascension and declination": target,
@@ -238,18 +238,16 @@ def sky_angles(observations, location=None):
     return angles
 
 
-def _times(observations):
-    frames = observations.frames
-    if "time" not in frames.colnames:
-        return None
-    column = frames["time"]
-    if np.any(getattr(column, "mask", False)):
+def _times(frames):
+    """Return the times of frames that are times or dates as text; None if one is not known."""
+    column = frames["time"] if "time" in frames.colnames else None
+    if column is None or np.any(getattr(column, "mask", False)):
         return None
     if isinstance(column, Time):
         return column
-    texts = np.asarray(column).astype(str)
+    texts = np.asarray(column)
     # a date alone is no moment
-    if not np.all(np.char.find(texts, ":") > 0):
+    if texts.dtype.kind not in "SU" or not all(":" in str(text) for text in texts.astype(str)):
         return None
     try:
         with offline():
@@ -297,19 +295,17 @@ def motion(observations, angle, duty=None):
         if not 0 <= duty <= 1:
             raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
         return duty * np.gradient(steady)
-    frames, times = observations.frames, _times(observations)
-    numbers = clock(frames)
-    if "exposure_time" not in frames.colnames or (times is None and numbers is None):
+    frames, times = observations.frames, clock(observations.frames)
+    if "exposure_time" not in frames.colnames or times is None:
         raise ObservationError(
             f"{observations.name}: the motion within an exposure needs columns time and "
             "exposure_time, or duty=..., the share of the time in which light is collected"
         )
     exposure = numeric_column(frames, "exposure_time", observations.name, u.s)
-    if times is not None:
-        # differences before the factor, which would cost five digits
-        seconds = (times.mjd - times.mjd[0]) * 86400.0
-    else:
-        seconds = (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s)
+    if (unit := getattr(frames["time"], "unit", None)) is None:
+        times, unit = _place(observations, "time"), u.day
+    # differences before the factor, which would cost five digits
+    seconds = ((times - times[0]) * unit).to_value(u.s)
     if np.any(np.diff(seconds) <= 0):
         raise ObservationError(f"{observations.name}: the times of the frames do not increase")
     # second order also where the frames are not evenly spaced
@@ -470,14 +466,14 @@ def _place(observations, name):
         )
     if name != "time":
         return numeric_column(frames, name, observations.name, PLACES[name])
-    times, unit = clock(frames), getattr(frames["time"], "unit", None)
-    if isinstance(frames["time"], Time) or times is None:
-        times, unit = _times(observations), None
-    if times is None or np.any(getattr(times, "mask", False)):
-        raise ObservationError(
-            f"{observations.name}: column time; a law of a parameter needs a date in each frame"
-        )
-    times = times if unit is None else times * unit
+    times, unit = _times(frames), getattr(frames["time"], "unit", None)
+    if times is None:
+        times = clock(frames)
+        if times is None:
+            raise ObservationError(
+                f"{observations.name}: column time; a law of a parameter needs a date in each frame"
+            )
+        times = times if unit is None else times * unit
     try:
         return mjd_of(times, f"{observations.name}: time")
     except ParameterError as error:
@@ -525,11 +521,13 @@ def clock(frames):
     """
     Return the times of frames as numbers, in days or in the unit of the column.
 
-    None without a column ``time`` of times or numbers, or if one is unknown.
+    None without a column ``time`` of times, dates or numbers, or if one is unknown.
     """
+    times = _times(frames)
+    if times is not None:
+        # a double resolves a microsecond of a modified Julian date
+        return np.asarray(times.mjd)
     column = frames["time"] if "time" in frames.colnames else None
-    # a double resolves a microsecond of a modified Julian date
-    column = column.mjd if isinstance(column, Time) else column
     if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
         return None
     # one unknown time makes the order of all frames doubtful, so none is used then

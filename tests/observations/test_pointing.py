@@ -187,6 +187,18 @@ def test_motion_is_rate_times_exposure():
     np.testing.assert_allclose(motion(observations, [0.0, 0.2, 0.4, 0.6]), 0.05)
 
 
+def test_motion_takes_moments_in_any_form():
+    """Of plain numbers those that are Modified Julian Dates."""
+    times = Time(60000.0 + np.arange(4) / 1440, format="mjd")
+    for column in (times, times.isot, times.mjd, times.mjd * u.day, times.tai):
+        observations = on_sky(time=column, exposure_time=30 * u.s)
+        found = motion(observations, [0.0, 0.2, 0.4, 0.6])
+        np.testing.assert_allclose(found, 0.1, rtol=1e-4, err_msg=str(column))
+    observations = on_sky(time=np.arange(4.0), exposure_time=30 * u.s)
+    with pytest.raises(ObservationError, match="time = 0 is not a Modified Julian Date"):
+        motion(observations, np.zeros(4))
+
+
 def test_motion_crosses_a_full_turn():
     angle = np.mod(np.deg2rad([358, 359, 360, 361]), 2 * np.pi)
     np.testing.assert_allclose(motion(on_sky(), angle, duty=1), np.deg2rad(1))
