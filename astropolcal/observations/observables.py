@@ -22,7 +22,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import angle_or_zero, clock
+from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice, counted
 
@@ -480,7 +480,7 @@ def get_observable(name):
 PAIRINGS = ("hwp", "flc_state")
 
 # a half-wave plate at 45 deg exchanges +Q and -Q, and at 180 deg is the same again
-_QUARTER, _HALF, _TURN = np.deg2rad([45.0, 90.0, 180.0])
+_QUARTER, _HALF = np.deg2rad([45.0, 90.0])
 # a message of a thousand numbers helps nobody
 _MAX_NAMED = 10
 # tables up to this length are searched as a whole, longer ones within so many frames first
@@ -581,13 +581,13 @@ def _candidates(
     first, second = first[good], second[good]
     drift = np.zeros(first.size, dtype=bool)
     if derotator is not None:
-        distance = _apart(derotator[first], derotator[second])
+        distance = axes_apart(derotator[first], derotator[second])
         close = distance <= derotator_tolerance
         first, second = first[close], second[close]
         # a derotator that drifts pairs neighbours; one that is static is better
         drift = distance[close] > 0.5 * derotator_tolerance
     plus, minus = np.where(phase[first] < phase[second], (first, second), (second, first))
-    backwards = _apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
+    backwards = axes_apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
     order = np.lexsort((*_nearness(plus, minus, steps), drift, backwards))
     return plus[order], minus[order]
 
@@ -625,7 +625,7 @@ def pair_states(
     alike = np.ones((first.size, second.size), dtype=bool)
     for angle, limit in zip(angles, limits, strict=True):
         # (frames in state 0, frames in state 1)
-        alike &= _apart(angle[first][:, None], angle[second]) <= limit
+        alike &= axes_apart(angle[first][:, None], angle[second]) <= limit
     # of no partner at all, not only of none that is free: that is a table with a hole
     lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
     if lonely:
@@ -647,11 +647,6 @@ def pair_states(
             stacklevel=2,
         )
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
-
-
-def _apart(first, second):
-    """Return the smallest angle between two axes, in [0, 90] degrees."""
-    return np.abs(np.mod(first - second + _HALF, _TURN) - _HALF)
 
 
 def _choose(plus, minus, n_frames, share):

@@ -42,6 +42,8 @@ TRACKING = (0.5, 1.0)
 
 # how far the middle of the exposure is from the moment of the angle, in exposures
 _WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
+# an image rotator that has made half a turn is the same again; other angles need a whole one
+_TURNS = {"derotator": np.pi}
 # exact for degree 63: no angle of the sky is that wild within an exposure
 _MOST_NODES = 32
 
@@ -280,15 +282,15 @@ def _target(observations):
 # ---- exposures -------------------------------------------------------------------------------
 
 
-def motion(observations, angle, duty=None):
+def motion(observations, angle, duty=None, turn=2 * np.pi):
     """
     Return by how much an angle (radian, (F,)) changes while a frame is exposed.
 
     By the columns ``time`` and ``exposure_time``, or by ``duty``, the share of the time in which
-    light is collected.
+    light is collected. After a ``turn`` the angle is the same again.
     """
     # the parallactic angle jumps by 360 deg north of the zenith
-    steady = np.unwrap(np.asarray(angle, dtype=float))
+    steady = np.unwrap(np.asarray(angle, dtype=float), period=turn)
     if len(steady) < 2:
         return np.zeros_like(steady)
     if duty is not None:
@@ -346,8 +348,9 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
         offset = observations.position("hwp_true") - follows
     if nodes > 1:
         found = {
-            stage: smeared(angle, motion(observations, angle, duty), nodes, when)
+            stage: smeared(angle, motion(observations, angle, duty, turn), nodes, when)
             for stage, angle in found.items()
+            for turn in [_TURNS.get(stage, 2 * np.pi)]
         }
     if not {"hwp", "hwp_true"} & set(observations.frames.colnames):
         return found
@@ -434,7 +437,9 @@ def frame_coordinate(observations, name):
         out[order] = steps if name.endswith("_move") else steps[last] < 0
         return out
     if name.endswith("_rate"):
-        return angle_change(observations, observations.position(name.removesuffix("_rate")))
+        stage = name.removesuffix("_rate")
+        turn = _TURNS.get(stage, 2 * np.pi)
+        return angle_change(observations, observations.position(stage), turn)
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
@@ -487,6 +492,11 @@ def angle_or_zero(observations, stage):
     return np.zeros(observations.n_frames)
 
 
+def axes_apart(first, second):
+    """Return the smallest angle, radian, between two axes: half a turn is none."""
+    return np.abs(np.mod(first - second + np.pi / 2, np.pi) - np.pi / 2)
+
+
 def in_state(frames, name, label):
     """Return 1 where a column of frames has a state, ``"COLUMN=STATE"``, and 0 elsewhere, (F,)."""
     column, _, state = name.partition("=")
@@ -503,17 +513,18 @@ def plain_states(column):
     return np.array([str(value).strip() for value in column])
 
 
-def angle_change(observations, angle):
+def angle_change(observations, angle, turn=2 * np.pi):
     """
     Return how an angle (radian, (F,)) changes from frame to frame, in the order of the times.
 
-    That is half the change from the frame before to the one after.
+    That is half the change from the frame before to the one after. After a ``turn`` the angle is
+    the same again.
     """
     order = np.argsort(_time_or_order(observations), kind="stable")
     out = np.zeros_like(angle)
     if len(angle) > 1:
-        # a turn through 180 deg is a small change; central differences, one-sided at both ends
-        out[order] = np.gradient(np.unwrap(angle[order]))
+        # central differences, one-sided at both ends
+        out[order] = np.gradient(np.unwrap(angle[order], period=turn))
     return out
 
 

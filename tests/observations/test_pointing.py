@@ -204,6 +204,15 @@ def test_motion_crosses_a_full_turn():
     np.testing.assert_allclose(motion(on_sky(), angle, duty=1), np.deg2rad(1))
 
 
+def test_derotator_moves_on_across_half_a_turn():
+    """Its image is the same again after 180 deg, where encoders may begin again."""
+    angle = np.array([178.0, 179.0, 0.0, 1.0])
+    observations = on_sky(derotator=angle * u.deg)
+    found = np.rad2deg(sky_positions(observations, nodes=3, duty=1)["derotator"])
+    np.testing.assert_allclose(found, angle + 0.5 * np.sqrt(0.6) * np.array([[-1], [0], [1]]))
+    np.testing.assert_allclose(np.rad2deg(observations.position("derotator_rate")), 1.0)
+
+
 def test_motion_without_times_is_an_error():
     with pytest.raises(ObservationError, match="columns time and exposure_time"):
         motion(on_sky(), np.zeros(4))
