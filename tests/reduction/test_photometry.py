@@ -14,6 +14,7 @@ from reduction_lab import Small, expose, pair, star_image
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.reduction.finding import find_star, fit_gaussians
+from astropolcal.reduction.images import moffat
 from astropolcal.reduction.photometry import (
     detector_of,
     measure_internal,
@@ -341,6 +342,26 @@ def test_flag_masked_aperture(star_cube):
     good = np.ones(star_cube.shape, dtype=bool)
     good[1, 88:96, 60:82] = False
     assert flags_of(star_cube, good) == ["", "aperture masked", "", ""]
+
+
+def test_pixels_of_the_core_that_lack_a_value_are_as_uncertain_as_the_light_they_had():
+    """A Moffat core is no Gaussian, so that what fills a pixel is off by more than its noise."""
+    box = tuple(slice(0, size) for size in LAYOUT.shape[1:])
+    left, right = (moffat(box, place[:2], 5.0, 3.0) for place in pair(LAYOUT))
+    cube = expose(1e6 * (right + 0.8 * left) + 20.0, LAYOUT)
+    whole = measure_stars(cube, None, DETECTOR, LAYOUT)
+    y, x = np.unravel_index(np.argmax(left), left.shape)
+    for lost in ([0], [0, 1]):
+        good = np.ones(cube.shape, dtype=bool)
+        good[:, y, np.add(x, lost)] = False
+        found = measure_stars(np.where(good, cube, np.nan), good, DETECTOR, LAYOUT)
+        # far more than what the noise of the other pixels leaves
+        own = np.sqrt(np.maximum(found.variance - whole.variance, 0.0)[1])
+        assert np.all(np.abs(found.flux - whole.flux)[1] < 2.5 * own), lost
+        assert np.all(np.sqrt(found.variance[1]) < 4 * np.sqrt(whole.variance[1])), lost
+    # a per cent of the aperture, but much more of its light
+    good[:, y - 1 : y + 2, x - 1 : x + 2] = False
+    assert set(flags_of(cube, good)) == {"aperture masked"}
 
 
 def test_flag_no_background(star_cube):
