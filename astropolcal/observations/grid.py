@@ -304,7 +304,9 @@ def _measured(table, label, beams):
     """Return the unit of the fluxes, and fluxes and errors in it, by name."""
     flux_unit = getattr(table[beams[0]], "unit", None)
     flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
-    if not isinstance(flux_unit, u.UnitBase) or isinstance(flux_unit, u.UnrecognizedUnit):
+    strange = isinstance(flux_unit, u.UnrecognizedUnit) or not isinstance(flux_unit, u.UnitBase)
+    # magnitudes are a unit like others for astropy
+    if strange or flux_unit.is_equivalent(u.dex):
         raise ObservationError(
             f"{label}: column {beams[0]} has unit {flux_unit}, a linear unit such as adu is needed"
         )
