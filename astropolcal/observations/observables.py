@@ -601,13 +601,12 @@ def _nearness(first, second, steps, exposure):
     """Return keys to sort by: of one exposure, nearest in time, in the table, the earliest."""
     # the last key counts most
     apart = np.abs(steps[first] - steps[second])
-    uneven = np.zeros(len(first)) if exposure is None else _uneven(exposure, first, second)
+    uneven = np.zeros(len(first)) if exposure is None else _uneven(exposure[[first, second]])
     return np.minimum(first, second), np.abs(first - second), apart, uneven
 
 
-def _uneven(exposure, *frames):
-    """Return whether exposures of frames differ; what is not known does not."""
-    each = np.stack([exposure[one] for one in frames])
+def _uneven(each):
+    """Return whether exposures differ along the first axis; what is not known does not."""
     return np.ptp(each, axis=0) > _SAME_EXPOSURE * np.abs(each).max(axis=0)
 
 
@@ -711,17 +710,26 @@ def frame_groups(observations, kind, rows, label, **limits):
             f"{label}: none of its {counted(observations.n_frames, 'frame')} can be paired; two "
             "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
         )
-    if exposure is not None and (uneven := _uneven(exposure, *found.T)).any():
-        each = frames["exposure_time"]
-        shown = ", ".join(f"{labels[i]} ({each[i]:g})" for i in found[uneven.argmax()])
+    warn_of_exposures(observations, found, label)
+    found.flags.writeable = False
+    return found
+
+
+def warn_of_exposures(observations, groups, label):
+    """Warn of groups of frames of unequal exposures, whose light is taken to be the same."""
+    frames = observations.frames
+    exposure = _exposures(frames, observations.flux_unit, label)
+    uneven = [] if exposure is None else [g for g in groups if _uneven(exposure[g])]
+    if uneven:
+        numbers, each = frames["frame"], frames["exposure_time"]
+        ends = np.sort(uneven[0][[exposure[uneven[0]].argmin(), exposure[uneven[0]].argmax()]])
+        shown = " and ".join(f"{numbers[i]} ({each[i]:g})" for i in ends)
         warnings.warn(
-            f"{label}: exposures differ in {uneven.sum()} of {len(found)} pairs, such as frames "
-            f"{shown}: a double difference takes the light of both to be the same",
+            f"{label}: exposures differ in {len(uneven)} of {counted(len(groups), 'group')} of "
+            f"frames whose light is taken to be the same, such as {shown}",
             AstropolcalWarning,
             stacklevel=3,
         )
-    found.flags.writeable = False
-    return found
 
 
 def _exposures(frames, unit, label):

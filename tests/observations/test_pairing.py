@@ -250,8 +250,18 @@ def test_frames_of_one_exposure_are_paired_though_others_are_nearer():
 def test_pairs_of_unequal_exposures_are_told():
     """Twice the light in one of them leaves a third of what a double difference should cancel."""
     for column in ([10, 20, 20, 10] * u.s, [10, 20, 20, 10]):
-        with pytest.warns(AstropolcalWarning, match=r"differ in 2 of 2 pairs, .* 0 \(10.*1 \(20"):
+        with pytest.warns(AstropolcalWarning, match=r"differ in 2 of 2 groups .* 0 \(10.*1 \(20"):
             exposed(column).pairs()
+
+
+def test_single_beams_of_unequal_exposures_are_told_where_they_share_a_brightness():
+    table = exposed([10, 20, 20, 10] * u.s).to_table()
+    table.rename_column("flux_right", "flux")
+    table.remove_columns([name for name in table.colnames if name.startswith("flux_")])
+    with pytest.warns(AstropolcalWarning, match=r"differ in 1 of 1 group .* 0 \(10.*1 \(20"):
+        Observations.from_table(table).groups(1)
+    table["group"] = [0, 1, 1, 0]
+    assert len(Observations.from_table(table).groups(1)) == 4
 
 
 def test_exposures_do_not_matter_where_fluxes_do_not_grow_with_them():
