@@ -15,7 +15,7 @@ from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations.reading import read_ecsv, write_table
+from astropolcal.observations.reading import numeric_column, read_ecsv, write_table
 
 __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
 
@@ -277,22 +277,9 @@ def _checked(table):
 
 def _with_unit(table, column, unit):
     """Return a column as a Quantity of the kind of the unit, NaN where it is masked."""
-    values = table[column]
-    try:
-        # numpy would drop the imaginary part, and only warn of it
-        if np.iscomplexobj(values):
-            raise TypeError("complex")
-        if hasattr(values, "unmasked"):
-            values = values.filled(np.nan)
-        elif np.ma.isMaskedArray(values):
-            values = values.astype(float).filled(np.nan)
-        values = u.Quantity(values, dtype=float)
-        values.to(unit)
-    except (TypeError, ValueError, u.UnitConversionError):
-        raise ObservationError(
-            f"target: column {column} must be numbers with a unit such as {unit or '1'}"
-        ) from None
-    return values
+    # refused in another unit, and kept in its own
+    numeric_column(table, column, "target", unit)
+    return numeric_column(table, column, "target") * (table[column].unit or u.one)
 
 
 def _take(table, column, spectrum, key, name, unit):

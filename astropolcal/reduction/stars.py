@@ -159,7 +159,8 @@ def _check_light(result, images, there, starts, fwhm, detector, beams):
     values = np.where(there, images, np.nan).reshape(len(beams) * n, -1)
     values[~there.any(axis=(1, 2))] = 0.0
     # before the fit: a saturated core has no centre
-    bright = np.nanmax(values, axis=1).reshape(-1, n) >= detector.saturation
+    full = [[detector.of(beam).saturation] for beam in range(len(beams))]
+    bright = np.nanmax(values, axis=1).reshape(-1, n) >= full
     result.flag(bright.any(axis=0), "saturated")
     level = np.nanmedian(values, axis=1)[:, None]
     noise = MAD_TO_SIGMA * np.nanmedian(np.abs(values - level), axis=1)

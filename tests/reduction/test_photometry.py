@@ -323,6 +323,16 @@ def test_flag_saturated(star_cube):
     assert flags_of(cube) == ["", "saturated", "", ""]
 
 
+def test_each_beam_is_saturated_where_its_own_detector_is(star_cube):
+    # the star of the right beam is a quarter as bright
+    cube = np.where(np.arange(star_cube.shape[2]) < 100, star_cube, star_cube / 4)
+    brightest = cube.max()
+    for left, flag in [(2 * brightest, ""), (brightest / 2, "saturated")]:
+        own = replace(DETECTOR, saturation=left)
+        both = replace(DETECTOR, saturation=brightest / 2, left=own)
+        assert set(measure_stars(cube, None, both, LAYOUT).reasons) == {flag}, left
+
+
 def test_flag_lost_star_and_empty_slice(star_cube):
     cube = star_cube.copy()
     cube[0] = expose(star_image([]), LAYOUT, seed=2, n_wavelengths=1)[0]
