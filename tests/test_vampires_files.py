@@ -423,3 +423,28 @@ def test_raw_frames_that_cannot_be_sorted_are_named(raw):
     assert len(problems) == 4
     for why in problems.values():
         assert why[0].startswith("no frame of camera 1 in state ")
+
+
+def test_a_saturated_exposure_spoils_a_mean(raw, tmp_path):
+    for camera in (1, 2):
+        fits.writeto(tmp_path / f"flat_cam{camera}.fits", np.full((SIDE, SIDE), 2.0))
+    paths = [path for path in sorted(raw.glob("*.fits")) if fits.getval(path, "U_CAMERA") == 1]
+    # what a full pixel is in each unit
+    for path, unit, gain in zip(paths, ("adu", "electron"), (1, 0.105), strict=False):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].data *= np.float32(gain)
+            hdus[0].data[1, 20, 20] = gain * 65535
+            hdus[0].header["BUNIT"] = unit
+    for options in ({}, {"flat": tmp_path / "flat_cam1.fits"}):
+        problems = reduced(raw, **options).problems
+        assert [*map(str, paths[:2])] == [*problems]
+        for why in problems.values():
+            assert why == ["no slice can be used: saturated"]
+
+
+def test_exposures_without_a_value_are_refused(raw):
+    path = sorted(raw.glob("*.fits"))[0]
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].data[1] = np.nan
+    (why,) = reduced(raw).problems.values()
+    assert "1 of its 3 exposures, such as number 2, have no pixel with a value" in why[0]

@@ -20,7 +20,7 @@ import numpy as np
 from astropy.table import QTable, Table, vstack
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import angle_or_zero
+from astropolcal.observations.pointings import angle_or_zero, axes_apart
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
@@ -304,7 +304,9 @@ def _measured(table, label, beams):
     """Return the unit of the fluxes, and fluxes and errors in it, by name."""
     flux_unit = getattr(table[beams[0]], "unit", None)
     flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
-    if not isinstance(flux_unit, u.UnitBase) or isinstance(flux_unit, u.UnrecognizedUnit):
+    strange = isinstance(flux_unit, u.UnrecognizedUnit) or not isinstance(flux_unit, u.UnitBase)
+    # magnitudes are a unit like others for astropy
+    if strange or flux_unit.is_equivalent(u.dex):
         raise ObservationError(
             f"{label}: column {beams[0]} has unit {flux_unit}, a linear unit such as adu is needed"
         )
@@ -464,7 +466,7 @@ def runs_of_frames(count, number):
 def derotator_runs(observations):
     """Return the number of the run of frames at one derotator angle of every frame, (F,)."""
     angle = angle_or_zero(observations, "derotator")
-    return np.cumsum(np.abs(np.diff(angle, prepend=angle[:1])) > SAME_ANGLE)
+    return np.cumsum(axes_apart(angle, np.concatenate([angle[:1], angle[:-1]])) > SAME_ANGLE)
 
 
 # ---- cycles of the half-wave plate ---------------------------------------------------------------
@@ -482,25 +484,22 @@ def cycle_numbers(observations, start=None):
     if "cycle" in frames.colnames:
         # numbers of cycles need not be consecutive
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = _step_of(angle_or_zero(observations, "hwp"))
+    # with the first of a cycle, if it is known; 180 deg is 0 deg again, and so is a bit less
+    known = [] if start is None else [float(angle_to_rad(start, "start"))]
+    plate = np.append(angle_or_zero(observations, "hwp"), known)
+    plate = clusters(np.mod(plate + _PLATE_STEPS, np.pi), _PLATE_STEPS)
+    plate, first = plate[: observations.n_frames], plate[observations.n_frames :]
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
     moved = np.diff(derotator_runs(observations), prepend=0) > 0
-    first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
         # with its first angle, unless nothing but that angle was seen: both states share it
-        begins = key[0] == first and any(angle != first for angle, _ in seen)
+        begins = key[0] in first and any(angle != key[0] for angle, _ in seen)
         if i and (moved[i] or begins or key in seen):
             number, seen = number + 1, set()
         seen.add(key)
         cycle[i] = number
     return cycle
-
-
-def _step_of(angle):
-    """Return the number of the step at which a plate stands; 180 deg is 0 deg again."""
-    step = np.rint(np.mod(angle, np.pi) / _PLATE_STEPS).astype(int)
-    return step % round(np.pi / _PLATE_STEPS)
 
 
 def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
@@ -516,8 +515,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
     # (frames, wanted angles)
-    apart = np.abs(np.mod(plate[:, None] - wanted + np.pi / 2, np.pi) - np.pi / 2)
-    there = (apart < _PLATE_STEPS) & ~lost[:, None]
+    there = (axes_apart(plate[:, None], wanted) < _PLATE_STEPS) & ~lost[:, None]
     complete = np.array([there[cycle == c].any(axis=0).all() for c in range(cycle.max() + 1)])
     if not complete.any():
         shown = ", ".join(f"{angle:g}" for angle in np.rad2deg(wanted))

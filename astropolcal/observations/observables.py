@@ -22,7 +22,8 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import angle_or_zero, clock
+from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock
+from astropolcal.observations.reading import numeric_column
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice, counted
 
@@ -480,7 +481,9 @@ def get_observable(name):
 PAIRINGS = ("hwp", "flc_state")
 
 # a half-wave plate at 45 deg exchanges +Q and -Q, and at 180 deg is the same again
-_QUARTER, _HALF, _TURN = np.deg2rad([45.0, 90.0, 180.0])
+_QUARTER, _HALF = np.deg2rad([45.0, 90.0])
+# relative; what a shutter or a header may differ by
+_SAME_EXPOSURE = 0.01
 # a message of a thousand numbers helps nobody
 _MAX_NAMED = 10
 # tables up to this length are searched as a whole, longer ones within so many frames first
@@ -492,6 +495,7 @@ def pair_frames(
     derotator=None,
     flc_state=None,
     time=None,
+    exposure=None,
     *,
     tolerance=0.3 * u.deg,
     derotator_tolerance=0.5 * u.deg,
@@ -504,10 +508,10 @@ def pair_frames(
     Pair the frames whose half-wave-plate angles differ by 45 deg; return indices (P, 2).
 
     All arguments are one per frame, angles as quantities; frames of a pair agree in derotator and
-    state. The plus frame, whose angle modulo 90 deg lies in [0, 45), comes first; the nearest in
-    time (else in the table) wins. ``share`` lets a frame left over use one that is used already;
-    ``labels``, ``rows`` and ``name`` are for messages. An angle without any partner in the table is
-    an error, frames left over a warning.
+    state. The plus frame, whose angle modulo 90 deg lies in [0, 45), comes first; that of the same
+    exposure and then the nearest in time (else in the table) wins. ``share`` lets a frame left over
+    use one that is used already; ``labels``, ``rows`` and ``name`` are for messages. An angle
+    without any partner in the table is an error, frames left over a warning.
     """
     hwp = np.atleast_1d(angle_to_rad(hwp, "hwp"))
     n_frames, tolerance = len(hwp), float(angle_to_rad(tolerance, "tolerance"))
@@ -526,7 +530,8 @@ def pair_frames(
             "a frame with the half-wave plate 45 deg from it (modulo 180 deg) is needed"
         )
     steps = np.arange(n_frames) if time is None else np.asarray(time, dtype=float)
-    setting = {"hwp": hwp, "steps": steps, "tolerance": tolerance, "flc_state": flc_state}
+    setting = {"hwp": hwp, "steps": (steps, exposure), "tolerance": tolerance}
+    setting["flc_state"] = flc_state
     if derotator is not None:
         setting["derotator"] = np.atleast_1d(angle_to_rad(derotator, "derotator"))
         setting["derotator_tolerance"] = derotator_tolerance
@@ -581,22 +586,28 @@ def _candidates(
     first, second = first[good], second[good]
     drift = np.zeros(first.size, dtype=bool)
     if derotator is not None:
-        distance = _apart(derotator[first], derotator[second])
+        distance = axes_apart(derotator[first], derotator[second])
         close = distance <= derotator_tolerance
         first, second = first[close], second[close]
         # a derotator that drifts pairs neighbours; one that is static is better
         drift = distance[close] > 0.5 * derotator_tolerance
     plus, minus = np.where(phase[first] < phase[second], (first, second), (second, first))
-    backwards = _apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
-    order = np.lexsort((*_nearness(plus, minus, steps), drift, backwards))
+    backwards = axes_apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
+    order = np.lexsort((*_nearness(plus, minus, *steps), drift, backwards))
     return plus[order], minus[order]
 
 
-def _nearness(first, second, steps):
-    """Return keys to sort by: nearest in time, then in the table, then the earliest."""
+def _nearness(first, second, steps, exposure):
+    """Return keys to sort by: of one exposure, nearest in time, in the table, the earliest."""
     # the last key counts most
     apart = np.abs(steps[first] - steps[second])
-    return np.minimum(first, second), np.abs(first - second), apart
+    uneven = np.zeros(len(first)) if exposure is None else _uneven(exposure[[first, second]])
+    return np.minimum(first, second), np.abs(first - second), apart, uneven
+
+
+def _uneven(each):
+    """Return whether exposures differ along the first axis; what is not known does not."""
+    return np.ptp(each, axis=0) > _SAME_EXPOSURE * np.abs(each).max(axis=0)
 
 
 def pair_states(
@@ -604,6 +615,7 @@ def pair_states(
     hwp,
     derotator,
     time=None,
+    exposure=None,
     *,
     tolerance=0.3 * u.deg,
     derotator_tolerance=0.5 * u.deg,
@@ -625,7 +637,7 @@ def pair_states(
     alike = np.ones((first.size, second.size), dtype=bool)
     for angle, limit in zip(angles, limits, strict=True):
         # (frames in state 0, frames in state 1)
-        alike &= _apart(angle[first][:, None], angle[second]) <= limit
+        alike &= axes_apart(angle[first][:, None], angle[second]) <= limit
     # of no partner at all, not only of none that is free: that is a table with a hole
     lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
     if lonely:
@@ -637,7 +649,7 @@ def pair_states(
             f"{derotator:g} deg has no partner; a frame in state {other} at these angles is needed"
         )
     i, j = (frames[k] for frames, k in zip((first, second), np.nonzero(alike), strict=True))
-    order = np.lexsort(_nearness(i, j, steps))
+    order = np.lexsort(_nearness(i, j, steps, exposure))
     chosen, used = _choose(i[order], j[order], len(state), share)
     if not used.all():
         warnings.warn(
@@ -647,11 +659,6 @@ def pair_states(
             stacklevel=2,
         )
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
-
-
-def _apart(first, second):
-    """Return the smallest angle between two axes, in [0, 90] degrees."""
-    return np.abs(np.mod(first - second + _HALF, _TURN) - _HALF)
 
 
 def _choose(plus, minus, n_frames, share):
@@ -678,20 +685,23 @@ def frame_groups(observations, kind, rows, label, **limits):
     of `pair_frames`, rows and label are for messages.
     """
     frames, time = observations.frames, clock(observations.frames)
+    exposure = _exposures(frames, observations.flux_unit, label)
     angles = observations.position("hwp") * u.rad, angle_or_zero(observations, "derotator") * u.rad
     labels, rows, limits = np.asarray(frames["frame"]), np.asarray(rows), limits | {"name": label}
     if kind == "hwp":
         # the plate cancels what is static: both frames must be in one state
         state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
-        found = pair_frames(*angles, state, time, labels=labels, rows=rows, **limits)
+        found = pair_frames(*angles, state, time, exposure, labels=labels, rows=rows, **limits)
     else:
         # states first: they alternate within an exposure and so share its atmosphere
-        found = pair_states(observations.position("flc_state"), *angles, time, rows=rows, **limits)
+        state = observations.position("flc_state")
+        found = pair_states(state, *angles, time, exposure, rows=rows, **limits)
     if kind == "both":
         # both frames of a pair stand at the same angles, so that one speaks for both
         first = found[:, 0]
         time = first if time is None else time[first]
         settings = {"time": time, "labels": labels[first], "rows": rows[first]} | limits
+        settings["exposure"] = None if exposure is None else exposure[first]
         pairs = pair_frames(*(angle[first] for angle in angles), **settings)
         # (Q, 2, 2): plus and minus, then states; flat it is A+, B+, A-, B-
         found = found[pairs].reshape(-1, 4)
@@ -700,5 +710,33 @@ def frame_groups(observations, kind, rows, label, **limits):
             f"{label}: none of its {counted(observations.n_frames, 'frame')} can be paired; two "
             "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
         )
+    warn_of_exposures(observations, found, label)
     found.flags.writeable = False
     return found
+
+
+def warn_of_exposures(observations, groups, label):
+    """Warn of groups of frames of unequal exposures, whose light is taken to be the same."""
+    frames = observations.frames
+    exposure = _exposures(frames, observations.flux_unit, label)
+    uneven = [] if exposure is None else [g for g in groups if _uneven(exposure[g])]
+    if uneven:
+        numbers, each = frames["frame"], frames["exposure_time"]
+        ends = np.sort(uneven[0][[exposure[uneven[0]].argmin(), exposure[uneven[0]].argmax()]])
+        shown = " and ".join(f"{numbers[i]} ({each[i]:g})" for i in ends)
+        warnings.warn(
+            f"{label}: exposures differ in {len(uneven)} of {counted(len(groups), 'group')} of "
+            f"frames whose light is taken to be the same, such as {shown}",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+
+
+def _exposures(frames, unit, label):
+    """Return how long frames were exposed, (F,); None where it is not known or does not matter."""
+    column = frames["exposure_time"] if "exposure_time" in frames.colnames else None
+    # rates, and what is calibrated or normalized, do not grow with it
+    counts = any(unit.is_equivalent(kind) for kind in (u.adu, u.electron, u.ct, u.ph, u.DN))
+    if not counts or getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
+        return None
+    return numeric_column(frames, "exposure_time", label)

@@ -42,6 +42,8 @@ TRACKING = (0.5, 1.0)
 
 # how far the middle of the exposure is from the moment of the angle, in exposures
 _WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
+# an image rotator that has made half a turn is the same again; other angles need a whole one
+_TURNS = {"derotator": np.pi}
 # exact for degree 63: no angle of the sky is that wild within an exposure
 _MOST_NODES = 32
 
@@ -213,7 +215,7 @@ def sky_angles(observations, location=None):
     if "altitude" in there and "parallactic" in there:
         angles = observations.position("altitude"), observations.position("parallactic")
     else:
-        time, target = _times(observations), _target(observations)
+        time, target = _times(observations.frames), _target(observations)
         needed = {
             "a column time (date and time of day)": time,
             "right_ascension and declination": target,
@@ -238,18 +240,16 @@ def sky_angles(observations, location=None):
     return angles
 
 
-def _times(observations):
-    frames = observations.frames
-    if "time" not in frames.colnames:
-        return None
-    column = frames["time"]
-    if np.any(getattr(column, "mask", False)):
+def _times(frames):
+    """Return the times of frames that are times or dates as text; None if one is not known."""
+    column = frames["time"] if "time" in frames.colnames else None
+    if column is None or np.any(getattr(column, "mask", False)):
         return None
     if isinstance(column, Time):
         return column
-    texts = np.asarray(column).astype(str)
+    texts = np.asarray(column)
     # a date alone is no moment
-    if not np.all(np.char.find(texts, ":") > 0):
+    if texts.dtype.kind not in "SU" or not all(":" in str(text) for text in texts.astype(str)):
         return None
     try:
         with offline():
@@ -282,34 +282,32 @@ def _target(observations):
 # ---- exposures -------------------------------------------------------------------------------
 
 
-def motion(observations, angle, duty=None):
+def motion(observations, angle, duty=None, turn=2 * np.pi):
     """
     Return by how much an angle (radian, (F,)) changes while a frame is exposed.
 
     By the columns ``time`` and ``exposure_time``, or by ``duty``, the share of the time in which
-    light is collected.
+    light is collected. After a ``turn`` the angle is the same again.
     """
     # the parallactic angle jumps by 360 deg north of the zenith
-    steady = np.unwrap(np.asarray(angle, dtype=float))
+    steady = np.unwrap(np.asarray(angle, dtype=float), period=turn)
     if len(steady) < 2:
         return np.zeros_like(steady)
     if duty is not None:
         if not 0 <= duty <= 1:
             raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
         return duty * np.gradient(steady)
-    frames, times = observations.frames, _times(observations)
-    numbers = clock(frames)
-    if "exposure_time" not in frames.colnames or (times is None and numbers is None):
+    frames, times = observations.frames, clock(observations.frames)
+    if "exposure_time" not in frames.colnames or times is None:
         raise ObservationError(
             f"{observations.name}: the motion within an exposure needs columns time and "
             "exposure_time, or duty=..., the share of the time in which light is collected"
         )
     exposure = numeric_column(frames, "exposure_time", observations.name, u.s)
-    if times is not None:
-        # differences before the factor, which would cost five digits
-        seconds = (times.mjd - times.mjd[0]) * 86400.0
-    else:
-        seconds = (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s)
+    if (unit := getattr(frames["time"], "unit", None)) is None:
+        times, unit = _place(observations, "time"), u.day
+    # differences before the factor, which would cost five digits
+    seconds = ((times - times[0]) * unit).to_value(u.s)
     if np.any(np.diff(seconds) <= 0):
         raise ObservationError(f"{observations.name}: the times of the frames do not increase")
     # second order also where the frames are not evenly spaced
@@ -350,8 +348,9 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
         offset = observations.position("hwp_true") - follows
     if nodes > 1:
         found = {
-            stage: smeared(angle, motion(observations, angle, duty), nodes, when)
+            stage: smeared(angle, motion(observations, angle, duty, turn), nodes, when)
             for stage, angle in found.items()
+            for turn in [_TURNS.get(stage, 2 * np.pi)]
         }
     if not {"hwp", "hwp_true"} & set(observations.frames.colnames):
         return found
@@ -438,7 +437,9 @@ def frame_coordinate(observations, name):
         out[order] = steps if name.endswith("_move") else steps[last] < 0
         return out
     if name.endswith("_rate"):
-        return angle_change(observations, observations.position(name.removesuffix("_rate")))
+        stage = name.removesuffix("_rate")
+        turn = _TURNS.get(stage, 2 * np.pi)
+        return angle_change(observations, observations.position(stage), turn)
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
@@ -470,14 +471,14 @@ def _place(observations, name):
         )
     if name != "time":
         return numeric_column(frames, name, observations.name, PLACES[name])
-    times, unit = clock(frames), getattr(frames["time"], "unit", None)
-    if isinstance(frames["time"], Time) or times is None:
-        times, unit = _times(observations), None
-    if times is None or np.any(getattr(times, "mask", False)):
-        raise ObservationError(
-            f"{observations.name}: column time; a law of a parameter needs a date in each frame"
-        )
-    times = times if unit is None else times * unit
+    times, unit = _times(frames), getattr(frames["time"], "unit", None)
+    if times is None:
+        times = clock(frames)
+        if times is None:
+            raise ObservationError(
+                f"{observations.name}: column time; a law of a parameter needs a date in each frame"
+            )
+        times = times if unit is None else times * unit
     try:
         return mjd_of(times, f"{observations.name}: time")
     except ParameterError as error:
@@ -489,6 +490,11 @@ def angle_or_zero(observations, stage):
     if stage in observations.frames.colnames:
         return observations.position(stage)
     return np.zeros(observations.n_frames)
+
+
+def axes_apart(first, second):
+    """Return the smallest angle, radian, between two axes: half a turn is none."""
+    return np.abs(np.mod(first - second + np.pi / 2, np.pi) - np.pi / 2)
 
 
 def in_state(frames, name, label):
@@ -507,17 +513,18 @@ def plain_states(column):
     return np.array([str(value).strip() for value in column])
 
 
-def angle_change(observations, angle):
+def angle_change(observations, angle, turn=2 * np.pi):
     """
     Return how an angle (radian, (F,)) changes from frame to frame, in the order of the times.
 
-    That is half the change from the frame before to the one after.
+    That is half the change from the frame before to the one after. After a ``turn`` the angle is
+    the same again.
     """
     order = np.argsort(_time_or_order(observations), kind="stable")
     out = np.zeros_like(angle)
     if len(angle) > 1:
-        # a turn through 180 deg is a small change; central differences, one-sided at both ends
-        out[order] = np.gradient(np.unwrap(angle[order]))
+        # central differences, one-sided at both ends
+        out[order] = np.gradient(np.unwrap(angle[order], period=turn))
     return out
 
 
@@ -525,11 +532,13 @@ def clock(frames):
     """
     Return the times of frames as numbers, in days or in the unit of the column.
 
-    None without a column ``time`` of times or numbers, or if one is unknown.
+    None without a column ``time`` of times, dates or numbers, or if one is unknown.
     """
+    times = _times(frames)
+    if times is not None:
+        # a double resolves a microsecond of a modified Julian date
+        return np.asarray(times.mjd)
     column = frames["time"] if "time" in frames.colnames else None
-    # a double resolves a microsecond of a modified Julian date
-    column = column.mjd if isinstance(column, Time) else column
     if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
         return None
     # one unknown time makes the order of all frames doubtful, so none is used then

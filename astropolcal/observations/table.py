@@ -13,7 +13,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.observations.grid import beam_variances, build_grid, warn_of_copies
-from astropolcal.observations.observables import PAIRINGS, frame_groups
+from astropolcal.observations.observables import PAIRINGS, frame_groups, warn_of_exposures
 from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
     complete_table,
@@ -502,7 +502,8 @@ class Observations:
         Warns
         -----
         AstropolcalWarning
-            If frames are left over.
+            If frames are left over, or the exposures of those whose light is taken to be the same
+            differ.
 
         Examples
         --------
@@ -518,6 +519,10 @@ class Observations:
             return self.pairs()
         if size != 1:
             raise ObservationError(f"groups of {size!r} frames; allowed are 1, 2 and 4")
+        if self.single_beam:
+            number = self.brightness_groups
+            shared = [np.flatnonzero(number == one) for one in range(number.max() + 1)]
+            warn_of_exposures(self, shared, self._label)
         return np.arange(self.n_frames)[:, None]
 
     def with_mask(self, mask, reason):

@@ -34,7 +34,7 @@ from astropolcal.fitscheck import primary_header
 from astropolcal.pipeline.headers import recognized
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting
-from astropolcal.reduction.headers import _SUFFIXES, observation_time, read_header
+from astropolcal.reduction.headers import _SUFFIXES, _half_turn, observation_time, read_header
 
 __all__ = []
 
@@ -283,25 +283,21 @@ def _cut(frames, gap, cycles):
     part, end, count, seen = [], None, 1, []
     for frame in frames:
         late = None not in (end, frame.mjd) and frame.mjd - end > gap
-        angle = None if frame.hwp is None else frame.hwp % 180
-        again = angle is not None and any(_same(angle, other) for other in seen[:-1])
-        if again:
+        known = frame.hwp is not None
+        same = [known and abs(_half_turn(frame.hwp - other)) < _SAME_ANGLE for other in seen]
+        if any(same[:-1]):
             # an angle that was there before the last one begins another cycle
-            count, seen = count + 1, []
+            count, seen, same = count + 1, [], []
         if part and (late or (cycles and count > cycles)):
             yield part
-            part, count, seen = [], 1, []
+            part, count, seen, same = [], 1, [], []
         part.append(frame)
-        if angle is not None and not (seen and _same(angle, seen[-1])):
-            seen.append(angle)
+        if known and not any(same[-1:]):
+            seen.append(frame.hwp)
         if frame.mjd is not None:
             end = frame.mjd + (frame.seconds or 0.0) / _DAY
     if part:
         yield part
-
-
-def _same(angle, other):
-    return abs((angle - other + 90) % 180 - 90) < _SAME_ANGLE
 
 
 # ---- what was done -------------------------------------------------------------------------------

@@ -97,10 +97,8 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             frame.number, frame.values = known.number, known.values
             frame.errors, frame.doubts = known.errors, known.doubts
             _check_header(frame, layout, source)
-            units = (card_value(one, "BUNIT") for one in (header, primary))
-            unit = next((one for one in units if one is not None), None)
             # per file: gain and exposure time may change within a night
-            detector = detector_of(layout, unit, frame.values.get("exposure_time"), frame.values)
+            detector = detector_of(layout, _unit(header, primary), frame.values)
             if layout.beam_files:
                 detector, cube = match_beams(frame, layout, cube, detector)
             frame.unit = detector.unit.to_string()
@@ -170,8 +168,8 @@ def _read_beams(path, hdus, layout, masters):
     data = hdus[number].data
     if data is not None and data.ndim == 2 and wanted[0] == 1:
         data = data[None]
-    several = layout.stacked and wanted[0] == 1 and np.shape(data)[1:] == wanted[1:]
-    if data is None or (data.shape != wanted and not several):
+    stack = layout.stacked and wanted[0] == 1 and np.shape(data)[1:] == wanted[1:]
+    if data is None or (data.shape != wanted and not stack):
         shape = "no data" if data is None else f"shape {data.shape}"
         raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")
     if data.dtype.kind not in "fiu":
@@ -185,18 +183,35 @@ def _read_beams(path, hdus, layout, masters):
         cube = np.where(np.isnan(cube), np.array(np.nan, cube.dtype), cube)
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
     if weight is not None and weight.size == cube.size:
-        good &= np.asarray(weight.reshape(cube.shape)) > 0
+        weight = np.asarray(weight.reshape(cube.shape))
+        # no measurement is without noise, nor is one that is all noise a measurement
+        good &= (weight > 0) & (weight < np.inf)
+    primary, header = hdus[0].header, hdus[number].header
+    several = cube.shape != wanted
+    if several or masters is not None:
+        values = read_header(path, layout, header=primary).values
+        saturation = detector_of(layout, _unit(header, primary), values).saturation
     if masters is not None:
-        cube, good = masters.applied(cube, good, layout)
+        cube, good = masters.applied(cube, good, layout, saturation)
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
-    if cube.shape != wanted:
+    if several:
+        # the noise of the mean is that of all of them
+        empty = np.flatnonzero(~good.any(axis=(1, 2)))
+        if empty.size:
+            count = f"{empty.size} of its {len(good)} exposures, such as number {empty[0] + 1},"
+            raise ObservationError(f"{path}: {count} have no pixel with a value; leave them out")
         # one saturated exposure spoils the mean, and is to be seen in it
-        full = np.where(good, cube, -np.inf).max(axis=0) >= layout.saturation
+        full = np.where(good, cube, -np.inf).max(axis=0) >= saturation
         seen = good.sum(axis=0, keepdims=True)
         cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.maximum(seen, 1)
-        cube, good = np.where(full, layout.saturation, cube), seen > 0
-    return hdus[0].header, hdus[number].header, cube, good
+        cube, good = np.where(full, saturation, cube), seen > 0
+    return primary, header, cube, good
+
+
+def _unit(*headers):
+    """Return BUNIT of the first header that has it, None without one."""
+    return next((unit for one in headers if (unit := card_value(one, "BUNIT")) is not None), None)
 
 
 def _check_header(frame, layout, source):
@@ -279,9 +294,9 @@ class Masters:
         """Return the files of the left beam."""
         return Masters(*(p and str(layout.left_file(p)) for p in (self.dark, self.flat)))
 
-    def applied(self, cube, good, layout):
+    def applied(self, cube, good, layout, saturation):
         """Return a cube, or a stack of exposures, and its known pixels, less dark and over flat."""
-        saturated = cube >= layout.saturation
+        saturated = cube >= saturation
         raw, cube = cube, np.asarray(cube, dtype=float)
         if self.dark is not None:
             dark = _image(self.dark, layout.file_shape)
@@ -352,13 +367,12 @@ def match_beams(frame, layout, cube, detector):
             keyword = layout.keywords["camera"]
             frame.errors.append(f"{keyword} = {camera:g}, its name says {mark!r}")
     # each camera is read out in its own way
-    unit, exposure = detector.unit.to_string(), other.values.get("exposure_time")
-    left = detector_of(layout, unit, exposure, other.values)
+    left = detector_of(layout, other.unit or detector.unit.to_string(), other.values)
     # to the electrons of the right one: single differences compare both beams
-    if left.gain != detector.gain:
+    if (factor := left.units_of(detector)) != 1.0:
         # the left image is the first half of the columns
         first = np.arange(cube.shape[-1]) < cube.shape[-1] // 2
-        cube = cube * np.where(first, left.gain / detector.gain, 1.0)
+        cube = cube * np.where(first, factor, 1.0)
     return replace(detector, left=left.in_units_of(detector)), cube
 
 
@@ -366,11 +380,13 @@ def beam_detectors(path, layout, values, unit=None):
     """
     Return the detectors of the right and the left beam, the same where one file holds both.
 
-    ``values`` are those of the right beam's header, ``unit`` the BUNIT of both.
+    ``values`` are those of the right beam's header, and ``unit`` its BUNIT.
     """
-    left = layout.left_file(path)
-    both = (values, values if left is None else read_header(left, layout).values)
-    return [detector_of(layout, unit, known.get("exposure_time"), known) for known in both]
+    right, left = detector_of(layout, unit, values), layout.left_file(path)
+    if left is None:
+        return right, right
+    other = read_header(left, layout)
+    return right, detector_of(layout, other.unit or unit, other.values)
 
 
 # ---- science frames, before their light is measured ---------------------------------------------

@@ -312,7 +312,8 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     uneven = np.abs(hwp - layout.hwp_step * steps) > tolerance
     # an uneven angle is a step of its own, which no sequence has
     steps[uneven] = 1e6 + np.flatnonzero(uneven)
-    blocks = np.split(np.arange(len(hwp)), np.flatnonzero(np.abs(np.diff(derotator)) > 1.0) + 1)
+    moved = np.abs(_half_turn(np.diff(derotator))) > 1.0
+    blocks = np.split(np.arange(len(hwp)), np.flatnonzero(moved) + 1)
     # the steps that most blocks have, if there is a majority
     ranked = Counter(tuple(steps[block]) for block in blocks if max(steps[block]) < 1e6)
     ranked = ranked.most_common(2)

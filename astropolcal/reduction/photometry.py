@@ -66,6 +66,8 @@ class Photometry:
 
 # ---- errors of fluxes ----------------------------------------------------------------------------
 
+# a pixel counts as full from this part of the saturation on
+_FULL = 1 - 5e-7
 # variance of a median over that of a mean, for normal noise and many pixels
 _MEDIAN = np.pi / 2
 
@@ -82,6 +84,8 @@ class Detector:
     saturation: float
     # by what factor electron multiplication raises the photon noise
     excess_noise: float = 1.0
+    # of how many exposures a pixel is the mean
+    exposures: float = 1.0
     # that of the left beam, if it is another one
     left: "Detector | None" = None
 
@@ -98,25 +102,31 @@ class Detector:
         """Return the detector of the right (0) or left (1) beam."""
         return self.left if beam == 1 and self.left is not None else self
 
+    def units_of(self, other):
+        """Return how many units of another detector the electrons of one own unit are there."""
+        # of a single exposure: one camera may have lost some of them
+        return (self.gain / self.exposures) / (other.gain / other.exposures)
+
     def in_units_of(self, other):
         """Return the same detector where its electrons count as another one's do."""
-        # one own unit is so many of the other
-        factor = self.gain / other.gain
+        factor = self.units_of(other)
         return replace(
             self,
             unit=other.unit,
-            gain=other.gain,
+            gain=other.gain * self.exposures / other.exposures,
             read_noise=self.read_noise * factor,
             saturation=self.saturation * factor,
         )
 
 
-def detector_of(layout, unit=None, exposure_time=None, values=None):
+def detector_of(layout, unit=None, values=None):
     """
     Return the detector of a layout in the unit that BUNIT gives (adu if absent).
 
-    A rate needs the exposure time in seconds. The ``values`` of the header say how it was read out.
+    The ``values`` of the header say how it was read out. A rate needs their exposure time.
     """
+    values = values or {}
+    exposure_time = values.get("exposure_time")
     # counts and DN are adu
     words = str(unit or "adu").strip()
     # the longer name first: "count" would leave an s behind
@@ -134,13 +144,14 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
     if rate and exposure_time is None:
         raise ObservationError(f"BUNIT = {unit!r} is a rate, and the exposure time is unknown")
     counts = 1 * own * (exposure_time * u.s if rate else 1)
-    how = layout.read_out(values or {})
-    if counts.unit.is_equivalent(u.adu):
-        counts = counts * how.gain * u.electron / u.adu
-    electrons = float(counts.to_value(u.electron))
-    # saturation and noise in electrons, which no unit of the file changes
-    full, noise = how.saturation * how.gain / electrons, how.read_noise / electrons
-    return Detector(own, electrons, noise, full, how.excess_noise)
+    how, exposures = layout.read_out(values), values.get("exposures", 1.0)
+    # electrons are those of all exposures of which a pixel is the mean
+    gain = how.gain * u.electron / u.adu if counts.unit.is_equivalent(u.adu) else exposures
+    electrons = float((counts * gain).to_value(u.electron))
+    # saturation and noise in electrons, which no unit of the file changes; a pixel that is full
+    # may be rounded down, as files in other units have it in single precision
+    full, noise = _FULL * how.saturation * how.gain / electrons, how.read_noise / electrons
+    return Detector(own, electrons, noise, full, how.excess_noise, exposures)
 
 
 def flux_variance(photons, area, background_variance, n_background=np.inf):

@@ -254,7 +254,7 @@ def reduce_run(
         ``aperture_correction`` (whether fluxes are scaled to all of the star's light, by a
         profile of its wings; or "growth", to what circles of ``max_radius`` have), ``companion``
         (a second star brighter than this fraction of the first, 0.1, corrupts a frame) and
-        ``max_masked`` (0.1).
+        ``max_masked`` (0.1, of the aperture as well as of the light in it).
 
     Returns
     -------

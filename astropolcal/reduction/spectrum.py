@@ -15,7 +15,7 @@ from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations.reading import read_ecsv, write_table
+from astropolcal.observations.reading import numeric_column, read_ecsv, write_table
 
 __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
 
@@ -70,13 +70,14 @@ def spectra_from_table(table):
         if name not in table.colnames:
             continue
         # each spectrum its own: a user may change one
-        meta = dict(table.meta)
+        meta, unit = dict(table.meta), table[name].unit
         if key in ("q", "u") and _COVARIANCE in table.colnames:
             meta[_COVARIANCE] = table[_COVARIANCE].to_value(u.one)
         if f"{name}_{_SYSTEMATIC}" in table.colnames:
-            meta[_SYSTEMATIC] = table[f"{name}_{_SYSTEMATIC}"].value
+            # in the unit of the spectrum: meta have none
+            meta[_SYSTEMATIC] = table[f"{name}_{_SYSTEMATIC}"].to_value(unit)
         settings = {"flux": table[name], "spectral_axis": table["wavelength"], "meta": meta}
-        uncertainty = StdDevUncertainty(table[f"{name}_err"])
+        uncertainty = StdDevUncertainty(table[f"{name}_err"].to(unit))
         spectra[key] = Spectrum(**settings, uncertainty=uncertainty, mask=mask.copy())
     return spectra
 
@@ -126,9 +127,12 @@ def table_from_spectra(spectra):
             raise ObservationError(f"spectrum {key}: {np.ndim(spectrum.flux)} axes; 1 is needed")
         axis = u.Quantity(spectrum.spectral_axis)
         # frequencies and energies run the other way; the table is sorted later
-        if not axis.unit.is_equivalent(u.um):
-            axis = axis.to(u.um, u.spectral())
-        axes[key] = axis
+        if not axis.unit.is_equivalent(u.um, u.spectral()):
+            raise ObservationError(
+                f"spectrum {key}: its axis is in {axis.unit}; a wavelength, frequency or energy is "
+                "needed"
+            )
+        axes[key] = axis if axis.unit.is_equivalent(u.um) else axis.to(u.um, u.spectral())
     first = axes["I"]
     for key, axis in axes.items():
         # without an absolute tolerance, which would be 10 nm for an axis in metres
@@ -273,22 +277,9 @@ def _checked(table):
 
 def _with_unit(table, column, unit):
     """Return a column as a Quantity of the kind of the unit, NaN where it is masked."""
-    values = table[column]
-    try:
-        # numpy would drop the imaginary part, and only warn of it
-        if np.iscomplexobj(values):
-            raise TypeError("complex")
-        if hasattr(values, "unmasked"):
-            values = values.filled(np.nan)
-        elif np.ma.isMaskedArray(values):
-            values = values.astype(float).filled(np.nan)
-        values = u.Quantity(values, dtype=float)
-        values.to(unit)
-    except (TypeError, ValueError, u.UnitConversionError):
-        raise ObservationError(
-            f"target: column {column} must be numbers with a unit such as {unit or '1'}"
-        ) from None
-    return values
+    # refused in another unit, and kept in its own
+    numeric_column(table, column, "target", unit)
+    return numeric_column(table, column, "target") * (table[column].unit or u.one)
 
 
 def _take(table, column, spectrum, key, name, unit):

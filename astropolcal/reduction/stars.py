@@ -159,7 +159,8 @@ def _check_light(result, images, there, starts, fwhm, detector, beams):
     values = np.where(there, images, np.nan).reshape(len(beams) * n, -1)
     values[~there.any(axis=(1, 2))] = 0.0
     # before the fit: a saturated core has no centre
-    bright = np.nanmax(values, axis=1).reshape(-1, n) >= detector.saturation
+    full = [[detector.of(beam).saturation] for beam in range(len(beams))]
+    bright = np.nanmax(values, axis=1).reshape(-1, n) >= full
     result.flag(bright.any(axis=0), "saturated")
     level = np.nanmedian(values, axis=1)[:, None]
     noise = MAD_TO_SIGMA * np.nanmedian(np.abs(values - level), axis=1)
@@ -289,22 +290,38 @@ def _aperture(cube, k, beam, places, radius):
         return "saturated"
     level = float(np.median(image[ring]))
     spread = MAD_TO_SIGMA * np.median(np.abs(image[ring] - level))
+    # what the ring shows, but never less than the detector's own noise
+    pixel = max(spread**2, float(detector.variance(level)))
+    filled = unsure = 0.0
     if not known[inside].all():
         # the Gaussian, and what nearby pixels have beyond it
         x, y = np.subtract(cut.origin_original, cube.origin[beam])
         model = cube.fits.image(beam * len(cube.cube) + k, columns + x, rows + y)
-        weight = ndimage.gaussian_filter(known.astype(float), 1.0, mode="constant")
         beyond = np.where(known, image - model, 0.0)
-        nearby = ndimage.gaussian_filter(beyond, 1.0, mode="constant") / np.maximum(weight, 1e-3)
-        image = np.where(known, image, model + nearby)
+        around, weight, squares = (
+            ndimage.gaussian_filter(values, 1.0, mode="constant")
+            for values in (beyond, known.astype(float), beyond**2)
+        )
+        around, squares = np.stack([around, squares]) / np.maximum(weight, 1e-3)
+        image = np.where(known, image, model + around)
+        filled = float((weights * (image - level))[~known].sum())
+        # a pixel may be as far off what is around it as pixels there are from each other, less
+        # what is noise
+        noise = pixel + detector.photon_noise(np.maximum(image - level, 0.0))
+        excess = np.sqrt(np.maximum(squares - around**2 - noise, 0.0))
+        off = np.where(known, 0.0, weights * excess)
+        # neighbours are off together, as far as the smoothing reaches: 2 pi is one over its peak
+        unsure = 2 * np.pi * float((off * ndimage.gaussian_filter(off, 1.0, mode="constant")).sum())
     flux = float((weights * image).sum() - level * area)
     if flux <= 0:
         return "lost star"
-    # what the ring shows, but never less than the detector's own noise
-    pixel = max(spread**2, float(detector.variance(level)))
+    # few pixels of the core may have much of the light
+    if filled > cube.max_masked * flux:
+        return "aperture masked"
     photons = detector.photon_noise(float((weights**2 * np.maximum(image - level, 0.0)).sum()))
-    variance = flux_variance(photons, area, pixel, ring.sum())
-    return flux, variance, level, variance - flux_variance(photons, area, pixel)
+    alone = flux_variance(photons, area, pixel)
+    of_level = flux_variance(photons, area, pixel, ring.sum()) - alone
+    return flux, alone + of_level + unsure, level, of_level
 
 
 def _growth_shares(result, cube, reach):

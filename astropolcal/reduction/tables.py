@@ -212,13 +212,20 @@ def _rows(files):
             open(path, encoding="utf-8", newline="") as stream,
         ):
             reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+            names = reader.fieldnames or ()
+            missing = [name for name in _NEEDED if name not in names]
             if missing:
                 raise ObservationError(
                     f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
                 )
-            known = [row for row in reader if any(row.values())]
-        rows += [(path, i, row) for i, row in enumerate(known, start=2)]
+            for row in filter(lambda row: any(row.values()), reader):
+                # a comma too many, or too few, moves all that follows to another column
+                if None in row or None in row.values() or len(row) < len(names):
+                    raise ObservationError(
+                        f"{path}, line {reader.line_num}: each of its {len(names)} columns needs a "
+                        "name of its own, and one value"
+                    )
+                rows.append((path, reader.line_num, row))
     if not rows:
         raise ObservationError(f"{files[0]}: no rows")
     return rows

@@ -148,13 +148,6 @@ class _Profile:
         along = self.terms.T.reshape(-1, len(core), *(1,) * (core.ndim - 1))
         return np.concatenate([core * along, halo * along])
 
-    def _seen(self):
-        rings, flux = self.rings, self.star.flux
-        for beam in range(2):
-            yield flux[beam], rings.own[:, beam]
-            if rings.other is not None:
-                yield flux[1 - beam], rings.other[:, beam]
-
 
 # --- fit -------------------------------------------------------------------------
 

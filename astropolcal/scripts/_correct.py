@@ -167,7 +167,7 @@ def work(arguments):
         position_angle=_position_angles(table, arguments),
         mirrored=arguments.mirrored,
         scale=scale,
-        left_scale=[left.gain / right.gain for right, left in detectors],
+        left_scale=[left.units_of(right) for right, left in detectors],
         detectors=detectors,
         # date and mode were checked when the calibration was chosen
         date=None,

@@ -28,6 +28,7 @@ WANTED = [
     MINUTES,
     (MINUTES * 2).astype(int),
     -5.0 + MINUTES,
+    (Time("2025-10-05T23:59:00", scale="utc") + MINUTES * u.min).isot,
     Masked(MINUTES * u.min, mask=False),
     MaskedColumn(MINUTES, mask=False),
 ]

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
+from astropolcal.observations import Observations, example_table
 from astropolcal.observations.observables import pair_frames
 
 CYCLE = [0.0, 45.0, 22.5, 67.5]
@@ -223,3 +224,50 @@ def test_time_of_pairing_is_linear():
     assert len(pairs) == 10_000
     # quadratic work took 30 s
     assert time.process_time() - start < 5
+
+
+# --- exposures -----------------------------------------------------------------------------------
+
+
+def exposed(seconds, unit=u.adu, **columns):
+    table = example_table(hwp=(0.0, 45.0, 45.0, 0.0), wavelength=(1.6,))
+    for name in [name for name in table.colnames if name.startswith("flux")]:
+        table[name] = table[name].value * unit
+    table["exposure_time"] = seconds
+    for name, column in columns.items():
+        table[name] = column
+    return Observations.from_table(table)
+
+
+def test_frames_of_one_exposure_are_paired_though_others_are_nearer():
+    for column in ([10, 20, 10.01, 20] * u.s, [10, 20, 10, 20]):
+        observations = exposed(column)
+        assert observations.pairs().tolist() == [[0, 2], [3, 1]], column
+    states = exposed([10, 20, 10, 20] * u.s, hwp=np.zeros(4) * u.deg, flc_state=list("ABBA"))
+    assert states.paired_by("flc_state").pairs().tolist() == [[0, 2], [3, 1]]
+
+
+def test_pairs_of_unequal_exposures_are_told():
+    """Twice the light in one of them leaves a third of what a double difference should cancel."""
+    for column in ([10, 20, 20, 10] * u.s, [10, 20, 20, 10]):
+        with pytest.warns(AstropolcalWarning, match=r"differ in 2 of 2 groups .* 0 \(10.*1 \(20"):
+            exposed(column).pairs()
+
+
+def test_single_beams_of_unequal_exposures_are_told_where_they_share_a_brightness():
+    table = exposed([10, 20, 20, 10] * u.s).to_table()
+    table.rename_column("flux_right", "flux")
+    table.remove_columns([name for name in table.colnames if name.startswith("flux_")])
+    with pytest.warns(AstropolcalWarning, match=r"differ in 1 of 1 group .* 0 \(10.*1 \(20"):
+        Observations.from_table(table).groups(1)
+    table["group"] = [0, 1, 1, 0]
+    assert len(Observations.from_table(table).groups(1)) == 4
+
+
+def test_exposures_do_not_matter_where_fluxes_do_not_grow_with_them():
+    seconds = [10, 20, 20, 10] * u.s
+    for unit in (u.adu / u.s, u.electron / u.min, u.mJy, u.one):
+        assert exposed(seconds, unit).pairs().tolist() == [[0, 1], [3, 2]], unit
+    unequal = ["a", "b", "c", "d"], [10, np.nan, np.nan, 20] * u.s
+    for unknown in unequal:
+        assert exposed(unknown).pairs().tolist() == [[0, 1], [3, 2]], unknown

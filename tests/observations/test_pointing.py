@@ -187,9 +187,30 @@ def test_motion_is_rate_times_exposure():
     np.testing.assert_allclose(motion(observations, [0.0, 0.2, 0.4, 0.6]), 0.05)
 
 
+def test_motion_takes_moments_in_any_form():
+    """Of plain numbers those that are Modified Julian Dates."""
+    times = Time(60000.0 + np.arange(4) / 1440, format="mjd")
+    for column in (times, times.isot, times.mjd, times.mjd * u.day, times.tai):
+        observations = on_sky(time=column, exposure_time=30 * u.s)
+        found = motion(observations, [0.0, 0.2, 0.4, 0.6])
+        np.testing.assert_allclose(found, 0.1, rtol=1e-4, err_msg=str(column))
+    observations = on_sky(time=np.arange(4.0), exposure_time=30 * u.s)
+    with pytest.raises(ObservationError, match="time = 0 is not a Modified Julian Date"):
+        motion(observations, np.zeros(4))
+
+
 def test_motion_crosses_a_full_turn():
     angle = np.mod(np.deg2rad([358, 359, 360, 361]), 2 * np.pi)
     np.testing.assert_allclose(motion(on_sky(), angle, duty=1), np.deg2rad(1))
+
+
+def test_derotator_moves_on_across_half_a_turn():
+    """Its image is the same again after 180 deg, where encoders may begin again."""
+    angle = np.array([178.0, 179.0, 0.0, 1.0])
+    observations = on_sky(derotator=angle * u.deg)
+    found = np.rad2deg(sky_positions(observations, nodes=3, duty=1)["derotator"])
+    np.testing.assert_allclose(found, angle + 0.5 * np.sqrt(0.6) * np.array([[-1], [0], [1]]))
+    np.testing.assert_allclose(np.rad2deg(observations.position("derotator_rate")), 1.0)
 
 
 def test_motion_without_times_is_an_error():

@@ -70,6 +70,20 @@ def test_run_whose_first_frame_is_lost_is_cut_at_the_right_place():
     assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == [0, 1, 2]
 
 
+def test_encoders_that_are_not_exact_change_no_cycle():
+    """Neither at angles of a plate that are odd multiples of 11.25 deg, nor at a whole turn."""
+    rng = np.random.default_rng(4)
+    for angles in (CRITICAL, [11.25, 56.25, 33.75, 78.75] * u.deg, [179.9, 45, 22.5, 67.5] * u.deg):
+        frames = half_wave_plate_cycles(angles, np.zeros(6) * u.deg)
+        for stage in ("hwp", "derotator"):
+            off = rng.normal(0, 0.01, len(frames)) * u.deg
+            frames[stage] = np.mod(frames[stage] + off, 180 * u.deg)
+        night = simulate(CHARIS.chain("unpolarized", wavelength=FEW), FEW, frames, seed=1)
+        expected = np.repeat(np.arange(6), 4).tolist()
+        for start in (None, angles[0]):
+            assert cycle_numbers(night, start).tolist() == expected, (angles, start)
+
+
 def test_cycles_may_be_given():
     observations = cycles()
     table = observations.to_table()

@@ -256,6 +256,10 @@ def test_columns_with_a_wrong_unit():
 def test_fluxes_are_linear(table):
     table["flux_right"] = u.Magnitude(np.ones(len(table)) * u.adu)
     refuse(table, r"column flux_right has unit mag\(adu\), a linear unit such as adu is needed")
+    for unit in (u.mag, u.dex, u.dB):
+        for name in [name for name in table.colnames if name.startswith("flux")]:
+            table[name] = np.ones(len(table)) * unit
+        refuse(table, f"column flux_right has unit {unit}, a linear unit such as adu is needed")
 
 
 def test_an_unknown_unit_in_a_file(tmp_path, table):

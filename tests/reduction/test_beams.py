@@ -12,7 +12,7 @@ from astropolcal.reduction.photometry import detector_of
 
 KEYWORDS = {
     "hwp": "HWP", "derotator": "ROT", "exposure_time": "EXPTIME", "flc_state": "FLC",
-    "filter": "FILTER", "camera": "CAMERA", "read_mode": "MODE",
+    "filter": "FILTER", "camera": "CAMERA", "read_mode": "MODE", "exposures": "NDIT",
 }  # fmt: skip
 LAYOUT = FileLayout(
     KEYWORDS, (1, 8, 16), cube_extension=0, beam_files=("cam1", "cam2"), gain=1.0,
@@ -30,7 +30,9 @@ def files(tmp_path):
             cards = HEADER | {"CAMERA": camera} | changes
             header = fits.Header([(k, v) for k, v in cards.items() if v is not None])
             data = np.full((8, 8), value, dtype="f4") if image is None else image
-            fits.PrimaryHDU(data, header).writeto(tmp_path / f"n_00000001_cam{camera}.fits")
+            fits.PrimaryHDU(data, header).writeto(
+                tmp_path / f"n_00000001_cam{camera}.fits", overwrite=True
+            )
         return tmp_path / "n_00000001_cam1.fits"
 
     return write
@@ -56,6 +58,14 @@ def test_both_images_count_the_same_electrons(files):
     assert detector.left.saturation * detector.gain == pytest.approx(5000.0)
     right, left = beam_detectors(frame.path, LAYOUT, frame.values)
     assert left.gain / right.gain == pytest.approx(0.5)
+
+
+def test_a_camera_that_lost_exposures_is_as_bright_and_noisier(files):
+    _, whole, expected = matched(files(NDIT=3), exposures=3.0)
+    _, detector, cube = matched(files(NDIT=2), exposures=3.0)
+    np.testing.assert_allclose(cube, expected)
+    ratio = detector.left.variance(cube) / whole.left.variance(expected)
+    np.testing.assert_allclose(ratio, 3 / 2)
 
 
 @pytest.mark.parametrize(
@@ -117,3 +127,13 @@ def test_unit_of_the_files_is_that_of_the_scale(files):
     values = {"read_mode": "slow", "camera": 1.0}
     right, left = beam_detectors(files(), LAYOUT, values, "electron")
     assert right.gain == left.gain == 1.0
+
+
+def test_each_camera_has_the_unit_of_its_own_header(files):
+    for unit, expected in [(None, 2.0), ("adu", 2.0), ("electron", 8.0)]:
+        path = files(BUNIT=unit)
+        frame, _, cube = matched(path)
+        # 4 electrons are 8 adu of the right camera
+        np.testing.assert_allclose(cube[0, :, :8], expected, err_msg=str(unit))
+        right, left = beam_detectors(path, LAYOUT, frame.values)
+        assert 4.0 * left.units_of(right) == pytest.approx(expected), unit

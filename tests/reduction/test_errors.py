@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.instruments.layout import ReadOut
+from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.reduction.photometry import (
     Detector,
     detector_of,
@@ -82,11 +82,30 @@ def test_gain_counts_electrons_of_one_unit_of_the_data():
         ("kadu", None, 2000.0),
         ("adu/min", 60.0, 2.0),
     ]:
-        found = detector_of(layout(), unit, seconds)
+        found = detector_of(layout(), unit, {"exposure_time": seconds})
         assert found.gain == pytest.approx(gain), (unit, seconds, gain)
         # 10 electrons of read noise, saturated at 4e4 adu
         assert found.read_noise * found.gain == pytest.approx(10.0), (unit, seconds, gain)
         assert found.saturation * found.gain == pytest.approx(8e4), (unit, seconds, gain)
+
+
+def test_electrons_of_a_mean_are_those_of_all_exposures():
+    camera = FileLayout({}, (1, 8, 8), gain=2.0, read_noise=10.0, saturation=4e4)
+    for unit, one in [("adu", 1.0), ("electron", 2.0)]:
+        found = detector_of(camera, unit, {"exposures": 4.0})
+        # a mean of 100 adu: 800 electrons in all, each read with 10 electrons of noise
+        relative = np.sqrt(found.variance(100.0 * one)) / (100.0 * one)
+        assert relative == pytest.approx(np.sqrt(800 + 4 * 10**2) / 800), unit
+        assert found.saturation == pytest.approx(4e4 * one, rel=1e-5), unit
+
+
+def test_a_full_pixel_is_saturated_in_any_unit_and_read_out():
+    for gain in np.linspace(0.05, 2.0, 40):
+        for unit, one in [("adu", 1.0), ("electron", gain)]:
+            found = detector_of(layout(gain=gain, saturation=65535.0), unit)
+            # as files have it
+            assert np.float32(65535.0 * one) >= found.saturation, (unit, gain)
+            assert np.float32(65000.0 * one) < found.saturation, (unit, gain)
 
 
 def test_other_units_are_refused():

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """One file: what cannot be opened, what its header lacks, and frames as plain numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -86,6 +88,19 @@ def test_extension_of_another_size_is_no_weight(small, tmp_path, flat_cube):
     extra = [fits.ImageHDU(np.zeros((2, 2)))]
     _, good = opened(write_cube(tmp_path / "a.fits", flat_cube, extra_hdus=extra), small.files)
     assert good.all()
+
+
+def test_weights_and_errors_that_are_no_numbers_mark_pixels_without_a_value(
+    small, tmp_path, flat_cube
+):
+    weight = np.ones_like(flat_cube)
+    weight[0, 0, :4] = 0.0, -1.0, np.nan, np.inf
+    for kind in ("inverse variance", "error"):
+        path = tmp_path / f"{kind}.fits"
+        write_cube(path, flat_cube, extra_hdus=[fits.ImageHDU(weight)])
+        _, good = opened(path, replace(small.files, weights=kind))
+        assert not good[0, 0, :4].any(), kind
+        assert good.sum() == good.size - 4, kind
 
 
 @pytest.mark.parametrize(("kind", "dtype"), [("f8", "f8"), (">f4", "f4"), ("i2", "f8")])

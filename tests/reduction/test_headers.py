@@ -215,6 +215,16 @@ def test_corrupted_angles_are_found_with_what_belongs_there():
     assert "the sequence has 33.75 deg" in found[30]
 
 
+def test_derotator_at_zero_stands_still_where_its_encoder_begins_again():
+    hwp = np.array(CYCLE * 8)
+    hwp[3] = hwp[2]
+    derotator = np.repeat(np.arange(0, 90, 12.5), len(CYCLE))
+    for turn in (180, 360):
+        flicker = np.where(np.arange(72) % 2, 0.01, turn - 0.01)
+        found = check_sequence(hwp, np.where(derotator == 0, flicker, derotator), LAYOUT)
+        assert sorted(found) == [3], turn
+
+
 def test_layout_refuses_nonsense():
     with pytest.raises(InstrumentError, match="gain"):
         FileLayout(keywords={}, shape=(1, 2, 3), gain=0.0)

@@ -14,6 +14,7 @@ from reduction_lab import Small, expose, pair, star_image
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.reduction.finding import find_star, fit_gaussians
+from astropolcal.reduction.images import moffat
 from astropolcal.reduction.photometry import (
     detector_of,
     measure_internal,
@@ -322,6 +323,16 @@ def test_flag_saturated(star_cube):
     assert flags_of(cube) == ["", "saturated", "", ""]
 
 
+def test_each_beam_is_saturated_where_its_own_detector_is(star_cube):
+    # the star of the right beam is a quarter as bright
+    cube = np.where(np.arange(star_cube.shape[2]) < 100, star_cube, star_cube / 4)
+    brightest = cube.max()
+    for left, flag in [(2 * brightest, ""), (brightest / 2, "saturated")]:
+        own = replace(DETECTOR, saturation=left)
+        both = replace(DETECTOR, saturation=brightest / 2, left=own)
+        assert set(measure_stars(cube, None, both, LAYOUT).reasons) == {flag}, left
+
+
 def test_flag_lost_star_and_empty_slice(star_cube):
     cube = star_cube.copy()
     cube[0] = expose(star_image([]), LAYOUT, seed=2, n_wavelengths=1)[0]
@@ -341,6 +352,26 @@ def test_flag_masked_aperture(star_cube):
     good = np.ones(star_cube.shape, dtype=bool)
     good[1, 88:96, 60:82] = False
     assert flags_of(star_cube, good) == ["", "aperture masked", "", ""]
+
+
+def test_pixels_of_the_core_that_lack_a_value_are_as_uncertain_as_the_light_they_had():
+    """A Moffat core is no Gaussian, so that what fills a pixel is off by more than its noise."""
+    box = tuple(slice(0, size) for size in LAYOUT.shape[1:])
+    left, right = (moffat(box, place[:2], 5.0, 3.0) for place in pair(LAYOUT))
+    cube = expose(1e6 * (right + 0.8 * left) + 20.0, LAYOUT)
+    whole = measure_stars(cube, None, DETECTOR, LAYOUT)
+    y, x = np.unravel_index(np.argmax(left), left.shape)
+    for lost in ([0], [0, 1]):
+        good = np.ones(cube.shape, dtype=bool)
+        good[:, y, np.add(x, lost)] = False
+        found = measure_stars(np.where(good, cube, np.nan), good, DETECTOR, LAYOUT)
+        # far more than what the noise of the other pixels leaves
+        own = np.sqrt(np.maximum(found.variance - whole.variance, 0.0)[1])
+        assert np.all(np.abs(found.flux - whole.flux)[1] < 2.5 * own), lost
+        assert np.all(np.sqrt(found.variance[1]) < 4 * np.sqrt(whole.variance[1])), lost
+    # a per cent of the aperture, but much more of its light
+    good[:, y - 1 : y + 2, x - 1 : x + 2] = False
+    assert set(flags_of(cube, good)) == {"aperture masked"}
 
 
 def test_flag_no_background(star_cube):
@@ -403,7 +434,7 @@ def test_detector_in_the_unit_of_the_header():
         ("adu / s", 10.0, 20.0, 0.5),
         ("electron/s", 10.0, 10.0, 1.0),
     ]:
-        detector = detector_of(LAYOUT, unit, seconds)
+        detector = detector_of(LAYOUT, unit, {"exposure_time": seconds})
         assert detector.gain == pytest.approx(gain), (unit, seconds, gain, noise)
         assert detector.read_noise == pytest.approx(noise), (unit, seconds, gain, noise)
         # the same number of electrons, whatever the unit

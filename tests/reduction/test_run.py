@@ -510,6 +510,12 @@ def test_pypolcal_errors_name_file_and_line(tmp_path):
     row = path.read_text().splitlines()[1]
     with pytest.raises(ObservationError, match=r"line 6: .* is given already in .*line 2"):
         read_pypolcal(write_csv(tmp_path / "twice.csv", 1159.5614, values=[row]))
+    # a comma too many, as of decimals, or a column too few would move numbers to other columns
+    whole = path.read_text()
+    for old, new in [(row, f"{row},3"), (row, row.rpartition(",")[0])]:
+        path.write_text(whole.replace(old, new).replace("\n", "\n\n", 1))
+        with pytest.raises(ObservationError, match=r"line 3: each of its \d+ columns needs a name"):
+            read_pypolcal(path)
     bare = tmp_path / "bare.csv"
     bare.write_text("filepath,D_IMRANG\na,1\n")
     with pytest.raises(ObservationError, match="missing columns RET-ANG1, LCOUNTS"):

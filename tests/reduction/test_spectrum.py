@@ -72,6 +72,31 @@ def test_there_and_back_is_the_same_table(n, seed, some):
     assert back.meta == table.meta
 
 
+def test_units_of_errors_need_not_be_those_of_the_values():
+    plain = target(q_systematic=1e-3)
+    mixed = target(q_systematic=0.1 * u.percent)
+    mixed["intensity_systematic"] = 20 * u.uJy
+    spectra = spectra_from_table(mixed)
+    np.testing.assert_allclose(spectra["q"].meta["systematic"], 1e-3)
+    back = table_from_spectra(spectra)
+    np.testing.assert_allclose(back["q_systematic"], plain["q_systematic"])
+    np.testing.assert_allclose(back["intensity_systematic"].to_value(u.mJy), 0.02)
+    # and of values in percent, whose errors are plain numbers
+    mixed["q"] = mixed["q"].to(u.percent)
+    spectrum = spectra_from_table(mixed)["q"]
+    np.testing.assert_allclose(spectrum.uncertainty.array, 100 * plain["q_err"])
+    np.testing.assert_allclose(spectrum.meta["systematic"], 0.1)
+
+
+def test_velocities_are_no_axis_of_wavelengths():
+    spectra = spectra_from_table(target())
+    axis = np.linspace(0, 9, 5) * u.km / u.s
+    for key, one in spectra.items():
+        spectra[key] = specutils.Spectrum(one.flux, axis, uncertainty=one.uncertainty)
+    with pytest.raises(ObservationError, match="spectrum I: its axis is in km / s"):
+        table_from_spectra(spectra)
+
+
 def test_table_of_a_correction_is_read(tmp_path):
     table = QTable({"wavelength": [1.2, 1.6, 2.0] * u.um, "I": [900.0, 800.0, 700.0] * u.adu})
     table["I_statistical"], table["I_systematic"] = [3, 3, 3] * u.adu, [1, 1, np.inf] * u.adu
@@ -168,12 +193,12 @@ def test_table_that_is_no_target_is_refused():
         (target()[:0], "no rows"),
         (target(wavelength=[1, 2, 2, 3, 4] * u.um), "wavelength 2.0 um is given twice"),
         (target(wavelength=[-1, 2, 3, 4, 5] * u.um), "not positive"),
-        (target(wavelength=[1, 2, 3, 4, 5]), "wavelength must be numbers with a unit such as um"),
-        (target(q=np.ones(5) * u.mJy), "column q must be"),
-        (target(q=list("abcde")), "column q must be"),
+        (target(wavelength=[1, 2, 3, 4, 5]), "column wavelength has no unit, a unit such as um"),
+        (target(q=np.ones(5) * u.mJy), "column q has unit mJy"),
+        (target(q=list("abcde")), "column q has type .*, numbers are needed"),
         (target(u=[0, np.nan, 0, 0, 0]), "u = nan at 13"),
         (target(u_err=[0, 0, -1e-4, 0, 0]), "u_err = -0.0001 at 1658.* not negative"),
-        (target(intensity_err=np.ones(5) * u.um), "column intensity_err must be"),
+        (target(intensity_err=np.ones(5) * u.um), "column intensity_err has unit um"),
     ]:
         with pytest.raises(ObservationError, match=words):
             spectra_from_table(table)
