@@ -16,7 +16,7 @@ import numpy as np
 from astropy.time import Time
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.files import one_line
 
 __all__ = []
@@ -126,6 +126,22 @@ def wavelengths_of(value, name="wavelength"):
             f"{name} = {one_line(value)} needs a unit such as nm, and finite numbers above zero"
         )
     return found
+
+
+def check_range(wavelength, low, high, what, slack=1e-9):
+    """
+    Return wavelengths (um) as floats, or raise unless ``what`` is known at all of them.
+
+    The ends of the range survive the conversion of their unit, by a share ``slack``.
+    """
+    wavelength = np.asarray(wavelength, dtype=float)
+    # written so that NaN is outside
+    outside = ~((wavelength >= low * (1 - slack)) & (wavelength <= high * (1 + slack)))
+    if outside.any():
+        raise WavelengthRangeError(
+            f"{what} is known from {low:g} to {high:g} um, not at {wavelength[outside][0]:.6g} um"
+        )
+    return wavelength
 
 
 def check_seed(seed, *, generator=True):

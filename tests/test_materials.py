@@ -406,6 +406,15 @@ def test_what_is_no_material_is_not_registered(registry):
             register_material(thing)
 
 
+def test_a_table_is_not_extrapolated_whatever_its_material_claims():
+    law = TabulatedLaw([1.1, 1.7, 2.4] * u.um, [0.3 + 7.5j, 0.5 + 11j, 0.8 + 15j])
+    wide = IsotropicMaterial("aged silver", law, measured_range=[0.5, 5.0] * u.um)
+    np.testing.assert_array_equal(wide.index([1100, 2400] * u.nm), [0.3 + 7.5j, 0.8 + 15j])
+    for wavelength in (0.6, [1.2, 4.0]):
+        with pytest.raises(WavelengthRangeError, match=r"1\.1 to 2\.4 um"):
+            wide.index(wavelength * u.um)
+
+
 def test_a_table_that_is_not_one_is_refused():
     for wavelength, index, message in [
         ([1.0, 2.0], [1.5], "one per wavelength"),

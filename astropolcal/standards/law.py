@@ -8,17 +8,15 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Fittable1DModel, Parameter
 
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.exceptions import ParameterError
 from astropolcal.optics.sources import serkowski
-from astropolcal.units import angle_to_rad, length_to_um, to_unit
+from astropolcal.units import angle_to_rad, check_range, length_to_um, to_unit
 
 __all__ = ["SerkowskiLaw", "whittet_width"]
 
 # Whittet et al. (1992): K = intercept + slope * lambda_max / um
 _INTERCEPT, _SLOPE = 0.01, 1.66
 _TURN = u.deg / u.um
-# lets the ends of a range survive the conversion of their unit
-_EDGE = 1e-9
 _CANONICAL = {"p_max": u.dimensionless_unscaled, "lambda_max": u.um, "theta": u.rad}
 _CANONICAL |= {"K": u.dimensionless_unscaled, "rotation": u.rad / u.um}
 
@@ -318,12 +316,5 @@ class SerkowskiLaw(Fittable1DModel):
 
 def _in_range(x, valid):
     """Return the wavelengths, or raise where the law does not hold."""
-    value = np.asarray(x.to_value(u.um) if hasattr(x, "unit") else x, dtype=float)
-    low, high = valid.to_value(u.um)
-    good = (value >= low * (1 - _EDGE)) & (value <= high * (1 + _EDGE))
-    if not np.all(good):
-        bad = value[~good].ravel()[0] if value.ndim else float(value)
-        raise WavelengthRangeError(
-            f"wavelength = {bad:g} um; the Serkowski law holds from {low:g} to {high:g} um"
-        )
-    return value
+    value = x.to_value(u.um) if hasattr(x, "unit") else x
+    return check_range(value, *valid.to_value(u.um), "the Serkowski law")
