@@ -616,6 +616,7 @@ class StateAnalyser(FrameOptic):
     [0.5, 0.0, 0.495, 0.0]
     """
 
+    _components = ("efficiency",)
     efficiency = Parameter(default=1.0, bounds=(-1, 1), description="modulation efficiency")
     transmission = Parameter(
         default=1.0, bounds=(0, 4), fixed=True, description="relative transmission"

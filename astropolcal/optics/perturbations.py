@@ -19,6 +19,7 @@ from astropolcal.mueller import UNITS
 from astropolcal.optics.core import _LinearOptic
 from astropolcal.optics.modulated import _Modulated
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
 __all__ = ["MuellerElement", "Perturbation"]
@@ -311,7 +312,7 @@ class MuellerElement(_LinearOptic):
         >>> MuellerElement.from_matrix(np.eye(4)).mueller()[3, 3]
         np.float64(1.0)
         """
-        matrix = np.asarray(matrix, dtype=float)
+        matrix = to_unit(matrix, None, "matrix")
         if matrix.shape[-2:] != (4, 4) or matrix.ndim not in (2, 3):
             raise ParameterError(
                 f"a Mueller matrix has shape (4, 4) or (n, 4, 4), not {matrix.shape}"
