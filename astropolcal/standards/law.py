@@ -60,7 +60,9 @@ def whittet_width(lambda_max):
     >>> law.K.tied = whittet_width
     """
     if isinstance(lambda_max, SerkowskiLaw):
-        return _INTERCEPT + _SLOPE * lambda_max.lambda_max.value
+        # in a fit it is a plain number of micrometres
+        given = lambda_max.lambda_max
+        lambda_max = u.Quantity(given.value, given.unit or u.um)
     return _INTERCEPT + _SLOPE * length_to_um(lambda_max, "lambda_max")
 
 
@@ -302,16 +304,24 @@ class SerkowskiLaw(Fittable1DModel):
                 f"the covariance has {len(matrix)} rows; it must have {len(self.param_names)} "
                 f"({', '.join(self.param_names)}) or {len(free)} (free: {', '.join(free)})"
             )
-        scale = [(getattr(self, n).unit or u.one).to(_CANONICAL[n]) for n in names]
-        place = [self.param_names.index(name) for name in names]
-        full = np.zeros((len(self.param_names),) * 2)
-        full[np.ix_(place, place)] = matrix * np.outer(scale, scale)
-        if "K" not in names and self.tied["K"] is whittet_width:
-            # a K that is tied to lambda_max has its part of the covariance
-            spread = np.eye(len(full))
-            spread[self.param_names.index("K"), self.param_names.index("lambda_max")] = _SLOPE
-            full = spread @ full @ spread.T
-        return full
+        scale = [(getattr(self, n).unit or u.one).to(_CANONICAL[n]) for n in self.param_names]
+        moves = np.array([self._moves(name, names) for name in self.param_names])
+        return moves @ matrix @ moves.T * np.outer(scale, scale)
+
+    def _moves(self, name, names):
+        """Return by how much a parameter moves with others, by its tie if it is not one of them."""
+        tie = self.tied[name]
+        if name in names or not tie:
+            return [float(name == other) for other in names]
+        found = []
+        for other in names:
+            ends, step = [], 1e-4 * max(abs(getattr(self, other).value), 1e-3)
+            for sign in (1, -1):
+                moved = self.copy()
+                getattr(moved, other).value += sign * step
+                ends.append(float(u.Quantity(tie(moved)).value))
+            found.append((ends[0] - ends[1]) / (2 * step))
+        return found
 
 
 def _in_range(x, valid):

@@ -48,6 +48,9 @@ def test_width_defaults_to_the_relation_of_whittet():
     # Whittet et al. 1992: K = 0.01 + 1.66 lambda_max
     assert SerkowskiLaw(lambda_max=0.6 * u.um).K.value == pytest.approx(1.006)
     assert whittet_width(600 * u.nm) == pytest.approx(1.006)
+    law = SerkowskiLaw()
+    law.lambda_max = 600 * u.nm
+    assert whittet_width(law) == pytest.approx(1.006)
 
 
 @settings(max_examples=40)
@@ -153,6 +156,16 @@ def test_a_tied_width_carries_the_error_of_lambda_max():
     low, high = (SerkowskiLaw(lambda_max=(0.55 + s) * u.um).q(1.5 * u.um) for s in (-step, step))
     expected = ((high - low) / (2 * step)) ** 2 * 1e-4
     assert law.stokes(1.5 * u.um, matrix).covariance[0, 0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_whatever_a_width_is_tied_to_its_error_is_that_of_many_laws_drawn():
+    for intercept, slope in ((2.5, -1.66), (-0.5, 2.6)):
+        law = SerkowskiLaw(p_max=0.04, K=intercept + slope * 0.55)
+        law.K.tied = lambda model: intercept + slope * model.lambda_max.value  # noqa: B023
+        error = law.stokes(2.2 * u.um, np.diag([1e-3, 0.02]) ** 2).covariance[0, 0] ** 0.5
+        p_max, longest = np.random.default_rng(1).normal([0.04, 0.55], [1e-3, 0.02], (9999, 2)).T
+        drawn = p_max * np.exp(-(intercept + slope * longest) * np.log(longest / 2.2) ** 2)
+        assert error == pytest.approx(drawn.std(), rel=0.05)
 
 
 def test_a_width_that_is_fixed_and_not_tied_has_no_error():
