@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.modeling import models
 from astropy.time import Time
+from scipy.stats import norm
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.chain import (
@@ -442,6 +443,20 @@ def test_laws_that_cannot_be(still):
         follow(still, "polarizer.theta", LINE, "time", since="soon")
     with pytest.raises(ParameterError, match="is a number, not the angle of a stage"):
         optics.DriftRotator(mount="time")
+
+
+def test_a_prior_is_of_the_coefficient_in_its_unit(still):
+    hourly = models.Polynomial1D(1, c0=0 * u.deg, c1=0.1 * u.deg / u.hour)
+    hourly.c1.prior = norm(0.1, 0.01)
+    with pytest.raises(ParameterError, match="prior is of a value in deg / h"):
+        follow(still, "polarizer.theta", hourly, "time", since=SINCE)
+    hourly.c1.prior = Normal(0.1 * u.deg / u.hour, 0.01 * u.deg / u.hour)
+    daily = models.Polynomial1D(1, c1=2.4 * u.deg / u.day)
+    daily.c1.prior = norm(2.4, 0.24)
+    for model in (hourly, daily):
+        chain = follow(still, "polarizer.theta", model, "time", since=SINCE)
+        assert chain["polarizer"].theta_c1.value == pytest.approx(2.4)
+        assert chain["polarizer"].theta_c1.prior is model.c1.prior
 
 
 def changed(observations, **columns):

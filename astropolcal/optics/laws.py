@@ -211,6 +211,11 @@ def _coefficient(label, given, unit):
         factor = float(to_unit(1.0 * given.unit, unit, label))
     if value.ndim > 1 or not np.all(np.isfinite(value)):
         raise ParameterError(f"{label} = {value} must be a finite number, or one per wavelength")
+    if factor != 1 and hasattr(given.prior, "dist"):
+        # a distribution of scipy has no unit
+        raise ParameterError(
+            f"{label}: its prior is of a value in {given.unit}; give model and prior in {unit}"
+        )
     bounds = [None if bound is None else float(bound) * factor for bound in given.bounds]
     new = OpticParameter(
         name=label.rpartition(".")[2],
