@@ -334,7 +334,11 @@ def spelled_model(model):
     # what is not there, and what a file does not say, is not a number
     domains = (getattr(model, key, None) for key in ("domain", "x_domain", "y_domain"))
     limits = [np.array([np.nan] if x is None else x, dtype=float) for x in domains]
-    return {"model": type(model).__name__, "parameters": values, "domains": limits}
+    known = {"model": type(model).__name__, "parameters": values, "domains": limits}
+    # checksums of before did not know of windows, hardly any of which is not the default
+    windows = {key: getattr(model, key, None) for key in ("window", "x_window", "y_window")}
+    windows = {k: np.array(x, dtype=float) for k, x in windows.items() if x not in (None, (-1, 1))}
+    return known | ({"windows": windows} if windows else {})
 
 
 def _parameter_node(optic, key):
