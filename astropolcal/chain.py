@@ -585,9 +585,9 @@ def _check_axes(wavelength, positions):
     placed, shapes = {}, {}
     for name, value in (positions or {}).items():
         position = finite_position(value, name)
-        one_each = name in FLUXES and position.ndim > 1
-        if one_each and position.shape[1:] != grid:
-            several = f" or (n_frames, {grid[0]})" if grid else ""
+        one_each = position.ndim > 1
+        if one_each and not (name in FLUXES and position.shape[1:] == grid):
+            several = f" or (n_frames, {grid[0]})" if grid and name in FLUXES else ""
             raise ChainError(
                 f"{name} has shape {position.shape}; allowed are a scalar, (n_frames,){several}"
             )

@@ -487,8 +487,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def _dispersion_at(self, wavelength):
         """Return the dispersion, or None without a wavelength where none is needed."""
-        if wavelength is not None and not np.all(wavelength > 0):
-            raise ParameterError(f"wavelength = {wavelength} um must be positive")
+        if wavelength is not None and not np.all((wavelength > 0) & np.isfinite(wavelength)):
+            raise ParameterError(f"wavelength = {wavelength} um must be positive and finite")
         # only a law needs the wavelength; a constant matrix is the same at all
         if wavelength is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
