@@ -16,7 +16,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.units import check_range, length_to_um
+from astropolcal.units import check_range, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
 __all__ = [
@@ -320,7 +320,7 @@ class TabulatedLaw:
 
     def __init__(self, wavelength, index):
         self._wavelength = np.atleast_1d(length_to_um(wavelength))
-        self._index = np.atleast_1d(np.asarray(index, dtype=complex))
+        self._index = np.atleast_1d(to_unit(index, None, "index", complex))
         if self._wavelength.ndim != 1 or self._wavelength.shape != self._index.shape:
             raise ParameterError(
                 f"a table of {self._wavelength.shape} wavelengths has {self._index.shape} "

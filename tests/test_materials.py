@@ -415,6 +415,14 @@ def test_a_table_is_not_extrapolated_whatever_its_material_claims():
             wide.index(wavelength * u.um)
 
 
+def test_a_table_keeps_unit_and_mask():
+    percent = TabulatedLaw([1, 2] * u.um, [150, 160] * u.percent)
+    glass = IsotropicMaterial("glass", percent, measured_range=[1, 2] * u.um)
+    assert glass.index(1 * u.um) == 1.5
+    with pytest.raises(ParameterError, match="in row 2 of a table"):
+        TabulatedLaw([1, 2] * u.um, np.ma.array([0.3 + 7j, 0.5 + 9j], mask=[False, True]))
+
+
 def test_a_table_that_is_not_one_is_refused():
     for wavelength, index, message in [
         ([1.0, 2.0], [1.5], "one per wavelength"),

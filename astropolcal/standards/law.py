@@ -326,5 +326,5 @@ class SerkowskiLaw(Fittable1DModel):
 
 def _in_range(x, valid):
     """Return the wavelengths, or raise where the law does not hold."""
-    value = x.to_value(u.um) if hasattr(x, "unit") else x
+    value = length_to_um(x) if hasattr(x, "unit") else x
     return check_range(value, *valid.to_value(u.um), "the Serkowski law")

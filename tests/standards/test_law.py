@@ -5,12 +5,14 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.modeling.fitting import TRFLSQFitter
+from astropy.utils.masked import Masked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.standards import SerkowskiLaw, whittet_width
 
+HIDDEN = Masked([0.5, 0.6] * u.um, mask=[False, True])
 WAVELENGTH = np.linspace(0.4, 2.2, 15) * u.um
 degrees = st.floats(0.001, 0.12)
 maxima = st.floats(0.4, 0.9)
@@ -193,7 +195,7 @@ def test_bad_covariance_is_refused():
 
 
 def test_wavelength_out_of_range_is_refused():
-    for wavelength in [0.2 * u.um, 2.6 * u.um, [1.0, 3.0] * u.um, np.nan * u.um]:
+    for wavelength in [0.2 * u.um, 2.6 * u.um, [1.0, 3.0] * u.um, np.nan * u.um, HIDDEN]:
         law = SerkowskiLaw()
         for function in (law, law.stokes, law.angle):
             with pytest.raises(WavelengthRangeError, match=r"0\.28 to 2\.5 um"):
