@@ -216,6 +216,18 @@ def test_jacobian_is_that_of_central_differences(still, frames):
 # --- calibration --------------------------------------------------------------------------------
 
 
+def test_derivatives_to_coefficients_of_any_size():
+    plate = optics.LinearRetarder(retardance=90 * u.deg, name="plate")
+    for phase in (0, 1e-12, 1e-9, 1e-6, 1e-3, 0.3):
+        chain = follow(plate, "plate.retardance", models.Sine1D(10, 0.01, phase), "hwp")
+        slopes = system_mueller_derivatives(chain, positions={"hwp": 10 * u.deg})
+        angle = 2 * np.pi * (0.1 + phase)
+        slope = np.deg2rad(10) * 2 * np.pi * np.cos(angle)
+        expected = -np.sin(np.deg2rad(90 + 10 * np.sin(angle))) * slope
+        found = slopes["plate.retardance_phase"][2, 2]
+        np.testing.assert_allclose(found, expected, rtol=1e-6, err_msg=f"{phase}")
+
+
 def test_recovery_with_errors(still, frames):
     chain = law_of_time(still)
     chain = follow(chain, "derotator.retardance", PLANE, ("x", "y"))

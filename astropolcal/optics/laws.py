@@ -74,8 +74,8 @@ class Law:
     def rate(self, lam, places, coefficients, i):
         """Return the derivative of `value` to coefficient i, by central differences."""
         inputs, numbers = self._inputs(lam, places), self._numbers(coefficients)
-        # exact to rounding where the law is linear
-        small = 1e-6 * np.where(numbers[i] == 0, 1.0, np.abs(numbers[i]))
+        # exact to rounding where the law is linear; not lost in it where a coefficient is tiny
+        small = 1e-6 * np.maximum(np.abs(numbers[i]), 0.1)
         step = np.ones_like(small) if _is_linear(self.model) else small
         high, low = ([*numbers[:i], numbers[i] + s, *numbers[i + 1 :]] for s in (step, -step))
         change = self._evaluated(inputs, high) - self._evaluated(inputs, low)
