@@ -132,6 +132,21 @@ def test_law_is_added_where_its_inputs_are(still):
         system_mueller(with_beam(chain, "left"), WAVELENGTH, {"hwp": 0 * u.deg})
 
 
+def test_law_of_the_stage_of_its_optic():
+    plate = optics.LinearRetarder(retardance=90 * u.deg, mount="-hwp", name="plate")
+    chain = follow(plate, "plate.retardance", models.Sine1D(10, 1 / 360), "hwp")
+    for angle in (30 * u.deg, 0.4 * u.rad, [[10], [80]] * u.deg):
+        there = at_positions(chain, hwp=angle)
+        other = chain.copy()
+        other.position = angle
+        for found in (chain.mueller(position=angle), other.mueller()):
+            np.testing.assert_array_equal(found, there.mueller())
+        for key, slope in chain.mueller_derivatives(position=angle).items():
+            np.testing.assert_array_equal(slope, there.mueller_derivatives()[key])
+    still = optics.LinearRetarder(retardance=95 * u.deg, theta=-30 * u.deg).mueller()
+    np.testing.assert_allclose(chain.mueller(position=30 * u.deg), still, atol=1e-15)
+
+
 def test_copies_with_other_values_follow_the_same_law(still):
     plate = everything(still)["hwp"]
     other = plate.with_parameters(retardance=5 * u.deg, retardance_c1=0.1)

@@ -311,6 +311,13 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     @position.setter
     def position(self, value):
         self._position = finite_position(value, "position", self.stage)
+        self._places = self._places_at(value)
+
+    def _places_at(self, position):
+        """Return where the inputs of laws stand, the stage of the optic at a position, if any."""
+        if position is None or not self._follows:
+            return self._places
+        return self._places | {self.stage: finite_position(position, "position", self.stage)}
 
     # ---- values on canonical floats ---------------------------------------
 
@@ -423,7 +430,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             As `mueller`.
         """
         found = self._resolve(wavelength, position)
-        derivatives = self._oriented_derivatives(*found, self._rates_at(wavelength, self._places))
+        rates = self._rates_at(wavelength, self._places_at(position))
+        derivatives = self._oriented_derivatives(*found, rates)
         return {
             key: self._per_unit(key, value)
             for key, value in zip(self.param_names, derivatives, strict=True)
@@ -438,7 +446,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _resolve(self, wavelength, position, parameters=None, places=None):
         """Bring wavelength, orientation and values to canonical floats, with what laws add."""
         lam, shift, values = self._read(wavelength, position, parameters)
-        values = self._followed(lam, self._places if places is None else places, values)
+        places = self._places_at(position) if places is None else places
+        values = self._followed(lam, places, values)
         return (*self._moved(self._dispersion_at(lam), values[0], shift), values[1:])
 
     # ---- laws that parameters follow ----------------------------------------
