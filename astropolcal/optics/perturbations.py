@@ -200,6 +200,16 @@ class Perturbation(_BeamOptic, _Modulated):
         kwargs.setdefault("mount", self._dependence.driver)
         super().__init__(*args, **kwargs)
 
+    @_BeamOptic.mount.setter
+    def mount(self, value):
+        """Set the stage, which has to be what the perturbation follows, if anything."""
+        driver = self._dependence.driver
+        if driver is not None and str(value).removeprefix("-") != driver:
+            raise ParameterError(
+                f"Perturbation: mount = {value!r}, but {self.dependence!r} follows {driver!r}"
+            )
+        _BeamOptic.mount.fset(self, value)
+
     @property
     def kind(self):
         """Key of the generator."""
