@@ -40,13 +40,6 @@ def _finite_angle(value, name):
     return angle
 
 
-def _fraction(value, name):
-    """Return a number between -1 and 1, or raise."""
-    value = to_unit(value, None, name)
-    require(np.abs(value) <= 1, value, name, "between -1 and 1")
-    return value
-
-
 def _rotation_matrix(theta):
     """Return T(theta) for floats in radian."""
     theta = np.asarray(theta, dtype=float)
@@ -189,9 +182,9 @@ def diattenuator_retarder(diattenuation, retardance):
 
     Equation for M_DR in Sec. 3 of the CHARIS paper.
     """
-    return _diattenuator_retarder(
-        _fraction(diattenuation, "diattenuation"), _finite_angle(retardance, "retardance")
-    )
+    strength = to_unit(diattenuation, None, "diattenuation")
+    require(np.abs(strength) <= 1, strength, "diattenuation", "between -1 and 1")
+    return _diattenuator_retarder(strength, _finite_angle(retardance, "retardance"))
 
 
 def elliptical_retarder(horizontal, diagonal, circular):

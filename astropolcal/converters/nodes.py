@@ -343,7 +343,7 @@ def spelled_model(model):
 
 def _parameter_node(optic, key):
     parameter = getattr(optic, key)
-    label = f"{optic.name or type(optic).__name__}.{key}"
+    label = f"{optic._label}.{key}"
     if parameter.tied:
         raise CalibrationFileError(
             f"{label} has a callable 'tied', which files cannot hold; use ties={{...: Tie(...)}} "

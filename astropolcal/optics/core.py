@@ -334,9 +334,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             self._check_unit(key, parameter.unit)
             value = np.asarray(parameter.value)
             if not np.isfinite(value).all():
-                raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} = {value} must be finite"
-                )
+                raise ParameterError(f"{self._label}.{key} = {value} must be finite")
             values.append(value * canonical_factor(parameter.unit))
         where = [self.param_names.index(key) for key in self._components]
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
@@ -344,16 +342,20 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if np.any(length > 1 + _ROUNDING):
             what = self._components[0] if len(where) == 1 else "diattenuation"
             raise ParameterError(
-                f"{self.name or type(self).__name__}: the {what} is {np.max(length):.4g}; "
-                "allowed is 1 at most"
+                f"{self._label}: the {what} is {np.max(length):.4g}; allowed is 1 at most"
             )
         return values
+
+    @property
+    def _label(self):
+        """What messages call the optic."""
+        return self.name or type(self).__name__
 
     def _check_unit(self, key, unit):
         # a fitter may leave a parameter behind without its unit
         if unit is not None and unit != self._declared(key).unit:
             raise ParameterError(
-                f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
+                f"{self._label}.{key} is in {unit}, but its "
                 f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
             )
 
@@ -486,7 +488,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """Let a parameter follow a law, whose coefficients become parameters of this optic."""
         if key not in type(self).param_names or key in self._follows:
             reason = "follows a law already; add the models" if key in self._follows else "is none"
-            raise ParameterError(f"{self.name or type(self).__name__}.{key} {reason}")
+            raise ParameterError(f"{self._label}.{key} {reason}")
         laws, own = self._follows | {key: law}, type(self).param_names
         # in the order of the parameters, whichever came first
         self._follows = {name: laws[name] for name in own if name in laws}
@@ -532,7 +534,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
                 raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
+                    f"{self._label}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
             found.append(value)
@@ -590,7 +592,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # astropy gives the outputs of scalar inputs back as scalars
         if matrix[0, 0].size > 1 and all(np.size(x) == 1 for x in (wavelength, *light)):
             raise ParameterError(
-                f"{self.name or type(self).__name__} stands at {matrix[0, 0].size} positions: "
+                f"{self._label} stands at {matrix[0, 0].size} positions: "
                 f"give light of shape {matrix[0, 0].shape}"
             )
         return [sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix]
