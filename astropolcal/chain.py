@@ -478,24 +478,22 @@ def _oriented_leaves(chain, wavelength, positions):
     for leaf in leaves(chain):
         check_inputs(leaf, positions)
         dispersion, angle, values = leaf._resolve(wavelength, None, places=positions)
-        if leaf.stage and leaf.stage not in positions:
-            raise ChainError(
-                f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}, but "
-                f"positions has only {sorted(positions)}"
-            )
         shift = leaf.stage_sign * positions[leaf.stage] if leaf.stage else 0.0
         yield leaf, *leaf._moved(dispersion, angle, shift), values
 
 
 def check_inputs(leaf, positions):
-    """Refuse positions without what the laws of an optic depend on."""
-    for key, law in leaf._follows.items():
-        for name in law.of:
-            if name not in positions and name != "wavelength":
-                raise ChainError(
-                    f"{leaf.name or type(leaf).__name__}.{key} follows a law of {name!r}, but "
-                    f"positions has only {sorted(positions)}"
-                )
+    """Refuse positions without the stage of an optic or what its laws depend on."""
+    needed = [
+        (name, f"{leaf._label}.{key} follows a law of {name!r}")
+        for key, law in leaf._follows.items()
+        for name in law.of
+    ]
+    if leaf.stage:
+        needed.append((leaf.stage, f"optic {leaf._label} stands on stage {leaf.stage!r}"))
+    for name, words in needed:
+        if name not in positions and name != "wavelength":
+            raise ChainError(f"{words}, but positions has only {sorted(positions)}")
 
 
 def system_mueller(chain, wavelength=None, positions=None):
@@ -585,9 +583,9 @@ def _check_axes(wavelength, positions):
     placed, shapes = {}, {}
     for name, value in (positions or {}).items():
         position = finite_position(value, name)
-        one_each = name in FLUXES and position.ndim > 1
-        if one_each and position.shape[1:] != grid:
-            several = f" or (n_frames, {grid[0]})" if grid else ""
+        one_each = position.ndim > 1
+        if one_each and not (name in FLUXES and position.shape[1:] == grid):
+            several = f" or (n_frames, {grid[0]})" if grid and name in FLUXES else ""
             raise ChainError(
                 f"{name} has shape {position.shape}; allowed are a scalar, (n_frames,){several}"
             )

@@ -15,8 +15,8 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.units import length_to_um
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import check_range, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
 __all__ = [
@@ -26,9 +26,6 @@ __all__ = [
     "get_material",
     "register_material",
 ]
-
-# lets the ends of a range survive the conversion of their unit
-_EDGE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -117,17 +114,8 @@ class _Ranged:
 
     def _checked_um(self, wavelength_um):
         """Return the wavelengths, or raise if one is out of range or a NaN."""
-        wavelength_um = np.asarray(wavelength_um, dtype=float)
-        low, high = self._valid_um
-        # NaN compares as False and is refused with the others
-        inside = (wavelength_um >= low * (1 - _EDGE)) & (wavelength_um <= high * (1 + _EDGE))
-        if inside.all():
-            return wavelength_um
-        offending = wavelength_um[~inside].ravel()[0]
-        raise WavelengthRangeError(
-            f"the refractive index of {self.name} is known from {low:g} to {high:g} um, "
-            f"not at {offending:.6g} um"
-        )
+        words = f"the refractive index of {self.name}"
+        return check_range(wavelength_um, *self._valid_um, words)
 
 
 class IsotropicMaterial(_Ranged):
@@ -332,7 +320,7 @@ class TabulatedLaw:
 
     def __init__(self, wavelength, index):
         self._wavelength = np.atleast_1d(length_to_um(wavelength))
-        self._index = np.atleast_1d(np.asarray(index, dtype=complex))
+        self._index = np.atleast_1d(to_unit(index, None, "index", complex))
         if self._wavelength.ndim != 1 or self._wavelength.shape != self._index.shape:
             raise ParameterError(
                 f"a table of {self._wavelength.shape} wavelengths has {self._index.shape} "
@@ -351,7 +339,10 @@ class TabulatedLaw:
             )
 
     def _index_um(self, wavelength_um):
-        return np.interp(wavelength_um, self._wavelength, self._index)
+        # a material may claim a wider range
+        low, high = self._wavelength[[0, -1]]
+        inside = check_range(wavelength_um, low, high, "the index of a table")
+        return np.interp(inside, self._wavelength, self._index)
 
 
 def _built_in(name, entry):

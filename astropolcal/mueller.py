@@ -15,6 +15,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.stokes import checked_error, require
 from astropolcal.units import angle_to_rad, to_unit
 
 __all__ = ["elliptical_retarder", "linear_retarder", "rotate"]
@@ -28,28 +29,15 @@ def _mueller_array(matrix):
     matrix = to_unit(matrix, None, "matrix")
     if matrix.shape[-2:] != (4, 4):
         raise ParameterError(f"matrix has shape {matrix.shape}; a Mueller matrix is (..., 4, 4)")
-    bad = np.argwhere(~np.isfinite(matrix)).tolist()
-    if bad:
-        where = tuple(bad[0])
-        raise ParameterError(f"matrix = {matrix[where]} at index {where} must be finite")
+    require(np.isfinite(matrix), matrix, "matrix", "finite")
     return matrix
 
 
 def _finite_angle(value, name):
     """Return an angle in radian, or raise if it is not finite."""
     angle = angle_to_rad(value, name)
-    if not np.isfinite(angle).all():
-        raise ParameterError(f"{name} = {value} must be finite")
+    require(np.isfinite(angle), angle, name, "finite")
     return angle
-
-
-def _fraction(value, name):
-    """Return a number between -1 and 1, or raise."""
-    value = to_unit(value, None, name)
-    bad = ~(np.abs(value) <= 1)
-    if bad.any():
-        raise ParameterError(f"{name} = {value[bad].ravel()[0]} must be between -1 and 1")
-    return value
 
 
 def _rotation_matrix(theta):
@@ -194,9 +182,9 @@ def diattenuator_retarder(diattenuation, retardance):
 
     Equation for M_DR in Sec. 3 of the CHARIS paper.
     """
-    return _diattenuator_retarder(
-        _fraction(diattenuation, "diattenuation"), _finite_angle(retardance, "retardance")
-    )
+    strength = to_unit(diattenuation, None, "diattenuation")
+    require(np.abs(strength) <= 1, strength, "diattenuation", "between -1 and 1")
+    return _diattenuator_retarder(strength, _finite_angle(retardance, "retardance"))
 
 
 def elliptical_retarder(horizontal, diagonal, circular):
@@ -319,12 +307,8 @@ _SINGULAR = 1e-12
 def _transmitting(matrix):
     """Return Mueller matrices that transmit unpolarized light, or raise."""
     matrix = _mueller_array(matrix)
-    mean = matrix[..., 0, 0]
-    if not (mean > 0).all():
-        raise ParameterError(
-            f"matrix[0, 0] = {mean[~(mean > 0)].ravel()[0]} must be positive: "
-            "it is the transmission of unpolarized light"
-        )
+    mean, words = matrix[..., 0, 0], "positive: it is the transmission of unpolarized light"
+    require(mean > 0, mean, "matrix[0, 0]", words)
     return matrix
 
 
@@ -450,9 +434,7 @@ def is_physical(matrix, tolerance=1e-9):
     most four optics without depolarization where its coherency matrix has no negative eigenvalue:
     Cloude 1990, doi:10.1117/12.962889.
     """
-    matrix, tolerance = _mueller_array(matrix), to_unit(tolerance, None, "tolerance")
-    if not (tolerance >= 0).all():
-        raise ParameterError(f"tolerance = {tolerance} must be zero or positive")
+    matrix, tolerance = _mueller_array(matrix), checked_error(tolerance, "tolerance")
     smallest = np.linalg.eigvalsh(coherency_matrix(matrix))[..., 0]
     return smallest >= -tolerance * matrix[..., 0, 0]
 

@@ -17,7 +17,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import get_material
 from astropolcal.mueller import diattenuator_retarder
-from astropolcal.units import angle_to_rad, length_to_um
+from astropolcal.units import angle_to_rad, length_to_um, to_unit
 
 __all__ = ["reflect"]
 
@@ -291,10 +291,7 @@ def _index(material, lam):
 
 
 def _plain_index(value):
-    try:
-        index = np.asarray(value, dtype=complex)
-    except (TypeError, ValueError):
-        raise ParameterError(f"{value!r} is neither a material nor an index") from None
+    index = to_unit(value, None, "material or index", complex)
     if not np.all(np.isfinite(index) & (index.real >= 0) & (index.imag >= 0) & (index != 0)):
         raise ParameterError(f"index = {value}; allowed are n + ik with n and k not negative")
     return index

@@ -16,7 +16,7 @@ import numpy as np
 from astropy.time import Time
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.files import one_line
 
 __all__ = []
@@ -66,20 +66,21 @@ def canonical_factor(unit):
         return 1.0
 
 
-def to_unit(value, unit, name="value"):
+def to_unit(value, unit, name="value", kind=float):
     """
     Return a value as floats in a unit, NaN where masked; ``name`` is what messages call it.
 
-    Plain numbers are accepted only where the unit is None or dimensionless.
+    Plain numbers are accepted only where the unit is None or dimensionless, complex ones where
+    the ``kind`` is complex.
     """
     unit = u.dimensionless_unscaled if unit is None else u.Unit(unit)
     # numpy would drop the imaginary part with no more than a warning
-    if np.iscomplexobj(value):
+    if kind is float and np.iscomplexobj(value):
         raise ParameterError(f"{name} = {value!r} is complex; allowed are real numbers")
     # parameters of astropy and columns of tables carry a unit without being quantities
     if isinstance(value, u.Quantity) or hasattr(value, "unit"):
         try:
-            return _known(np.asarray(u.Quantity(value).to_value(unit), dtype=float), value)
+            return _known(np.asarray(u.Quantity(value).to_value(unit), dtype=kind), value)
         except u.UnitConversionError:
             raise ParameterError(
                 f"{name} has unit {value.unit}, which is not convertible to "
@@ -88,7 +89,7 @@ def to_unit(value, unit, name="value"):
     if unit != u.dimensionless_unscaled:
         raise ParameterError(f"{name} = {value!r} needs a unit such as {unit}")
     try:
-        found = np.asarray(value, dtype=float)
+        found = np.asarray(value, dtype=kind)
     except (TypeError, ValueError):
         raise ParameterError(f"{name} = {value!r} is not a number") from None
     # numpy makes NaN of None
@@ -101,6 +102,14 @@ def _known(found, value):
     """Return floats with NaN where the value they were made of is masked; numpy drops the mask."""
     mask = getattr(value, "mask", False)
     return np.where(mask, np.nan, found) if np.any(mask) else found
+
+
+def positive_number(value, name):
+    """Return one number above zero as a float, or raise."""
+    number = to_unit(value, None, name)
+    if number.ndim or not (np.isfinite(number) and number > 0):
+        raise ParameterError(f"{name} = {value!r} must be one positive number")
+    return float(number)
 
 
 def angle_to_rad(value, name="angle"):
@@ -117,15 +126,33 @@ def wavelengths_of(value, name="wavelength"):
     """Return wavelengths as a quantity of any shape; raise unless they are lengths above zero."""
     try:
         found = u.Quantity(value)
-        good = (found.to_value(u.um) > 0) & np.isfinite(found.value)
+        # a masked one is not finite
+        plain = length_to_um(value if hasattr(value, "unit") else found)
+        good = (plain > 0) & np.isfinite(plain)
     # an error of astropy's units is a TypeError, too
-    except (TypeError, ValueError, u.UnitsError):
+    except (TypeError, ValueError, ParameterError):
         good = np.zeros(1, dtype=bool)
     if not good.size or not good.all():
         raise ParameterError(
             f"{name} = {one_line(value)} needs a unit such as nm, and finite numbers above zero"
         )
     return found
+
+
+def check_range(wavelength, low, high, what, slack=1e-9):
+    """
+    Return wavelengths (um) as floats, or raise unless ``what`` is known at all of them.
+
+    The ends of the range survive the conversion of their unit, by a share ``slack``.
+    """
+    wavelength = np.asarray(wavelength, dtype=float)
+    # written so that NaN is outside
+    outside = ~((wavelength >= low * (1 - slack)) & (wavelength <= high * (1 + slack)))
+    if outside.any():
+        raise WavelengthRangeError(
+            f"{what} is known from {low:g} to {high:g} um, not at {wavelength[outside][0]:.6g} um"
+        )
+    return wavelength
 
 
 def check_seed(seed, *, generator=True):

@@ -373,6 +373,9 @@ def test_bad_wavelengths_and_positions(charis):
         system_mueller(charis, WAVELENGTH, still | {"hwp": 3})
     with pytest.raises(ParameterError, match="hwp = nan deg must be finite"):
         system_mueller(charis, WAVELENGTH, still | {"hwp": np.nan * u.deg})
+    for function in (system_mueller, system_mueller_derivatives):
+        with pytest.raises(ChainError, match=r"hwp has shape \(2, 1\); allowed are a scalar"):
+            function(charis, WAVELENGTH, still | {"hwp": [[0], [10]] * u.deg})
 
 
 def test_angle_and_number_are_not_exchanged(uneven):

@@ -406,6 +406,23 @@ def test_what_is_no_material_is_not_registered(registry):
             register_material(thing)
 
 
+def test_a_table_is_not_extrapolated_whatever_its_material_claims():
+    law = TabulatedLaw([1.1, 1.7, 2.4] * u.um, [0.3 + 7.5j, 0.5 + 11j, 0.8 + 15j])
+    wide = IsotropicMaterial("aged silver", law, measured_range=[0.5, 5.0] * u.um)
+    np.testing.assert_array_equal(wide.index([1100, 2400] * u.nm), [0.3 + 7.5j, 0.8 + 15j])
+    for wavelength in (0.6, [1.2, 4.0]):
+        with pytest.raises(WavelengthRangeError, match=r"1\.1 to 2\.4 um"):
+            wide.index(wavelength * u.um)
+
+
+def test_a_table_keeps_unit_and_mask():
+    percent = TabulatedLaw([1, 2] * u.um, [150, 160] * u.percent)
+    glass = IsotropicMaterial("glass", percent, measured_range=[1, 2] * u.um)
+    assert glass.index(1 * u.um) == 1.5
+    with pytest.raises(ParameterError, match="in row 2 of a table"):
+        TabulatedLaw([1, 2] * u.um, np.ma.array([0.3 + 7j, 0.5 + 9j], mask=[False, True]))
+
+
 def test_a_table_that_is_not_one_is_refused():
     for wavelength, index, message in [
         ([1.0, 2.0], [1.5], "one per wavelength"),

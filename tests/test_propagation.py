@@ -393,7 +393,7 @@ def test_chain_without_beam_splitter_has_a_dark_left_beam():
 def test_stage_without_position():
     chain = optics.LinearRetarder(mount="hwp", name="plate") | optics.WollastonPrism()
     assert stages(chain) == ("hwp",)
-    with pytest.raises(ChainError, match=r"optic plate stands on stage 'hwp'; .* \['altitude'\]"):
+    with pytest.raises(ChainError, match=r"optic plate stands on stage 'hwp', .* \['altitude'\]"):
         Propagator(chain, LAM, {"altitude": np.zeros(2)})
 
 

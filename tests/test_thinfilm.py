@@ -290,6 +290,15 @@ def test_an_impossible_index_is_refused():
             reflect(LIGHT, 0 * u.deg, index)
 
 
+def test_an_index_keeps_unit_and_mask():
+    plain = reflect(LIGHT, 45 * u.deg, 1.5, [(1.4, 200 * u.nm)], ambient=1.1)
+    films = [(140 * u.percent, 200 * u.nm)]
+    percent = reflect(LIGHT, 45 * u.deg, 150 * u.percent, films, ambient=110 * u.percent)
+    np.testing.assert_allclose(percent.diattenuation, plain.diattenuation)
+    with pytest.raises(ParameterError, match=r"index = .*; allowed are"):
+        reflect(LIGHT, 0 * u.deg, np.ma.array([1.5, 1.6], mask=[False, True]))
+
+
 def test_an_absorbing_ambient_is_refused():
     for ambient in [0.0, 1 + 0.1j, -1.0]:
         with pytest.raises(ParameterError, match=r"ambient = .* real, positive|index = "):
@@ -303,7 +312,7 @@ def test_an_impossible_thickness_is_refused():
 
 
 def test_other_nonsense_is_refused():
-    with pytest.raises(ParameterError, match="neither a material nor an index"):
+    with pytest.raises(ParameterError, match="material or index"):
         reflect(LIGHT, 0 * u.deg, object())
     with pytest.raises(ParameterError, match="unobtainium"):
         reflect(LIGHT, 0 * u.deg, "unobtainium")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.modeling import models
 from astropy.time import Time
+from scipy.stats import norm
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.chain import (
@@ -131,6 +132,21 @@ def test_law_is_added_where_its_inputs_are(still):
         system_mueller(with_beam(chain, "left"), WAVELENGTH, {"hwp": 0 * u.deg})
 
 
+def test_law_of_the_stage_of_its_optic():
+    plate = optics.LinearRetarder(retardance=90 * u.deg, mount="-hwp", name="plate")
+    chain = follow(plate, "plate.retardance", models.Sine1D(10, 1 / 360), "hwp")
+    for angle in (30 * u.deg, 0.4 * u.rad, [[10], [80]] * u.deg):
+        there = at_positions(chain, hwp=angle)
+        other = chain.copy()
+        other.position = angle
+        for found in (chain.mueller(position=angle), other.mueller()):
+            np.testing.assert_array_equal(found, there.mueller())
+        for key, slope in chain.mueller_derivatives(position=angle).items():
+            np.testing.assert_array_equal(slope, there.mueller_derivatives()[key])
+    still = optics.LinearRetarder(retardance=95 * u.deg, theta=-30 * u.deg).mueller()
+    np.testing.assert_allclose(chain.mueller(position=30 * u.deg), still, atol=1e-15)
+
+
 def test_copies_with_other_values_follow_the_same_law(still):
     plate = everything(still)["hwp"]
     other = plate.with_parameters(retardance=5 * u.deg, retardance_c1=0.1)
@@ -213,6 +229,18 @@ def test_jacobian_is_that_of_central_differences(still, frames):
 
 
 # --- calibration --------------------------------------------------------------------------------
+
+
+def test_derivatives_to_coefficients_of_any_size():
+    plate = optics.LinearRetarder(retardance=90 * u.deg, name="plate")
+    for phase in (0, 1e-12, 1e-9, 1e-6, 1e-3, 0.3):
+        chain = follow(plate, "plate.retardance", models.Sine1D(10, 0.01, phase), "hwp")
+        slopes = system_mueller_derivatives(chain, positions={"hwp": 10 * u.deg})
+        angle = 2 * np.pi * (0.1 + phase)
+        slope = np.deg2rad(10) * 2 * np.pi * np.cos(angle)
+        expected = -np.sin(np.deg2rad(90 + 10 * np.sin(angle))) * slope
+        found = slopes["plate.retardance_phase"][2, 2]
+        np.testing.assert_allclose(found, expected, rtol=1e-6, err_msg=f"{phase}")
 
 
 def test_recovery_with_errors(still, frames):
@@ -442,6 +470,20 @@ def test_laws_that_cannot_be(still):
         follow(still, "polarizer.theta", LINE, "time", since="soon")
     with pytest.raises(ParameterError, match="is a number, not the angle of a stage"):
         optics.DriftRotator(mount="time")
+
+
+def test_a_prior_is_of_the_coefficient_in_its_unit(still):
+    hourly = models.Polynomial1D(1, c0=0 * u.deg, c1=0.1 * u.deg / u.hour)
+    hourly.c1.prior = norm(0.1, 0.01)
+    with pytest.raises(ParameterError, match="prior is of a value in deg / h"):
+        follow(still, "polarizer.theta", hourly, "time", since=SINCE)
+    hourly.c1.prior = Normal(0.1 * u.deg / u.hour, 0.01 * u.deg / u.hour)
+    daily = models.Polynomial1D(1, c1=2.4 * u.deg / u.day)
+    daily.c1.prior = norm(2.4, 0.24)
+    for model in (hourly, daily):
+        chain = follow(still, "polarizer.theta", model, "time", since=SINCE)
+        assert chain["polarizer"].theta_c1.value == pytest.approx(2.4)
+        assert chain["polarizer"].theta_c1.prior is model.c1.prior
 
 
 def changed(observations, **columns):

@@ -7,8 +7,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.modeling import Parameter
-from astropy.table import Column, QTable
+from astropy.table import Column, MaskedColumn, QTable
 from astropy.time import Time
+from astropy.utils.masked import Masked
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ from astropolcal.units import (
     length_to_um,
     plain_number,
     to_unit,
+    wavelengths_of,
 )
 
 FINITE = st.floats(-1e6, 1e6)
@@ -111,6 +113,14 @@ def test_plain_numbers_where_there_is_no_unit():
 def test_percent_is_a_number_and_a_number_is_percent():
     assert to_unit(3 * u.percent, None) == pytest.approx(0.03)
     assert to_unit(0.03 * u.one, u.percent) == pytest.approx(3)
+
+
+def test_masked_wavelengths_are_not_known():
+    column = MaskedColumn([1.2, 1.6], mask=[False, True], unit="um")
+    for hidden in (column, Masked([1.2, 1.6] * u.um, mask=[False, True])):
+        with pytest.raises(ParameterError, match="finite numbers above zero"):
+            wavelengths_of(hidden)
+    assert wavelengths_of(Column([1200, 1600], unit="nm"))[1] == 1600 * u.nm
 
 
 def test_what_was_given_is_not_changed():

@@ -334,12 +334,16 @@ def spelled_model(model):
     # what is not there, and what a file does not say, is not a number
     domains = (getattr(model, key, None) for key in ("domain", "x_domain", "y_domain"))
     limits = [np.array([np.nan] if x is None else x, dtype=float) for x in domains]
-    return {"model": type(model).__name__, "parameters": values, "domains": limits}
+    known = {"model": type(model).__name__, "parameters": values, "domains": limits}
+    # checksums of before did not know of windows, hardly any of which is not the default
+    windows = {key: getattr(model, key, None) for key in ("window", "x_window", "y_window")}
+    windows = {k: np.array(x, dtype=float) for k, x in windows.items() if x not in (None, (-1, 1))}
+    return known | ({"windows": windows} if windows else {})
 
 
 def _parameter_node(optic, key):
     parameter = getattr(optic, key)
-    label = f"{optic.name or type(optic).__name__}.{key}"
+    label = f"{optic._label}.{key}"
     if parameter.tied:
         raise CalibrationFileError(
             f"{label} has a callable 'tied', which files cannot hold; use ties={{...: Tie(...)}} "

@@ -196,8 +196,9 @@ def add_nuisance(chains, datasets, nuisance):
     chains, names = list(chains), [observations.name for observations in datasets]
     # names of optics must do as optic.parameter
     labels = [re.sub(r"\W+", "_", name) for name in names]
-    # two tables may have one name
-    labels = [f"{t}_{i + 1}" if labels.count(t) > 1 else t for i, t in enumerate(labels)]
+    # two tables may have one name, and a third the name that a number would make of it
+    if len(set(labels)) < len(labels):
+        labels = [f"{label}_{i + 1}" for i, label in enumerate(labels)]
     size = len(common_wavelengths(datasets))
     for text in nuisance:
         kind, _, wanted = str(text).partition(":")

@@ -168,19 +168,40 @@ def _polarized_star(known, wavelength, name):
     middle = _middle(wavelength)
     law, errors = known.law, known.errors
     longest = law.lambda_max.quantity
-    # the catalogue's change of the angle is one per wavelength, here it is one per logarithm
-    per_log = (middle - longest) / np.log(middle / longest)
     departure = _DEPARTURE * law(middle).to_value(u.one)
     values = {
         "p_max": (law.p_max.value, errors["p_max"]),
         "lambda_max": (longest, errors["lambda_max"]),
         "K": (law.K.value, errors["K"]),
         "theta": (law.theta.quantity, errors["theta"]),
-        "rotation": (law.rotation.quantity * per_log, errors["rotation"] * per_log),
+        "rotation": _rotation(known, wavelength),
     }
     # the degree may depart from the law; its angle is better known than that
     values |= {f"q{suffix}": (0.0, departure * w) for suffix, w in _smooth(wavelength)}
     return _with_priors(name, middle, values)
+
+
+def _rotation(known, wavelength):
+    """
+    Return the change of the angle per logarithm of the wavelength, and its error (deg).
+
+    That of the catalogue is one per wavelength; the two are the same in the middle. The error
+    makes that of the angle at the wavelength farthest from lambda_max no less than it is in the
+    catalogue, where those of angle and rotation go together, and than the two laws differ.
+    """
+    from scipy.special import exprel
+
+    longest, rotation = known.law.lambda_max.quantity, known.law.rotation.value
+    logs = np.log((u.Quantity([_middle(wavelength), *wavelength]) / longest).to_value(u.one))
+    # (x - lambda_max) / log(x / lambda_max), in um
+    middle, *others = longest.value * exprel(logs)
+    far = np.argmax(np.abs(logs[1:]))
+    log, per_log = logs[1:][far], others[far]
+    shared, turn = known.covariance[4, 3:]
+    # of the variance at that wavelength what that of theta leaves, per square of the logarithm
+    lacking = turn * per_log**2 + 2 * shared * per_log / (log or 1.0)
+    error = np.hypot(np.sqrt(max(lacking, 0.0)), rotation * (per_log - middle))
+    return rotation * middle * u.deg, max(np.sqrt(turn) * middle, error) * u.deg
 
 
 def _with_priors(name, reference, values):

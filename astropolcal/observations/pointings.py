@@ -208,13 +208,13 @@ def sky_angles(observations, location=None):
     """
     Return altitude and parallactic angle of every frame, radian, (F,).
 
-    From the columns of that name; else from ``time`` (UTC), ``right_ascension`` and ``declination``
-    (columns or meta, degree) and the `~astropy.coordinates.EarthLocation`.
+    Each from the column of that name; else from ``time`` (UTC), ``right_ascension`` and
+    ``declination`` (columns or meta, degree) and the `~astropy.coordinates.EarthLocation`.
     """
-    there = observations.frames.colnames
-    if "altitude" in there and "parallactic" in there:
-        angles = observations.position("altitude"), observations.position("parallactic")
-    else:
+    names = "altitude", "parallactic"
+    stated = [name in observations.frames.colnames for name in names]
+    angles = [None, None]
+    if not all(stated):
         time, target = _times(observations.frames), _target(observations)
         needed = {
             "a column time (date and time of day)": time,
@@ -227,8 +227,12 @@ def sky_angles(observations, location=None):
                 f"{observations.name}: a star needs its pointing: columns altitude and "
                 f"parallactic, or all of {', '.join(needed)}; missing: {', '.join(lacking)}"
             )
-        angles = tuple(angle.to_value(u.rad) for angle in pointing(target, time, location))
-    altitude = angles[0]
+        angles = [angle.to_value(u.rad) for angle in pointing(target, time, location)]
+    # the stage of that name need not stand at the parallactic angle: what is stated counts
+    altitude, parallactic = (
+        observations.position(name) if known else angle
+        for name, known, angle in zip(names, stated, angles, strict=True)
+    )
     # written so that NaN is low
     low = ~(altitude > 0)
     if low.any():
@@ -237,7 +241,7 @@ def sky_angles(observations, location=None):
             f"{observations.name}, frame {observations.frames['frame'][frame]}: altitude = "
             f"{np.rad2deg(altitude[frame]):.4g} deg; a star is above 0 deg"
         )
-    return angles
+    return altitude, parallactic
 
 
 def _times(frames):

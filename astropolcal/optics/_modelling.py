@@ -17,8 +17,8 @@ import numpy as np
 from astropy.modeling import FittableModel, Parameter
 from astropy.modeling.utils import _ConstraintsDict
 
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.units import length_to_um, to_unit
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import check_range, length_to_um, to_unit
 
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
@@ -94,14 +94,8 @@ class OpticParameter(Parameter):
             return values
         if np.shape(wavelength) == grid.shape and np.allclose(wavelength, grid, rtol=_SAME, atol=0):
             return values
-        low, high = grid[0] * (1 - _SAME), grid[-1] * (1 + _SAME)
-        outside = ~((wavelength >= low) & (wavelength <= high))
-        if np.any(outside):
-            raise WavelengthRangeError(
-                f"{self.name} is known from {grid[0]:g} to {grid[-1]:g} um, not at "
-                f"{np.ravel(wavelength)[np.argmax(outside)]:g} um"
-            )
-        return np.interp(wavelength, grid, values)
+        inside = check_range(wavelength, grid[0], grid[-1], self.name, _SAME)
+        return np.interp(inside, grid, values)
 
     @Parameter.bounds.setter
     def bounds(self, value):

@@ -311,6 +311,13 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     @position.setter
     def position(self, value):
         self._position = finite_position(value, "position", self.stage)
+        self._places = self._places_at(value)
+
+    def _places_at(self, position):
+        """Return where the inputs of laws stand, the stage of the optic at a position, if any."""
+        if position is None or not self._follows:
+            return self._places
+        return self._places | {self.stage: finite_position(position, "position", self.stage)}
 
     # ---- values on canonical floats ---------------------------------------
 
@@ -327,9 +334,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             self._check_unit(key, parameter.unit)
             value = np.asarray(parameter.value)
             if not np.isfinite(value).all():
-                raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} = {value} must be finite"
-                )
+                raise ParameterError(f"{self._label}.{key} = {value} must be finite")
             values.append(value * canonical_factor(parameter.unit))
         where = [self.param_names.index(key) for key in self._components]
         length = np.sqrt(sum(values[i] ** 2 for i in where)) if where else 0.0
@@ -337,16 +342,20 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if np.any(length > 1 + _ROUNDING):
             what = self._components[0] if len(where) == 1 else "diattenuation"
             raise ParameterError(
-                f"{self.name or type(self).__name__}: the {what} is {np.max(length):.4g}; "
-                "allowed is 1 at most"
+                f"{self._label}: the {what} is {np.max(length):.4g}; allowed is 1 at most"
             )
         return values
+
+    @property
+    def _label(self):
+        """What messages call the optic."""
+        return self.name or type(self).__name__
 
     def _check_unit(self, key, unit):
         # a fitter may leave a parameter behind without its unit
         if unit is not None and unit != self._declared(key).unit:
             raise ParameterError(
-                f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
+                f"{self._label}.{key} is in {unit}, but its "
                 f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
             )
 
@@ -423,7 +432,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             As `mueller`.
         """
         found = self._resolve(wavelength, position)
-        derivatives = self._oriented_derivatives(*found, self._rates_at(wavelength, self._places))
+        rates = self._rates_at(wavelength, self._places_at(position))
+        derivatives = self._oriented_derivatives(*found, rates)
         return {
             key: self._per_unit(key, value)
             for key, value in zip(self.param_names, derivatives, strict=True)
@@ -438,7 +448,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _resolve(self, wavelength, position, parameters=None, places=None):
         """Bring wavelength, orientation and values to canonical floats, with what laws add."""
         lam, shift, values = self._read(wavelength, position, parameters)
-        values = self._followed(lam, self._places if places is None else places, values)
+        places = self._places_at(position) if places is None else places
+        values = self._followed(lam, places, values)
         return (*self._moved(self._dispersion_at(lam), values[0], shift), values[1:])
 
     # ---- laws that parameters follow ----------------------------------------
@@ -477,7 +488,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """Let a parameter follow a law, whose coefficients become parameters of this optic."""
         if key not in type(self).param_names or key in self._follows:
             reason = "follows a law already; add the models" if key in self._follows else "is none"
-            raise ParameterError(f"{self.name or type(self).__name__}.{key} {reason}")
+            raise ParameterError(f"{self._label}.{key} {reason}")
         laws, own = self._follows | {key: law}, type(self).param_names
         # in the order of the parameters, whichever came first
         self._follows = {name: laws[name] for name in own if name in laws}
@@ -487,8 +498,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def _dispersion_at(self, wavelength):
         """Return the dispersion, or None without a wavelength where none is needed."""
-        if wavelength is not None and not np.all(wavelength > 0):
-            raise ParameterError(f"wavelength = {wavelength} um must be positive")
+        if wavelength is not None and not np.all((wavelength > 0) & np.isfinite(wavelength)):
+            raise ParameterError(f"wavelength = {wavelength} um must be positive and finite")
         # only a law needs the wavelength; a constant matrix is the same at all
         if wavelength is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
@@ -523,7 +534,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
                 raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
+                    f"{self._label}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
             found.append(value)
@@ -581,7 +592,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # astropy gives the outputs of scalar inputs back as scalars
         if matrix[0, 0].size > 1 and all(np.size(x) == 1 for x in (wavelength, *light)):
             raise ParameterError(
-                f"{self.name or type(self).__name__} stands at {matrix[0, 0].size} positions: "
+                f"{self._label} stands at {matrix[0, 0].size} positions: "
                 f"give light of shape {matrix[0, 0].shape}"
             )
         return [sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix]

@@ -74,8 +74,8 @@ class Law:
     def rate(self, lam, places, coefficients, i):
         """Return the derivative of `value` to coefficient i, by central differences."""
         inputs, numbers = self._inputs(lam, places), self._numbers(coefficients)
-        # exact to rounding where the law is linear
-        small = 1e-6 * np.where(numbers[i] == 0, 1.0, np.abs(numbers[i]))
+        # exact to rounding where the law is linear; not lost in it where a coefficient is tiny
+        small = 1e-6 * np.maximum(np.abs(numbers[i]), 0.1)
         step = np.ones_like(small) if _is_linear(self.model) else small
         high, low = ([*numbers[:i], numbers[i] + s, *numbers[i + 1 :]] for s in (step, -step))
         change = self._evaluated(inputs, high) - self._evaluated(inputs, low)
@@ -211,6 +211,11 @@ def _coefficient(label, given, unit):
         factor = float(to_unit(1.0 * given.unit, unit, label))
     if value.ndim > 1 or not np.all(np.isfinite(value)):
         raise ParameterError(f"{label} = {value} must be a finite number, or one per wavelength")
+    if factor != 1 and hasattr(given.prior, "dist"):
+        # a distribution of scipy has no unit
+        raise ParameterError(
+            f"{label}: its prior is of a value in {given.unit}; give model and prior in {unit}"
+        )
     bounds = [None if bound is None else float(bound) * factor for bound in given.bounds]
     new = OpticParameter(
         name=label.rpartition(".")[2],

@@ -94,9 +94,7 @@ class _Mirror(Optic):
         if not np.all(good):
             # argmin of booleans is the first that is False
             worst = np.ravel(value)[np.argmin(np.ravel(good))]
-            raise ParameterError(
-                f"{self.name or type(self).__name__}.{key} = {worst:.6g}{unit}; allowed are {words}"
-            )
+            raise ParameterError(f"{self._label}.{key} = {worst:.6g}{unit}; allowed are {words}")
 
     def _check_incidence(self, incidence):
         # the same mirror from the other side: a fit may cross zero

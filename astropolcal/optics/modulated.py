@@ -33,7 +33,7 @@ from astropolcal.optics._modelling import Setting, phase
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.optics.retarders import EllipticalRetarder
-from astropolcal.units import to_unit
+from astropolcal.units import positive_number
 
 __all__ = [
     "DriftRetarder",
@@ -141,13 +141,6 @@ def _one_of(*allowed):
         return kind(value)
 
     return check
-
-
-def _positive(value, name):
-    number = to_unit(value, None, name)
-    if number.ndim or not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r} must be one positive number")
-    return float(number)
 
 
 class _Harmonic(FrameOptic):
@@ -412,7 +405,9 @@ class _Referenced(FrameOptic):
     """What is given for a reference flux, so that its parameters are numbers near one."""
 
     reference = Setting(
-        1.0, _positive, "Flux of which the coefficients are shares, in the unit of the tables."
+        1.0,
+        positive_number,
+        "Flux of which the coefficients are shares, in the unit of the tables.",
     )
 
 
@@ -616,6 +611,7 @@ class StateAnalyser(FrameOptic):
     [0.5, 0.0, 0.495, 0.0]
     """
 
+    _components = ("efficiency",)
     efficiency = Parameter(default=1.0, bounds=(-1, 1), description="modulation efficiency")
     transmission = Parameter(
         default=1.0, bounds=(0, 4), fixed=True, description="relative transmission"

@@ -19,6 +19,7 @@ from astropolcal.mueller import UNITS
 from astropolcal.optics.core import _LinearOptic
 from astropolcal.optics.modulated import _Modulated
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
 __all__ = ["MuellerElement", "Perturbation"]
@@ -199,6 +200,16 @@ class Perturbation(_BeamOptic, _Modulated):
         kwargs.setdefault("mount", self._dependence.driver)
         super().__init__(*args, **kwargs)
 
+    @_BeamOptic.mount.setter
+    def mount(self, value):
+        """Set the stage, which has to be what the perturbation follows, if anything."""
+        driver = self._dependence.driver
+        if driver is not None and str(value).removeprefix("-") != driver:
+            raise ParameterError(
+                f"Perturbation: mount = {value!r}, but {self.dependence!r} follows {driver!r}"
+            )
+        _BeamOptic.mount.fset(self, value)
+
     @property
     def kind(self):
         """Key of the generator."""
@@ -311,7 +322,7 @@ class MuellerElement(_LinearOptic):
         >>> MuellerElement.from_matrix(np.eye(4)).mueller()[3, 3]
         np.float64(1.0)
         """
-        matrix = np.asarray(matrix, dtype=float)
+        matrix = to_unit(matrix, None, "matrix")
         if matrix.shape[-2:] != (4, 4) or matrix.ndim not in (2, 3):
             raise ParameterError(
                 f"a Mueller matrix has shape (4, 4) or (n, 4, 4), not {matrix.shape}"

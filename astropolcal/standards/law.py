@@ -8,17 +8,15 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Fittable1DModel, Parameter
 
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.exceptions import ParameterError
 from astropolcal.optics.sources import serkowski
-from astropolcal.units import angle_to_rad, length_to_um, to_unit
+from astropolcal.units import angle_to_rad, check_range, length_to_um, to_unit
 
 __all__ = ["SerkowskiLaw", "whittet_width"]
 
 # Whittet et al. (1992): K = intercept + slope * lambda_max / um
 _INTERCEPT, _SLOPE = 0.01, 1.66
 _TURN = u.deg / u.um
-# lets the ends of a range survive the conversion of their unit
-_EDGE = 1e-9
 _CANONICAL = {"p_max": u.dimensionless_unscaled, "lambda_max": u.um, "theta": u.rad}
 _CANONICAL |= {"K": u.dimensionless_unscaled, "rotation": u.rad / u.um}
 
@@ -62,7 +60,9 @@ def whittet_width(lambda_max):
     >>> law.K.tied = whittet_width
     """
     if isinstance(lambda_max, SerkowskiLaw):
-        return _INTERCEPT + _SLOPE * lambda_max.lambda_max.value
+        # in a fit it is a plain number of micrometres
+        given = lambda_max.lambda_max
+        lambda_max = u.Quantity(given.value, given.unit or u.um)
     return _INTERCEPT + _SLOPE * length_to_um(lambda_max, "lambda_max")
 
 
@@ -304,26 +304,27 @@ class SerkowskiLaw(Fittable1DModel):
                 f"the covariance has {len(matrix)} rows; it must have {len(self.param_names)} "
                 f"({', '.join(self.param_names)}) or {len(free)} (free: {', '.join(free)})"
             )
-        scale = [(getattr(self, n).unit or u.one).to(_CANONICAL[n]) for n in names]
-        place = [self.param_names.index(name) for name in names]
-        full = np.zeros((len(self.param_names),) * 2)
-        full[np.ix_(place, place)] = matrix * np.outer(scale, scale)
-        if "K" not in names and self.tied["K"] is whittet_width:
-            # a K that is tied to lambda_max has its part of the covariance
-            spread = np.eye(len(full))
-            spread[self.param_names.index("K"), self.param_names.index("lambda_max")] = _SLOPE
-            full = spread @ full @ spread.T
-        return full
+        scale = [(getattr(self, n).unit or u.one).to(_CANONICAL[n]) for n in self.param_names]
+        moves = np.array([self._moves(name, names) for name in self.param_names])
+        return moves @ matrix @ moves.T * np.outer(scale, scale)
+
+    def _moves(self, name, names):
+        """Return by how much a parameter moves with others, by its tie if it is not one of them."""
+        tie = self.tied[name]
+        if name in names or not tie:
+            return [float(name == other) for other in names]
+        found = []
+        for other in names:
+            ends, step = [], 1e-4 * max(abs(getattr(self, other).value), 1e-3)
+            for sign in (1, -1):
+                moved = self.copy()
+                getattr(moved, other).value += sign * step
+                ends.append(float(u.Quantity(tie(moved)).value))
+            found.append((ends[0] - ends[1]) / (2 * step))
+        return found
 
 
 def _in_range(x, valid):
     """Return the wavelengths, or raise where the law does not hold."""
-    value = np.asarray(x.to_value(u.um) if hasattr(x, "unit") else x, dtype=float)
-    low, high = valid.to_value(u.um)
-    good = (value >= low * (1 - _EDGE)) & (value <= high * (1 + _EDGE))
-    if not np.all(good):
-        bad = value[~good].ravel()[0] if value.ndim else float(value)
-        raise WavelengthRangeError(
-            f"wavelength = {bad:g} um; the Serkowski law holds from {low:g} to {high:g} um"
-        )
-    return value
+    value = length_to_um(x) if hasattr(x, "unit") else x
+    return check_range(value, *valid.to_value(u.um), "the Serkowski law")

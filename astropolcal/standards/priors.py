@@ -17,6 +17,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.optics.sources import serkowski
 from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
 from astropolcal.units import length_to_um
 from astropolcal.words import check_choice, did_you_mean
@@ -84,15 +85,6 @@ def _plain(error, name):
 # --- the degree --------------------------------------------------------------------------
 
 
-def _model(x, shape):
-    """Return degrees of a law, and their derivatives by p_max, lambda_max and K."""
-    p_max, lambda_max, width = shape
-    log = np.log(lambda_max / x)
-    degree = p_max * np.exp(-width * log**2)
-    slopes = [1 / p_max + 0 * log, -2 * width * log / lambda_max, -(log**2)]
-    return degree, degree[:, None] * np.stack(slopes, axis=-1)
-
-
 def _published(star):
     """Return the published shape of a law, and its covariance."""
     shape = np.array([getattr(star.law, name).value for name in _PARAMETERS[:3]], dtype=float)
@@ -103,7 +95,8 @@ def _published(star):
         return shape, np.diag(errors**2), []
     # the errors are published, but not that those of lambda_max and K go together,
     # as they do in every fit to these bands
-    slopes = _model(table["wavelength"].to_value(u.um), shape)[1] / error[:, None]
+    slopes = SerkowskiLaw().fit_deriv(table["wavelength"].to_value(u.um), *shape, 0.0, 0.0)[:3]
+    slopes = np.stack(slopes, axis=-1) / error[:, None]
     together = np.linalg.inv(slopes.T @ slopes)
     scale = errors / np.sqrt(np.diag(together))
     return shape, together * np.outer(scale, scale), []
@@ -127,7 +120,7 @@ def _fitted(star):
         # K follows the relation, unless one is published with its error
         width = center["K"] if "K" in star.law_errors else whittet_width(t[1] * u.um)
         prior = [(t[1] - center["lambda_max"]) / spread["lambda_max"], (t[2] - width) / spread["K"]]
-        return np.append((degree - _model(x, t)[0]) / error, prior)
+        return np.append((degree - t[0] * serkowski(x, *t[1:])[0]) / error, prior)
 
     start = [max(degree.max(), _LEAST), center["lambda_max"], center["K"]]
     fit = least_squares(residuals, start, bounds=_BOUNDS, x_scale=[0.01, 0.1, 0.1])

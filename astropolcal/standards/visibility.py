@@ -15,7 +15,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
 from astropolcal.standards.priors import StandardStar, check_kind, get, names
-from astropolcal.units import angle_to_rad, iso_date
+from astropolcal.units import angle_to_rad, iso_date, positive_number
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["observability", "search", "telescope_information"]
@@ -214,10 +214,10 @@ def telescope_information(
         raise ParameterError("an offset can only be separated with the altitude of each frame")
     if psi.shape != turn.shape:
         raise ParameterError(f"there are {psi.size} parallactic angles and {turn.size} altitudes")
-    columns = _design(psi, turn, offset) / _positive(frame_error, "frame_error")
+    columns = _design(psi, turn, offset) / positive_number(frame_error, "frame_error")
     if star_error is not None:
         # a star known beforehand is two more measurements, of its q and u
-        known = np.eye(2, columns.shape[1]) / _positive(star_error, "star_error")
+        known = np.eye(2, columns.shape[1]) / positive_number(star_error, "star_error")
         columns = np.vstack([columns, known])
     return TelescopeInformation(_NAMES[: columns.shape[1]], _covariance(columns))
 
@@ -249,13 +249,6 @@ def _angles(value, name):
     if angles.ndim != 1 or not angles.size or not np.all(np.isfinite(angles)):
         raise ParameterError(f"{name} must be finite angles, one per frame")
     return angles
-
-
-def _positive(value, name):
-    value = u.Quantity(value).to_value(u.dimensionless_unscaled)
-    if not (np.isfinite(value) and value > 0):
-        raise ParameterError(f"{name} = {value!r} must be a positive number")
-    return float(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,9 +58,11 @@ def test_one_dataset_may_have_what_others_have_not():
 
 
 def test_datasets_of_one_name_have_optics_of_their_own():
-    runs = [observe(chain_of(POLARIZED), POLARIZED, "run", seed=seed) for seed in (1, 2)]
-    found = CHARIS.chains_for(runs, nuisance=["background"])
-    assert [names(chain)[-2] for chain in found] == ["background_run_1", "background_run_2"]
+    for labels in (("run", "run"), ("run", "run", "run_1")):
+        runs = [observe(chain_of(POLARIZED), POLARIZED, name, seed=1) for name in labels]
+        found = [names(chain)[-2] for chain in CHARIS.chains_for(runs, nuisance=["background"])]
+        assert found[:2] == ["background_run_1", "background_run_2"]
+        assert len(set(found)) == len(labels)
 
 
 def test_what_does_not_fit_is_refused():

@@ -6,6 +6,7 @@ import datetime
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling import models
 from astropy.table import QTable
 from astropy.time import Time
 from hypothesis import given
@@ -139,3 +140,16 @@ def test_checksum_does_not_see_how_a_file_spells():
 def test_checksum_expands_optics():
     plate = LinearRetarder(retardance=180 * u.deg, name="hwp")
     assert checksum([plate]) == checksum([node_from_optic(plate)])
+
+
+def test_checksum_sees_all_that_a_law_gives():
+    laws = [
+        models.Polynomial1D(1, c1=1),
+        models.Polynomial1D(1, c1=2),
+        models.Chebyshev1D(1, c1=1),
+        models.Polynomial1D(1, c1=1, domain=(1, 3)),
+        models.Polynomial1D(1, c1=1, domain=(1, 3), window=(0, 5)),
+        models.Polynomial2D(1, c1_0=1, x_domain=(1, 3)),
+        models.Polynomial2D(1, c1_0=1, x_domain=(1, 3), x_window=(0, 5)),
+    ]
+    assert len({checksum(law) for law in laws}) == len(laws)

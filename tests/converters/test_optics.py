@@ -84,10 +84,12 @@ def an_optic(draw, name):
     n = draw(st.integers(1, 5))
     value = numbers | st.lists(numbers, min_size=n, max_size=n)
     extra = {key: draw(SETTINGS[key]) for key in cls()._settings() if key not in ("name", "mount")}
+    # what a perturbation follows is its mount
+    if extra.get("dependence", "constant") == "constant":
+        extra["mount"] = draw(st.sampled_from([None, "hwp", "-altitude", "nul l"]))
     declared = cls()._declared
     optic = cls(
         name=draw(st.none() | st.text(max_size=8)),
-        mount=draw(st.sampled_from([None, "hwp", "-altitude", "nul l"])),
         **{key: np.array(draw(value)) * (declared(key).unit or 1) for key in cls.param_names},
         **extra,
     )

@@ -99,12 +99,19 @@ def test_angles_of_the_columns_come_first():
 def test_angles_are_computed_from_time_target_and_site():
     for text in [True, False]:
         times = Time("2025-11-03T10:00") + np.arange(4) * 15 * u.s
-        table = table_on_sky(altitude=None, time=np.array(times.isot) if text else times)
+        time = np.array(times.isot) if text else times
+        expected = [angle.to_value(u.rad) for angle in pointing(STAR, times, SUBARU)]
+        table = table_on_sky(altitude=None, time=time)
         table.meta |= {"right_ascension": 80.0, "declination": -1.0}
-        altitude, parallactic = sky_angles(Observations.from_table(table), SUBARU)
-        expected = pointing(STAR, times, SUBARU)
-        np.testing.assert_allclose(altitude, expected[0].to_value(u.rad), atol=1e-7)
-        np.testing.assert_allclose(parallactic, expected[1].to_value(u.rad), atol=1e-7)
+        found = sky_angles(Observations.from_table(table), SUBARU)
+        np.testing.assert_allclose(found, expected, atol=1e-7)
+        # one that is stated counts, such as a position angle of FORS2 that is called so
+        for place, name in enumerate(("altitude", "parallactic")):
+            table[name] = np.full(len(table), 33.0) * u.deg
+            found = sky_angles(Observations.from_table(table), SUBARU)
+            np.testing.assert_allclose(np.rad2deg(found[place]), 33)
+            np.testing.assert_allclose(found[1 - place], expected[1 - place], atol=1e-7)
+            table.remove_column(name)
 
 
 def test_targets_as_headers_write_them_and_what_is_none():

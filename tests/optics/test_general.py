@@ -52,6 +52,15 @@ def test_matrix_that_is_not_finite_is_refused():
         MuellerElement.from_matrix(matrix)
 
 
+def test_matrix_keeps_its_unit_and_its_mask():
+    percent = MuellerElement.from_matrix([[100, 3, 0, 0], *(100 * np.eye(4))[1:]] * u.percent)
+    assert percent.mueller()[0].tolist() == [1, 0.03, 0, 0]
+    masked = np.ma.array(np.eye(4), mask=np.eye(4, k=1))
+    for matrix in (masked, np.eye(4) * (1 + 1j), np.eye(4) * u.deg):
+        with pytest.raises(ParameterError):
+            MuellerElement.from_matrix(matrix)
+
+
 def test_element_stands_for_any_optic():
     optic = LinearRetarder(retardance=100 * u.deg)
     element = MuellerElement.from_matrix(optic.mueller(), theta=20 * u.deg)

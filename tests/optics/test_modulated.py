@@ -249,6 +249,6 @@ def test_differential_gain_keeps_the_sum_of_equal_beams():
 def test_wavelength_that_is_none_is_refused():
     """Also by optics that depend on no wavelength."""
     for optic in [cls() for cls in OPTICS.values()]:
-        for wavelength in (-1.0, 0.0, np.nan) * u.um:
+        for wavelength in (-1.0, 0.0, np.nan, np.inf) * u.um:
             with pytest.raises(ParameterError, match="must be positive"):
                 optic.mueller(wavelength)

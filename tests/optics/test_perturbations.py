@@ -77,6 +77,12 @@ def test_dependences_have_their_functions_and_drivers():
     for text, driver in drivers.items():
         assert Dependence(text).driver == driver
         assert Perturbation(dependence=text).mount == driver
+        for other in (None, "hwp_true") if driver else ():
+            with pytest.raises(ParameterError, match="follows"):
+                Perturbation(dependence=text, mount=other)
+            with pytest.raises(ParameterError, match="follows"):
+                Perturbation(dependence=text).mount = other
+    assert Perturbation(dependence="harmonic:hwp:2", mount="-hwp").stage_sign == -1
 
 
 def test_a_dependence_may_be_in_one_run_only():

@@ -14,6 +14,7 @@ from astropolcal.optics import (
     DiattenuatorRetarder,
     LinearPolarizer,
     LinearRetarder,
+    StateAnalyser,
     VectorDiattenuator,
     WollastonPrism,
 )
@@ -117,5 +118,7 @@ def test_a_diattenuation_of_more_than_one_is_refused():
     for optic in strong:
         with pytest.raises(ParameterError, match=r"it: the \w+ is 1\.5; allowed is 1"):
             optic.mueller()
+    with pytest.raises(ParameterError, match=r"it: the \w+ is 1\.5; allowed is 1"):
+        StateAnalyser(efficiency=-1.5, name="it", mount="beam=a").mueller(position=1)
     perfect = VectorDiattenuator(horizontal=0.6, diagonal=0.8)
     np.testing.assert_allclose(perfect.mueller()[3, 3], 0.0, atol=1e-7)

@@ -333,6 +333,7 @@ CASES = {
         lambda x, efficiency, transmission: (
             (1 - x) * np.eye(4) + x * transmission * wollaston("right")(efficiency)
         ),
+        smooth={"efficiency": SMOOTH},
         mount="beam=one",
         position=st.sampled_from([0.0, 1.0]),
         efficiency=SIGNED,

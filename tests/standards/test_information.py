@@ -121,7 +121,7 @@ def test_bad_angles_are_refused():
 
 def test_bad_errors_are_refused():
     for key in ["frame_error", "star_error"]:
-        for value in [0, -1, np.inf, np.nan]:
+        for value in [0, -1, np.inf, np.nan, [1, 2]]:
             with pytest.raises(ParameterError, match=key):
                 telescope_information([0, 40] * u.deg, **{key: value})
 

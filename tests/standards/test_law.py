@@ -5,12 +5,14 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.modeling.fitting import TRFLSQFitter
+from astropy.utils.masked import Masked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.standards import SerkowskiLaw, whittet_width
 
+HIDDEN = Masked([0.5, 0.6] * u.um, mask=[False, True])
 WAVELENGTH = np.linspace(0.4, 2.2, 15) * u.um
 degrees = st.floats(0.001, 0.12)
 maxima = st.floats(0.4, 0.9)
@@ -48,6 +50,9 @@ def test_width_defaults_to_the_relation_of_whittet():
     # Whittet et al. 1992: K = 0.01 + 1.66 lambda_max
     assert SerkowskiLaw(lambda_max=0.6 * u.um).K.value == pytest.approx(1.006)
     assert whittet_width(600 * u.nm) == pytest.approx(1.006)
+    law = SerkowskiLaw()
+    law.lambda_max = 600 * u.nm
+    assert whittet_width(law) == pytest.approx(1.006)
 
 
 @settings(max_examples=40)
@@ -155,6 +160,16 @@ def test_a_tied_width_carries_the_error_of_lambda_max():
     assert law.stokes(1.5 * u.um, matrix).covariance[0, 0] == pytest.approx(expected, rel=1e-6)
 
 
+def test_whatever_a_width_is_tied_to_its_error_is_that_of_many_laws_drawn():
+    for intercept, slope in ((2.5, -1.66), (-0.5, 2.6)):
+        law = SerkowskiLaw(p_max=0.04, K=intercept + slope * 0.55)
+        law.K.tied = lambda model: intercept + slope * model.lambda_max.value  # noqa: B023
+        error = law.stokes(2.2 * u.um, np.diag([1e-3, 0.02]) ** 2).covariance[0, 0] ** 0.5
+        p_max, longest = np.random.default_rng(1).normal([0.04, 0.55], [1e-3, 0.02], (9999, 2)).T
+        drawn = p_max * np.exp(-(intercept + slope * longest) * np.log(longest / 2.2) ** 2)
+        assert error == pytest.approx(drawn.std(), rel=0.05)
+
+
 def test_a_width_that_is_fixed_and_not_tied_has_no_error():
     """A fit of p_max and lambda_max with K held: its 2 x 2 matrix says nothing of K."""
     law = SerkowskiLaw(theta=20 * u.deg)
@@ -180,7 +195,7 @@ def test_bad_covariance_is_refused():
 
 
 def test_wavelength_out_of_range_is_refused():
-    for wavelength in [0.2 * u.um, 2.6 * u.um, [1.0, 3.0] * u.um, np.nan * u.um]:
+    for wavelength in [0.2 * u.um, 2.6 * u.um, [1.0, 3.0] * u.um, np.nan * u.um, HIDDEN]:
         law = SerkowskiLaw()
         for function in (law, law.stokes, law.angle):
             with pytest.raises(WavelengthRangeError, match=r"0\.28 to 2\.5 um"):
