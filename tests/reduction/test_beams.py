@@ -7,7 +7,13 @@ from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.frames import Frame, beam_detectors, match_beams, open_cube
+from astropolcal.reduction.frames import (
+    Frame,
+    beam_detectors,
+    match_beams,
+    open_cube,
+    survey_frames,
+)
 from astropolcal.reduction.photometry import detector_of
 
 KEYWORDS = {
@@ -30,7 +36,9 @@ def files(tmp_path):
             cards = HEADER | {"CAMERA": camera} | changes
             header = fits.Header([(k, v) for k, v in cards.items() if v is not None])
             data = np.full((8, 8), value, dtype="f4") if image is None else image
-            fits.PrimaryHDU(data, header).writeto(tmp_path / f"n_00000001_cam{camera}.fits")
+            fits.PrimaryHDU(data, header).writeto(
+                tmp_path / f"n_00000001_cam{camera}.fits", overwrite=True
+            )
         return tmp_path / "n_00000001_cam1.fits"
 
     return write
@@ -56,6 +64,12 @@ def test_both_images_count_the_same_electrons(files):
     assert detector.left.saturation * detector.gain == pytest.approx(5000.0)
     right, left = beam_detectors(frame.path, LAYOUT, frame.values)
     assert left.gain / right.gain == pytest.approx(0.5)
+
+
+def test_beams_of_other_plate_angles_are_refused_where_no_star_is_looked_for(files):
+    survey_frames([files()], LAYOUT, centre=(4, 4))
+    with pytest.raises(ObservationError, match=r"hwp = 22\.5, but 67\.5 in n_00000001_cam2"):
+        survey_frames([files(HWP=67.5)], LAYOUT, centre=(4, 4))
 
 
 @pytest.mark.parametrize(
