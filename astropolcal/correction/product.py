@@ -59,7 +59,11 @@ def _header(corrected):
     header = fits.Header()
     header["CONTENT"] = (PRODUCT, "what this file is")
     header["CONTVERS"] = (_VERSION, "version of its form")
-    header["BUNIT"] = corrected.unit.to_string("fits")
+    try:
+        header["BUNIT"] = corrected.unit.to_string("fits")
+    except ValueError:
+        # such as electrons, which the standard does not know
+        header["BUNIT"] = corrected.unit.to_string()
     _axes(header, corrected)
     header["POLCONV"] = ("IAU", "angles from north through east")
     header["COMMENT"] = "Q is positive north-south, U from north-east to south-west; the position"

@@ -169,6 +169,7 @@ def work(arguments):
         scale=scale,
         left_scale=[left.gain / right.gain for right, left in detectors],
         detectors=detectors,
+        unit=detectors[0][0].unit,
         # date and mode were checked when the calibration was chosen
         date=None,
         mode=calibration.validity.mode,

@@ -4,6 +4,7 @@
 import dataclasses
 from contextlib import suppress
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -272,6 +273,12 @@ def test_a_complex_column_is_refused(path):
     hdus.writeto(path, overwrite=True)
     with pytest.raises(ObservationError, match="leakage is complex"):
         Corrected.read(path)
+
+
+def test_units_that_fits_does_not_know_come_back(corrected, tmp_path):
+    for unit in (u.electron, u.electron / u.s, u.adu / u.s):
+        dataclasses.replace(corrected, unit=unit).write(tmp_path / "out.fits", overwrite=True)
+        assert Corrected.read(tmp_path / "out.fits").unit == unit
 
 
 def test_a_unit_with_a_factor_is_refused(path):
