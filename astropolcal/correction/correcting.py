@@ -221,9 +221,10 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     """Return the errors that the calibration makes, None of a chain that nobody fitted."""
     if model.calibration is None:
         return None
+    how = {"mode": mode, "open_directions": open_directions}
     if n_samples:
-        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
-    return linear_systematic(model, solution, mode=mode, open_directions=open_directions)
+        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, **how)
+    return linear_systematic(model, solution, **how)
 
 
 def _observable(calibration, frames, observable):
