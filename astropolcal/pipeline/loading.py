@@ -21,6 +21,7 @@ from astropolcal.calibration.system import (
     at_wavelengths,
     distinct,
     match_wavelengths,
+    model_error,
 )
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves, warn_beyond, with_beam
@@ -497,6 +498,8 @@ class LoadedCalibration:
         flat[:3] = np.einsum("wks,swp->kwp", inverse, rest)
         n = len(flat)
         moved = np.einsum("wjk,wksr->wjsr", inverse, slopes[..., :n, :])
+        lacking = model_error(self.calibration.fit, beams[0].wavelength.to_value(u.um), n)
+        moved = np.concatenate([moved, np.moveaxis(lacking[:, :, :3], 0, -1)], axis=-1)
         # small, and the same for all pixels (p), which only need the products of their light
         tensor = np.einsum("wjsr,wjtr->wjst", moved, moved)
         spread = np.sqrt(np.einsum("wjst,swp,twp->jwp", tensor, flat, flat, optimize=True))
