@@ -291,6 +291,37 @@ def test_a_file_without_an_image(tmp_path):
             CubeFiles([tmp_path / "a.fits"], [(3, 3), (3, 2)], 3, extension=0, stacked=stacked)
 
 
+def test_exposures_that_are_no_measurement_take_no_part_in_their_mean(tmp_path):
+    class Reader:
+        """Of a mean of all exposures, a unit of which is so many electrons."""
+
+        def variance(self, pixels):
+            return pixels / 40
+
+    cube, error = np.full((4, 6, 12), 100.0), np.ones((4, 6, 12))
+    # a pixel that its error marks as bad, and one that two exposures lack
+    cube[0, 3, 3], error[0, 3, 3], cube[:2, 4, 3] = 1e6, 0.0, np.nan
+    names = {"error": "error.fits", "inverse variance": "weight.fits", "": "plain.fits"}
+    for weights, name in names.items():
+        hdus = [fits.PrimaryHDU(cube), fits.ImageHDU(error)][: 2 if weights else 1]
+        fits.HDUList(hdus).writeto(tmp_path / name)
+        options = {
+            "weights": weights or "error",
+            "detectors": None if weights else [[Reader()] * 2],
+        }
+        source = CubeFiles(
+            [tmp_path / name], [(3, 3), (9, 3)], 3, extension=0, stacked=True, **options
+        )
+        flux, variance = (
+            read(0, slice(0, 1), slice(0, 1))[0, 0] for read in (source.fluxes, source.variances)
+        )
+        one = 1.0 if weights else 10.0
+        assert (flux[2, 1], variance[2, 1]) == (100.0, one / 2)
+        assert (flux[0, 0], variance[0, 0]) == (100.0, one / 4)
+        if weights:
+            assert (flux[1, 1], variance[1, 1]) == (100.0, one / 3)
+
+
 @pytest.mark.parametrize("kind", [">f4", ">f8"])
 def test_nans_that_signal_are_nans(tmp_path, kind):
     """A damaged file may hold them; numpy warns where they are used, which is an error here."""
