@@ -72,6 +72,7 @@ def _header(corrected):
     header["CORRMODE"] = (corrected.mode, "stokes: whole Mueller matrix; ip: offsets only")
     header["OBSERVBL"] = (corrected.observable, "what was fitted")
     header["NORTHUP"] = (corrected.north_up, "north is up and east is left")
+    header["RESAMPLE"] = (corrected.resampling, "mean variance of a pixel, before: 1")
     for key, (keyword, comment) in _KEYWORDS.items():
         if corrected.provenance.get(key):
             value = _printable(corrected.provenance[key])
@@ -199,6 +200,10 @@ def _read(hdus):
     # a number alone is a unit too to astropy, and FITS cannot hold all of them
     if getattr(unit, "scale", 1.0) != 1.0:
         raise ValueError(f"BUNIT = {header['BUNIT']!r}; a unit without a factor is needed")
+    # products of before do not say it
+    resampling = _stated(header, "RESAMPLE", float) if "RESAMPLE" in header else 1.0
+    if not resampling > 0:
+        raise ValueError(f"RESAMPLE = {resampling}; a number above zero is needed")
     place = None
     if "STARX" in header:
         place = tuple(_stated(header, key, float) for key in ("STARX", "STARY"))
@@ -218,6 +223,7 @@ def _read(hdus):
         "north_up": _stated(header, "NORTHUP", bool),
         "centre": place,
         "pixel_scale": _stated(header, "PIXSCALE", float) if "PIXSCALE" in header else None,
+        "resampling": resampling,
         "provenance": provenance,
         "star": _star(hdus),
     }

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from astropolcal.correction.geometry import derotate, derotate_variance
+from astropolcal.correction.geometry import derotate, derotate_gain, derotate_variance
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line, understood
 from astropolcal.fitscheck import open_fits, readable_fits
@@ -27,6 +27,9 @@ class ArraySource:
     At a time all frames of arrays in memory are read, those of a chunk of dask arrays, and one of
     arrays on disk. Quantities are converted to ``unit``; what is masked has no value.
     """
+
+    # as `TurnedSource`
+    resampling = 1.0
 
     def __init__(
         self, right, left, variance_right=None, variance_left=None, names=None, unit=u.adu
@@ -121,6 +124,13 @@ class TurnedSource:
             self.image_shape = tuple(np.broadcast_to(size, 2).tolist())
         self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths
         self.names, self.has_variances = source.names, source.has_variances
+
+    @property
+    def resampling(self):
+        """Mean variance of a pixel over the one that it had before it was turned."""
+        shape, turns = self._source.image_shape, zip(self._angles, self._centres, strict=True)
+        known = [(angle, centre) for angle, both in turns for centre in both]
+        return np.mean([derotate_gain(shape, a, centre=xy, **self._options) for a, xy in known])
 
     def batches(self):
         """Return the frames that are read at a time, one by one."""

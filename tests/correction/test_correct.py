@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import Observations, calibrate
+from astropolcal import Observations, calibrate, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.correction.geometry import derotate
@@ -408,6 +408,24 @@ def test_an_aperture_sums(disk_frames, sky, charis):
     np.testing.assert_allclose(found.stokes, true, atol=1e-9)
     with pytest.raises(ParameterError, match="no pixel"):
         correct(sky, frames_of(disk_frames, charis)).aperture(0)
+
+
+def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
+    """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    chain, hwp = chain | optics.WollastonPrism(name="wollaston"), [0, 45, 22.5, 67.5] * u.deg
+    # the wavelengths are draws of the noise
+    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 1500, 25, 25))
+    known = {"variance_right": np.full(noise[0].shape, 900.0)}
+    known["variance_left"] = known["variance_right"]
+    for camera in ([0, 0, 0, 0], [90, 17, 30, 45], [20, 20, 20, 20]):
+        frames = ScienceFrames.from_arrays(
+            *noise, np.linspace(1, 2, 1500) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
+            **known,
+        )  # fmt: skip
+        star = correct(chain, frames, brightness="given").aperture(9)
+        claimed = star.error("Q").mean()
+        assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera
 
 
 def test_v_and_its_fraction(sky, charis, track, seen):

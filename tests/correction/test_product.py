@@ -281,6 +281,20 @@ def test_units_that_fits_does_not_know_come_back(corrected, tmp_path):
         assert Corrected.read(tmp_path / "out.fits").unit == unit
 
 
+def test_how_much_resampling_took_comes_back(corrected, path, tmp_path):
+    dataclasses.replace(corrected, resampling=0.6).write(tmp_path / "turned.fits")
+    again = Corrected.read(tmp_path / "turned.fits")
+    np.testing.assert_allclose(
+        again.aperture(2).covariance, corrected.aperture(2).covariance / 0.6, rtol=1e-12
+    )
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["RESAMPLE"] = 0.0
+        for key in ("CHECKSUM", "DATASUM"):
+            hdus[0].header.remove(key, ignore_missing=True)
+    with pytest.raises(ObservationError, match=r"RESAMPLE = 0\.0"):
+        Corrected.read(path)
+
+
 def test_a_unit_with_a_factor_is_refused(path):
     with fits.open(path, mode="update") as hdus:
         hdus[0].header["BUNIT"] = "2147483648"
