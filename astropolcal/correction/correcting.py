@@ -10,7 +10,7 @@ import numpy as np
 
 from astropolcal.correction.frames import ScienceFrames
 from astropolcal.correction.result import Corrected
-from astropolcal.correction.rows import RowModel, ideal_chain
+from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import Channels, covariance_index, estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
@@ -173,8 +173,12 @@ def correct(
     by_variance = isinstance(weights, str)
     _check(frames, mode, weights)
     if hasattr(calibration, "datasets"):
-        when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
-        check_frames(calibration, frames.moments(), "the calibration", **when)
+        when, moments = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}, frames.moments()
+        check_frames(calibration, moments, "the calibration", **when)
+        if chain is None:
+            # of a telescope that changed
+            dates = [date for _, date, _ in moments if date is not None]
+            chain = sky_chain(calibration, date=dates or None)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
