@@ -27,6 +27,8 @@ __all__ = []
 
 #: What the keyword ``CONTENT`` of a product says.
 PRODUCT = "astropolcal Stokes product"
+# characters of a HISTORY card
+_CARD = 72
 # raised when a reader of the version before would misunderstand the file
 _VERSION = 1
 _KEYWORDS = {
@@ -294,8 +296,14 @@ def _native(values):
 def _systematic(hdus):
     if "SYSFACT" not in hdus:
         return None
-    lines = hdus[0].header.get("HISTORY", [])
-    held = [line.rpartition(": ")[2] for line in lines if line.startswith("not free")]
+    held, before = [], ""
+    for line in hdus[0].header.get("HISTORY", []):
+        if line.startswith("not free"):
+            held.append(line.rpartition(": ")[2])
+        elif held and len(before) == _CARD and not line.startswith("poorly determined"):
+            # a card holds no more, and the next one goes on
+            held[-1] += line
+        before = line
     found = hdus["SYSFACT"]
     is_open = np.asarray(hdus["SYSOPEN"].data, dtype=bool)
     return Systematic(_native(found.data), is_open, found.header["SYSMETH"], held)

@@ -281,6 +281,17 @@ def test_units_that_fits_does_not_know_come_back(corrected, tmp_path):
         assert Corrected.read(tmp_path / "out.fits").unit == unit
 
 
+def test_long_names_without_error_come_back(corrected, tmp_path):
+    # 28 characters are as many as a card has room for
+    names = ["a" * 28, "mirror_of_the_telescope." + "b" * 80, "c.d", "e" * 29]
+    held = dataclasses.replace(corrected.systematic, held=names)
+    given = corrected.provenance | {"held": names}
+    weak = ["0.98 Q -0.19 U", *corrected.weak[1:]]
+    one = dataclasses.replace(corrected, systematic=held, provenance=given, weak=weak)
+    one.write(tmp_path / "out.fits")
+    assert Corrected.read(tmp_path / "out.fits").systematic.held == names
+
+
 def test_how_much_resampling_took_comes_back(corrected, path, tmp_path):
     dataclasses.replace(corrected, resampling=0.6).write(tmp_path / "turned.fits")
     again = Corrected.read(tmp_path / "turned.fits")
