@@ -523,6 +523,9 @@ def test_stokes_cubes_that_cannot_be_corrected(loaded):
         (cube[:, :2], {}, "at 3 wavelengths"),
         (cube, {}, "do not tell Q and U apart"),
         (cube, {"difference": "both"}, "allowed are right-left, left-right"),
+        (cube, {"hwp": [0, 22.5, 45] * u.deg}, "hwp = .*; 2 finite angles are needed"),
+        (cube, {"hwp": [0, np.nan] * u.deg}, "hwp = .*; 2 finite angles are needed"),
+        (cube, {"hwp": [0, 22.5]}, "hwp = .* needs a unit"),
     ]:
         with pytest.raises(ParameterError, match=message):
             loaded.correct(stokes, headers, **options)
