@@ -410,6 +410,34 @@ def test_an_aperture_sums(disk_frames, sky, charis):
         correct(sky, frames_of(disk_frames, charis)).aperture(0)
 
 
+def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, seen):
+    """Weights by equal variances are equal weights, and so must be the covariances."""
+    positions = track(2)[1]
+    stokes = np.array([1e5, 2e4, -1e4])[:, None, None] * np.ones((22, 3))
+    beams = seen(sky, positions, charis.wavelength, stokes)
+    unequal = {f"variance_{beam}": np.full(beams[0].shape, v) for beam, v in zip(
+        ("right", "left"), (100.0, 900.0), strict=True)}  # fmt: skip
+    twice = [[0, 1], [2, 3], [4, 5], [6, 7]] * 2
+    shared = [[0, 1], [0, 5], [4, 1], [4, 5], [2, 3], [2, 7], [6, 3], [6, 7]]
+    for observable, pairs in (("single", None), ("double", shared), ("double", twice)):
+        frames = ScienceFrames.from_arrays(
+            *beams, charis.wavelength, positions, pairs=pairs, **unequal
+        )
+        equal, by_variance = (
+            correct(sky, frames, observable=observable, brightness="given", weights=weights)
+            for weights in (None, "variance")
+        )
+        scale = np.sqrt(equal.covariance[0])
+        np.testing.assert_allclose(by_variance.stokes, equal.stokes, rtol=1e-9)
+        np.testing.assert_allclose(
+            by_variance.covariance / scale**2, equal.covariance / scale**2, atol=1e-9
+        )
+    # what is masked is no weight
+    weights = np.ma.array([1e9] + 7 * [1.0], mask=[True] + 7 * [False])
+    with pytest.raises(ParameterError, match="weights = nan"):
+        correct(sky, frames, observable="single", weights=weights)
+
+
 def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
     """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
     chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
