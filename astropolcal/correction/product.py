@@ -165,7 +165,7 @@ def _maps(corrected):
     order = ("aolp", "s_chi_statistical", "s_chi_systematic")
     hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order))
     hdus[-1].header["BUNIT"] = "deg"
-    if corrected.stokes.ndim == 4:
+    if corrected.stokes.ndim == 4 and corrected.north_up:
         found = corrected.azimuthal()
         hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
     return hdus

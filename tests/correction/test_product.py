@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from astropolcal.correction import Corrected, ScienceFrames, correct
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,7 @@ def corrected(calibration, charis, track, scene, seen):
         hwp=hwp,
         names=names,
         centre=(4.0, 4.0),
+        north_up=True,
         variance_right=right,
         variance_left=left,
         pixel_scale=16.2,
@@ -93,6 +94,17 @@ def test_maps_are_what_the_object_says(corrected, path):
         np.testing.assert_array_equal(hdus["DOLP"].data[2], found["s_p_statistical"])
         np.testing.assert_array_equal(hdus["AOLP"].data[2], found["s_chi_systematic"])
         np.testing.assert_array_equal(hdus["QPHI"].data[0], corrected.azimuthal()["q_phi"])
+
+
+def test_images_that_are_not_turned_have_no_azimuthal_components(corrected, tmp_path):
+    """Q and U refer to north, but where that is in the images is not known."""
+    seen = dataclasses.replace(corrected, north_up=False)
+    with pytest.raises(ParameterError, match="need images with north up"):
+        seen.azimuthal()
+    seen.write(tmp_path / "out.fits")
+    with fits.open(tmp_path / "out.fits") as hdus:
+        assert "QPHI" not in hdus
+    assert not Corrected.read(tmp_path / "out.fits").north_up
 
 
 def test_a_spectrum_without_errors(sky, charis, star, tmp_path):
