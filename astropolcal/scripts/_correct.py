@@ -397,6 +397,9 @@ def _words(summary, systematic, arguments):
     lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
     found, accuracy, lost = _polarization(star, is_open)
     lines += found
+    if held := summary.get("held"):
+        line = f"  without error, as not free in the calibration: {', '.join(held)}"
+        lines += common.wrapped(line, indent=4).split("\n")
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n = len(summary["wavelength_nm"])

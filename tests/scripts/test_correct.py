@@ -490,7 +490,7 @@ def test_report_has_units():
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
             "wavelength_nm": np.array([1600.0]),
-            "aperture": aperture,
+            "aperture": aperture, "held": ["m3.b1", "m3.m1"],
         }  # fmt: skip
         outputs = {"output": "o.fits", "spectrum": None, "plot": None, "json": "-", "full": False}
         lines = _correct._words(summary, systematic, SimpleNamespace(**outputs))
@@ -500,6 +500,8 @@ def test_report_has_units():
         assert "    angle of linear polarization: 30.0 deg" in lines, (systematic, words)
         assert "      statistical error: 2 deg" in lines, (systematic, words)
         assert lines.count(f"      systematic error: {words}") == 2, (systematic, words)
+        # a telescope as published does not err less than one that was calibrated
+        assert any("m3.b1, m3.m1" in line for line in lines), (systematic, words)
         verdict = lines[lines.index("") + 1]
         is_open = words == "infinite"
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
