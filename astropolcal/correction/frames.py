@@ -92,12 +92,17 @@ class ScienceFrames:
                 f"wavelength has shape {self.wavelength.shape}; the frames have "
                 f"{self.source.n_wavelengths} wavelengths"
             )
+        count = self.source.n_frames
         for name, position in self.positions.items():
-            if np.shape(position)[-1:] not in ((), (self.source.n_frames,), (1,)):
+            if np.shape(position)[-1:] not in ((), (count,), (1,)):
                 raise ObservationError(
-                    f"{name} has {np.shape(position)[-1]} positions; there are "
-                    f"{self.source.n_frames} frames"
+                    f"{name} has {np.shape(position)[-1]} positions; there are {count} frames"
                 )
+        if self.groups is not None and np.shape(self.groups) != (count,):
+            raise ObservationError(
+                f"groups has shape {np.shape(self.groups)}; one of each of the {count} frames is "
+                "needed"
+            )
 
     @property
     def names(self):

@@ -50,6 +50,8 @@ class ArraySource:
         self.n_frames, self.n_wavelengths, *image = self._beams[0].shape
         self.image_shape = tuple(image)
         self.names = [f"frame {i}" for i in range(self.n_frames)] if names is None else list(names)
+        if len(self.names) != self.n_frames:
+            raise ObservationError(f"{len(self.names)} names for {self.n_frames} frames")
 
     def batches(self):
         """Return the frames that are read at a time, a list of slices."""
