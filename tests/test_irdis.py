@@ -3,6 +3,7 @@
 
 import datetime
 import io
+from contextlib import nullcontext
 from dataclasses import replace
 
 import asdf
@@ -567,16 +568,21 @@ def test_calibrated_internal_source_corrects_a_star():
     calibration = calibrate(
         IRDIS_.chains_for([table]), [table], instrument="irdis", search=False, cross_validate=False
     )
-    sky = IRDIS_.on_sky(truth, coating="after")
-    star = star_table("after", n=16).frames
-    positions = frame_positions(IRDIS_, star, sky)
-    rows = measurement_rows(sky, positions, IRDIS_.wavelength)
-    right, left = np.moveaxis(rows @ [1000, 30, -20, 0], 1, 2)
-    science = ScienceFrames.from_arrays(right, left, IRDIS_.wavelength, positions, hwp=star["hwp"])
-    with pytest.warns(AstropolcalWarning, match="neither date nor coating"):
-        done = correct(calibration, science, observable="double", open_directions="ignore")
-    np.testing.assert_allclose(done.q, 0.03, atol=3e-4)
-    np.testing.assert_allclose(done.u, -0.02, atol=3e-4)
+    # the telescope is that of the frames' date
+    for coating, date in (("after", None), ("after", "2018-05-01"), ("before", "2016-05-01")):
+        sky = IRDIS_.on_sky(truth, coating=coating)
+        star = star_table(coating, n=16).frames
+        positions = frame_positions(IRDIS_, star, sky)
+        rows = measurement_rows(sky, positions, IRDIS_.wavelength)
+        right, left = np.moveaxis(rows @ [1000, 30, -20, 0], 1, 2)
+        science = ScienceFrames.from_arrays(
+            right, left, IRDIS_.wavelength, positions, hwp=star["hwp"], date=date
+        )
+        no_date = pytest.warns(AstropolcalWarning, match="neither date nor coating")
+        with nullcontext() if date else no_date:
+            done = correct(calibration, science, observable="double", open_directions="ignore")
+        np.testing.assert_allclose(done.q, 0.03, atol=3e-4)
+        np.testing.assert_allclose(done.u, -0.02, atol=3e-4)
 
 
 def test_chain_survives_a_file():

@@ -7,11 +7,13 @@ from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from astropolcal.correction.frames import ScienceFrames
 from astropolcal.correction.result import Corrected
-from astropolcal.correction.rows import RowModel, ideal_chain
-from astropolcal.correction.solve import Channels, covariance_index, estimator
+from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
+from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
     AstropolcalError,
@@ -173,8 +175,12 @@ def correct(
     by_variance = isinstance(weights, str)
     _check(frames, mode, weights)
     if hasattr(calibration, "datasets"):
-        when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
-        check_frames(calibration, frames.moments(), "the calibration", **when)
+        when, moments = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}, frames.moments()
+        check_frames(calibration, moments, "the calibration", **when)
+        if chain is None:
+            # of a telescope that changed
+            dates = [date for _, date, _ in moments if date is not None]
+            chain = sky_chain(calibration, date=dates or None)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
@@ -204,6 +210,7 @@ def correct(
         systematic=systematic,
         mode=mode,
         observable=observable,
+        resampling=float(frames.source.resampling) if len(found) > n else 1.0,
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
@@ -221,9 +228,10 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     """Return the errors that the calibration makes, None of a chain that nobody fitted."""
     if model.calibration is None:
         return None
+    how = {"mode": mode, "open_directions": open_directions}
     if n_samples:
-        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
-    return linear_systematic(model, solution, mode=mode, open_directions=open_directions)
+        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, **how)
+    return linear_systematic(model, solution, **how)
 
 
 def _observable(calibration, frames, observable):
@@ -381,7 +389,7 @@ def _block(source, solution, wavelengths, by_variance, in_order, shape):
     bad = ~np.isfinite(out).all(axis=0) & known[:, :3].all(axis=1)[:, None]
     if bad.any():
         equations = partial(_equations, source, solution, wavelengths, bad, by_variance)
-        sums = sum(in_order(equations, _together(list(enumerate(solution.channels.units)))))
+        sums = sum(in_order(equations, _together(_independent(solution.channels.units))))
         for i in np.flatnonzero(bad.any(axis=1)):
             # as for all other pixels: where V is not determined it is taken as zero
             solved = 3 if n == 4 and not known[i, 3] else n
@@ -424,43 +432,60 @@ def _add(out, gain, cubes):
             out[:, i] += gain[i] @ frames
 
 
-def _equations(source, solution, wavelengths, pixels, by_variance, units):
+def _independent(units):
+    """Return the numbers of the units, (n, frames), in groups that have no frame in common."""
+    count = units.max() + 1
+    ends = csr_array((np.ones(len(units)), (units[:, 0], units[:, -1])), shape=(count, count))
+    label = connected_components(ends, directed=False)[1][units[:, 0]]
+    return [np.flatnonzero(label == one) for one in dict.fromkeys(label.tolist())]
+
+
+def _equations(source, solution, wavelengths, pixels, by_variance, groups):
     """
-    Return the normal equations of pixels that lack some fluxes, summed over some units.
+    Return the normal equations of pixels that lack some fluxes, summed over some groups of units.
 
     Of ``pixels``, (n_wavelengths, n_pixels), those that are true: their matrices, what the scatter
     of the data adds to these, and the right sides, (n, n + n + 1, n_true).
     """
-    n, of = len(solution.components), np.nonzero(pixels)[0]
-    sums = np.zeros((n, 2 * n + 1, of.size))
+    n, of, channels = len(solution.components), np.nonzero(pixels)[0], solution.channels
+    sums, shares = np.zeros((n, 2 * n + 1, of.size)), CHANNELS[channels.observable]
+    size = channels.units.shape[1]
+    alone = Channels(channels.observable, size, [range(size)])
 
-    def channels_of(read, frames, power=1):
-        cells = [slice(f, f + 1) for f in frames]
-        found = [[read(beam, cell, wavelengths)[0] for cell in cells] for beam in (0, 1)]
-        fluxes = np.reshape(found, (2, len(cells), *pixels.shape))[..., pixels]
-        alone = Channels(solution.channels.observable, len(cells), [range(len(cells))])
-        return alone.combine(fluxes, power)[:, 0]
+    def beams_of(read, frames):
+        found = [[read(beam, slice(f, f + 1), wavelengths)[0] for f in frames] for beam in (0, 1)]
+        return np.reshape(found, (2, len(frames), *pixels.shape))[..., pixels]
 
-    for unit, frames in units:
-        data = channels_of(source.fluxes, frames)
-        variance = channels_of(source.variances, frames, 2) if source.has_variances else None
-        for channel in (0, 1):
-            row = np.take(solution.channel_rows[channel, wavelengths, unit, :n].T, of, axis=1)
-            weight = solution.weights[channel, wavelengths, unit][of]
-            good = np.isfinite(data[channel])
-            if variance is not None:
-                good &= np.isfinite(variance[channel]) & (variance[channel] > 0)
-                if by_variance:
-                    with np.errstate(divide="ignore", invalid="ignore"):
-                        # a flux that the user gave the weight zero stays out
-                        weight = (weight > 0) / variance[channel]
-            weighted = row * np.where(good, weight, 0.0)
-            sums[:, :n] += row[:, None] * weighted
-            sums[:, 2 * n] += weighted * np.where(good, data[channel], 0.0)
-            if variance is not None:
-                # A^T W V W A: with W = 1 / V it is the normal matrix itself
-                scatter = np.where(good, variance[channel], 0.0)
-                sums[:, n : 2 * n] += weighted[:, None] * (weighted * scatter)
+    for group in groups:
+        # of each beam and frame, what it adds to the right sides, and its variance
+        gains, noise = {}, {}
+        for unit in group:
+            frames = channels.units[unit]
+            data = alone.combine(beams_of(source.fluxes, frames))[:, 0]
+            if source.has_variances:
+                own = beams_of(source.variances, frames)
+                variance = alone.combine(own, 2)[:, 0]
+                noise |= {(b, f): own[b, k] for b in (0, 1) for k, f in enumerate(frames)}
+            for channel in (0, 1):
+                row = np.take(solution.channel_rows[channel, wavelengths, unit, :n].T, of, axis=1)
+                weight = solution.weights[channel, wavelengths, unit][of]
+                good = np.isfinite(data[channel])
+                if source.has_variances:
+                    good &= np.isfinite(variance[channel]) & (variance[channel] > 0)
+                    if by_variance:
+                        with np.errstate(divide="ignore", invalid="ignore"):
+                            # a flux that the user gave the weight zero stays out
+                            weight = (weight > 0) / variance[channel]
+                weighted = row * np.where(good, weight, 0.0)
+                sums[:, :n] += row[:, None] * weighted
+                sums[:, 2 * n] += weighted * np.where(good, data[channel], 0.0)
+                for beam, k in zip(*np.nonzero(shares[channel]), strict=True):
+                    key = (beam, frames[k])
+                    gains[key] = gains.get(key, 0.0) + shares[channel, beam, k] * weighted
+        for key, variance in noise.items():
+            # A^T W V W A, right for any weights, and channels that share a flux
+            scatter = gains[key] * np.nan_to_num(variance, posinf=0.0)
+            sums[:, n : 2 * n] += gains[key][:, None] * scatter
     return sums
 
 

@@ -92,12 +92,17 @@ class ScienceFrames:
                 f"wavelength has shape {self.wavelength.shape}; the frames have "
                 f"{self.source.n_wavelengths} wavelengths"
             )
+        count = self.source.n_frames
         for name, position in self.positions.items():
-            if np.shape(position)[-1:] not in ((), (self.source.n_frames,), (1,)):
+            if np.shape(position)[-1:] not in ((), (count,), (1,)):
                 raise ObservationError(
-                    f"{name} has {np.shape(position)[-1]} positions; there are "
-                    f"{self.source.n_frames} frames"
+                    f"{name} has {np.shape(position)[-1]} positions; there are {count} frames"
                 )
+        if self.groups is not None and np.shape(self.groups) != (count,):
+            raise ObservationError(
+                f"groups has shape {np.shape(self.groups)}; one of each of the {count} frames is "
+                "needed"
+            )
 
     @property
     def names(self):
@@ -323,7 +328,7 @@ class ScienceFrames:
             By what the left beam is multiplied, one number or one per frame.
         detectors : sequence of (object, object), optional
             Of the right and left beam in each frame, whose ``variance(pixels)`` gives the variances
-            where the files hold no errors.
+            where the files hold no errors; pixels from a ``saturation`` that they have on are bad.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 

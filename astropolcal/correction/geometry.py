@@ -53,13 +53,16 @@ def derotate_variance(variance, position_angle, *, centre=None, size=None, mirro
     variance = np.asarray(variance, dtype=float)
     grid = _grid(variance.shape, position_angle, centre, size, mirrored)
     # linear at most: a cubic spline would make negative variances beside a bright pixel
-    smooth = _resampled(variance, *grid, min(order, 1))
-    fraction, gain = _gain_table(order)
-    for place in _places(*grid):
-        # the weights of a spline in two dimensions are products, and so are the sums of their
-        # squares
-        smooth = smooth * np.interp(place - np.floor(place), fraction, gain)
-    return smooth
+    return _resampled(variance, *grid, min(order, 1)) * _gain(grid, order)
+
+
+def derotate_gain(shape, position_angle, *, centre=None, size=None, mirrored=False, order=3):
+    """
+    Return the mean share of their variance that pixels keep when an image is turned by `derotate`.
+
+    A sum of many of them keeps all of it, because neighbours are correlated.
+    """
+    return _gain(_grid(shape, position_angle, centre, size, mirrored), order).mean()
 
 
 def _grid(image_shape, position_angle, centre, size, mirrored):
@@ -150,6 +153,13 @@ def _places(matrix, offset, shape):
     y = matrix[0, 0] * rows + matrix[0, 1] * columns + offset[0]
     x = matrix[1, 0] * rows + matrix[1, 1] * columns + offset[1]
     return y, x
+
+
+def _gain(grid, order):
+    """Return the sums of the squared weights of a spline at the places of the result."""
+    # the weights in two dimensions are products, and so are the sums of their squares
+    y, x = (np.interp(p - np.floor(p), *_gain_table(order)) for p in _places(*grid))
+    return y * x
 
 
 @lru_cache(maxsize=8)

@@ -27,6 +27,8 @@ __all__ = []
 
 #: What the keyword ``CONTENT`` of a product says.
 PRODUCT = "astropolcal Stokes product"
+# characters of a HISTORY card
+_CARD = 72
 # raised when a reader of the version before would misunderstand the file
 _VERSION = 1
 _KEYWORDS = {
@@ -59,7 +61,11 @@ def _header(corrected):
     header = fits.Header()
     header["CONTENT"] = (PRODUCT, "what this file is")
     header["CONTVERS"] = (_VERSION, "version of its form")
-    header["BUNIT"] = corrected.unit.to_string("fits")
+    try:
+        header["BUNIT"] = corrected.unit.to_string("fits")
+    except ValueError:
+        # such as electrons, which the standard does not know
+        header["BUNIT"] = corrected.unit.to_string()
     _axes(header, corrected)
     header["POLCONV"] = ("IAU", "angles from north through east")
     header["COMMENT"] = "Q is positive north-south, U from north-east to south-west; the position"
@@ -68,6 +74,7 @@ def _header(corrected):
     header["CORRMODE"] = (corrected.mode, "stokes: whole Mueller matrix; ip: offsets only")
     header["OBSERVBL"] = (corrected.observable, "what was fitted")
     header["NORTHUP"] = (corrected.north_up, "north is up and east is left")
+    header["RESAMPLE"] = (corrected.resampling, "mean variance of a pixel, before: 1")
     for key, (keyword, comment) in _KEYWORDS.items():
         if corrected.provenance.get(key):
             value = _printable(corrected.provenance[key])
@@ -158,7 +165,7 @@ def _maps(corrected):
     order = ("aolp", "s_chi_statistical", "s_chi_systematic")
     hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order))
     hdus[-1].header["BUNIT"] = "deg"
-    if corrected.stokes.ndim == 4:
+    if corrected.stokes.ndim == 4 and corrected.north_up:
         found = corrected.azimuthal()
         hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
     return hdus
@@ -195,6 +202,10 @@ def _read(hdus):
     # a number alone is a unit too to astropy, and FITS cannot hold all of them
     if getattr(unit, "scale", 1.0) != 1.0:
         raise ValueError(f"BUNIT = {header['BUNIT']!r}; a unit without a factor is needed")
+    # products of before do not say it
+    resampling = _stated(header, "RESAMPLE", float) if "RESAMPLE" in header else 1.0
+    if not resampling > 0:
+        raise ValueError(f"RESAMPLE = {resampling}; a number above zero is needed")
     place = None
     if "STARX" in header:
         place = tuple(_stated(header, key, float) for key in ("STARX", "STARY"))
@@ -214,6 +225,7 @@ def _read(hdus):
         "north_up": _stated(header, "NORTHUP", bool),
         "centre": place,
         "pixel_scale": _stated(header, "PIXSCALE", float) if "PIXSCALE" in header else None,
+        "resampling": resampling,
         "provenance": provenance,
         "star": _star(hdus),
     }
@@ -284,8 +296,14 @@ def _native(values):
 def _systematic(hdus):
     if "SYSFACT" not in hdus:
         return None
-    lines = hdus[0].header.get("HISTORY", [])
-    held = [line.rpartition(": ")[2] for line in lines if line.startswith("not free")]
+    held, before = [], ""
+    for line in hdus[0].header.get("HISTORY", []):
+        if line.startswith("not free"):
+            held.append(line.rpartition(": ")[2])
+        elif held and len(before) == _CARD and not line.startswith("poorly determined"):
+            # a card holds no more, and the next one goes on
+            held[-1] += line
+        before = line
     found = hdus["SYSFACT"]
     is_open = np.asarray(hdus["SYSOPEN"].data, dtype=bool)
     return Systematic(_native(found.data), is_open, found.header["SYSMETH"], held)

@@ -52,6 +52,8 @@ class Corrected:
         Of ``stokes``.
     north_up, centre, pixel_scale
         As in `ScienceFrames`.
+    resampling : float
+        Mean variance of a pixel over the one that it would have had frames not been resampled.
     provenance : dict
         Calibration, versions, input files.
     star : `~astropy.table.QTable` or None
@@ -88,6 +90,7 @@ class Corrected:
     north_up: bool = False
     centre: tuple | None = None
     pixel_scale: float | None = None
+    resampling: float = 1.0
     provenance: dict = field(default_factory=dict)
     star: QTable | None = None
 
@@ -186,7 +189,7 @@ class Corrected:
 
     def azimuthal(self):
         """
-        Return Q_phi and U_phi of images, with their errors.
+        Return Q_phi and U_phi of images with north up, with their errors.
 
         Returns
         -------
@@ -195,6 +198,11 @@ class Corrected:
         """
         if self.stokes.ndim != 4:
             raise ParameterError("Q_phi and U_phi are of images; these are not")
+        if not self.north_up:
+            raise ParameterError(
+                "Q_phi and U_phi need images with north up: give position_angle (--rotation), or "
+                "north_up=True where they are so already"
+            )
         i, j = self._index("Q"), self._index("U")
         pair = azimuthal(self.stokes[i], self.stokes[j], self.centre)
         result = dict(zip(("q_phi", "u_phi"), pair, strict=True))
@@ -224,11 +232,14 @@ class Corrected:
         -------
         Corrected
             Of shape (n_components, n_wavelengths). The statistical errors take the pixels as
-            independent.
+            independent before they were resampled; of few pixels they are then too large.
         """
         inside = self._circle(radius, centre, inner)
-        covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
-        return replace(self, stokes=self.stokes[..., inside].sum(axis=-1), covariance=covariance)
+        stokes, covariance = self.stokes[..., inside].sum(axis=-1), self.covariance
+        if covariance is not None:
+            # what the spline took from each pixel is what it has in common with its neighbours
+            covariance = covariance[..., inside].sum(axis=-1) / self.resampling
+        return replace(self, stokes=stokes, covariance=covariance, resampling=1.0)
 
     def _circle(self, radius, centre=None, inner=0.0):
         """Return the pixels of a circle, or of a ring, that does not leave the images."""

@@ -15,6 +15,7 @@ import numpy as np
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.system import inverse_rows
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice, counted
 
 __all__ = []
@@ -231,7 +232,8 @@ def _in_words(weak, components):
 
 
 def _positive(name, value, shape, beams=False):
-    value = np.asarray(value, dtype=float)
+    # only ratios matter, in whatever unit
+    value = to_unit(value, getattr(value, "unit", None), name)
     allowed = [shape[1:], shape] + ([(2, *shape)] if beams else [])
     if value.shape not in allowed:
         raise ParameterError(f"{name} has shape {value.shape}; allowed are {allowed}")

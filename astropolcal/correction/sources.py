@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from astropolcal.correction.geometry import derotate, derotate_variance
+from astropolcal.correction.geometry import derotate, derotate_gain, derotate_variance
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line, understood
 from astropolcal.fitscheck import open_fits, readable_fits
@@ -27,6 +27,9 @@ class ArraySource:
     At a time all frames of arrays in memory are read, those of a chunk of dask arrays, and one of
     arrays on disk. Quantities are converted to ``unit``; what is masked has no value.
     """
+
+    # as `TurnedSource`
+    resampling = 1.0
 
     def __init__(
         self, right, left, variance_right=None, variance_left=None, names=None, unit=u.adu
@@ -47,6 +50,8 @@ class ArraySource:
         self.n_frames, self.n_wavelengths, *image = self._beams[0].shape
         self.image_shape = tuple(image)
         self.names = [f"frame {i}" for i in range(self.n_frames)] if names is None else list(names)
+        if len(self.names) != self.n_frames:
+            raise ObservationError(f"{len(self.names)} names for {self.n_frames} frames")
 
     def batches(self):
         """Return the frames that are read at a time, a list of slices."""
@@ -121,6 +126,13 @@ class TurnedSource:
             self.image_shape = tuple(np.broadcast_to(size, 2).tolist())
         self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths
         self.names, self.has_variances = source.names, source.has_variances
+
+    @property
+    def resampling(self):
+        """Mean variance of a pixel over the one that it had before it was turned."""
+        shape, turns = self._source.image_shape, zip(self._angles, self._centres, strict=True)
+        known = [(angle, centre) for angle, both in turns for centre in both]
+        return np.mean([derotate_gain(shape, a, centre=xy, **self._options) for a, xy in known])
 
     def batches(self):
         """Return the frames that are read at a time, one by one."""
@@ -230,44 +242,60 @@ class _WholeCubes:
 
     def fluxes(self, beam, frames, wavelengths):
         """Return the fluxes of a beam in some frames and wavelengths, (n, m, Y, X)."""
-        numbers = range(self.n_frames)[frames]
-        # a damaged file may hold signalling NaNs, of which numpy warns where they are first used
-        with np.errstate(invalid="ignore"):
-            scaled = [self._read(beam, i, wavelengths) * self._scale[beam, i] for i in numbers]
-        return np.stack(scaled)
+        return self._of_frames(beam, frames, wavelengths, 1)
 
     def variances(self, beam, frames, wavelengths):
         """Return their variances, NaN where the weight or the error is zero or infinite."""
-        known = [
-            self._variance(beam, i, wavelengths) * self._scale[beam, i] ** 2
-            for i in range(self.n_frames)[frames]
-        ]
-        return np.stack(known)
+        return self._of_frames(beam, frames, wavelengths, 2)
 
-    def _variance(self, beam, i, wavelengths):
-        if not self._has_errors:
-            return self._detectors[i][beam].variance(self._read(beam, i, wavelengths))
-        # variance = error^2 = 1 / inverse variance
-        power = 2 if self._weights == "error" else -1
-
-        def squared(known):
-            # no measurement is without noise, nor is one that is all noise a measurement
-            return np.where((known > 0) & (known < np.inf), known**power, np.nan)
-
+    def _of_frames(self, beam, frames, wavelengths, power):
+        # a damaged file may hold signalling NaNs, of which numpy warns where they are first used
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._read(beam, i, wavelengths, 1, squared)
+            scaled = [
+                self._read(beam, i, wavelengths, power) * self._scale[beam, i] ** power
+                for i in range(self.n_frames)[frames]
+            ]
+        return np.stack(scaled)
 
-    def _read(self, beam, i, wavelengths, offset=0, change=None):
-        """Return a cube or, with an offset, what follows it, ``change``d before it is averaged."""
-        cube = self._section(beam, i, slice(None) if self._stacked else wavelengths, offset)
-        cube = cube if change is None else change(cube)
+    def _read(self, beam, i, wavelengths, power):
+        """Return the fluxes of a frame or, with a power of two, their variances."""
         if self._stacked:
-            # the variance of a mean
-            cube = cube if change is None else cube / len(cube)
-            number = np.isfinite(cube).sum(axis=0, keepdims=True)
-            total = np.nansum(cube, axis=0, keepdims=True)
-            cube = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        return cube
+            return self._mean(beam, i)[power - 1]
+        if self._has_errors and power == 2:
+            return self._squared(self._section(beam, i, wavelengths, 1))
+        flux = self._section(beam, i, wavelengths, 0)
+        flux = np.where(flux < self._most(beam, i), flux, np.nan)
+        return flux if power == 1 else self._detectors[i][beam].variance(flux)
+
+    def _most(self, beam, i):
+        """Return what pixels have to stay below: what is saturated has no value."""
+        detector = None if self._detectors is None else self._detectors[i][beam]
+        return getattr(detector, "saturation", np.inf)
+
+    def _mean(self, beam, i):
+        """Return the mean of the exposures that have a value and an error, and its variance."""
+        flux, variance = self._section(beam, i, slice(None), 0), None
+        # one saturated exposure spoils the mean
+        full = (flux >= self._most(beam, i)).any(axis=0)
+        good = np.isfinite(flux) & ~full
+        if self._has_errors:
+            variance = self._squared(self._section(beam, i, slice(None), 1))
+            good &= np.isfinite(variance)
+        number = good.sum(axis=0, keepdims=True)
+        number = np.where(number > 0, number, np.nan)
+        mean = np.where(good, flux, 0.0).sum(axis=0, keepdims=True) / number
+        if self._has_errors:
+            variance = np.where(good, variance, 0.0).sum(axis=0, keepdims=True) / number**2
+        elif self._detectors is not None:
+            # the detector is that of a mean of all exposures
+            variance = self._detectors[i][beam].variance(mean) * len(flux) / number
+        return mean, variance
+
+    def _squared(self, known):
+        """Return variances of errors or weights: error^2 = 1 / inverse variance."""
+        square = known ** (2 if self._weights == "error" else -1)
+        # no measurement is without noise, nor is one that is all noise a measurement
+        return np.where((known > 0) & (known < np.inf), square, np.nan)
 
     def _section(self, beam, i, wavelengths, offset):
         (shape, dtype, start), path = self._places[beam][i][offset], self._beam_files[beam][i]

@@ -114,9 +114,10 @@ def without_star(corrected, star, words, measured):
     stokes[1:3] -= share[1:3].reshape(2, -1, *[1] * (stokes.ndim - 2)) * stokes[0]
     covariance = corrected.covariance
     if covariance is not None:
-        known = np.einsum(
-            "wab,bcw...,wdc->adw...", change, corrected.covariances("statistical"), change
-        )
+        known = corrected.covariances("statistical")
+        # a V that is not determined has no errors, but the others do
+        moved = np.einsum("wab,bcw...,wdc->adw...", change, np.nan_to_num(known), change)
+        known = np.where(np.isnan(known), np.nan, moved)
         covariance = np.stack([known[pair] for pair in covariance_index(n)])
     table = star.table()[COLUMNS]
     table.meta = {"star": words}

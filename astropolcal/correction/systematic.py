@@ -120,42 +120,20 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
 
     For ``open_directions`` see `correct`.
     """
-    known = open_directions in ("infinite", "ignore")
-    if not known and (isinstance(open_directions, str) or not 0 <= open_directions < np.inf):
-        raise ParameterError(
-            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
-            "from zero"
-        )
-    n = len(solution.components)
-    gain = np.nan_to_num(solution.gain)
-    shape = (len(gain), n, n)
-    light = _light(mode, n)
-    changes = model.changes(gain, n, solution.scale[..., None]) * light[:, None]
-    flat = changes.reshape(-1, model.free.size)
-    covariance = full_covariance(model.calibration)
-    spread = covariance._spread(flat)
-    # open: along a direction that no datum fixes; blind: of a parameter without any error
-    is_open = (spread.is_open | spread.is_blind).reshape(shape)
-    moved = np.where(is_open.ravel()[:, None], 0.0, spread.moved)
-    if open_directions != "infinite":
-        is_open, moved = np.zeros_like(is_open), spread.moved
-        if open_directions != "ignore":
-            axes = covariance._axes()
-            # rows in which the leading parameter moves by one step: degree, micrometre, percent
-            steps = np.array([row for row, _ in led(model.free, axes.open)])
-            steps = steps.reshape(-1, flat.shape[1])
-            along = float(open_directions) * (flat * axes.steps) @ steps.T
-            moved = np.concatenate([moved, along], axis=1)
-    return _with_model_error(moved.T.reshape(-1, *shape), is_open, "linear", model, light)
+    light = _light(mode, len(solution.components))
+    known, along, is_open = _moved(model, solution, light, open_directions)
+    return _with_model_error(known, along, is_open, "linear", model, light)
 
 
-def sampled_systematic(model, solution, *, n_samples, seed=None, mode="stokes"):
+def sampled_systematic(
+    model, solution, *, n_samples, seed=None, mode="stokes", open_directions="infinite"
+):
     """
     Return the systematic errors by solving again for samples of the parameters.
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
-    drawn from its covariance; directions that the calibration does not determine stay where they
-    are.
+    drawn from its covariance. These stay where they are along directions that the calibration does
+    not determine, whose errors are those of `linear_systematic`.
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
@@ -170,8 +148,41 @@ def sampled_systematic(model, solution, *, n_samples, seed=None, mode="stokes"):
         found[i] = np.einsum("wkbf,bwfs->wks", np.nan_to_num(gain), solution.rows[..., :n])
     # so that the sum over samples of the products is the unbiased covariance
     factor = (found - found.mean(axis=0)) / np.sqrt(n_samples - 1)
-    is_open = np.zeros(found.shape[1:], dtype=bool)
-    return _with_model_error(factor, is_open, "sampled", model, _light(mode, n))
+    light = _light(mode, n)
+    _, along, is_open = _moved(model, solution, light, open_directions)
+    if _has_samples(model):
+        # the samples have walked along all directions
+        along, is_open = along[:0], np.zeros_like(is_open)
+    return _with_model_error(factor, along, is_open, "sampled", model, light)
+
+
+def _moved(model, solution, light, open_directions):
+    """Return changes for one sigma along each known and open direction, and what is open."""
+    known = open_directions in ("infinite", "ignore")
+    if not known and (isinstance(open_directions, str) or not 0 <= open_directions < np.inf):
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
+            "from zero"
+        )
+    n = len(light)
+    gain = np.nan_to_num(solution.gain)
+    shape = (len(gain), n, n)
+    changes = model.changes(gain, n, solution.scale[..., None]) * light[:, None]
+    flat = changes.reshape(-1, model.free.size)
+    covariance = full_covariance(model.calibration)
+    spread = covariance._spread(flat)
+    # open: along a direction that no datum fixes; blind: of a parameter without any error
+    is_open = (spread.is_open | spread.is_blind).reshape(shape)
+    along = np.zeros((0, *shape))
+    if open_directions != "infinite":
+        is_open = np.zeros_like(is_open)
+    if not known:
+        axes = covariance._axes()
+        # rows in which the leading parameter moves by one step: degree, micrometre, percent
+        steps = np.array([row for row, _ in led(model.free, axes.open)])
+        steps = steps.reshape(-1, flat.shape[1])
+        along = (float(open_directions) * steps @ (flat * axes.steps).T).reshape(-1, *shape)
+    return spread.moved.T.reshape(-1, *shape), along, is_open
 
 
 def _light(mode, n):
@@ -179,16 +190,23 @@ def _light(mode, n):
     return (np.arange(n) < (1 if mode == "ip" else n)).astype(float)
 
 
-def _with_model_error(factor, is_open, method, model, light):
+def _with_model_error(known, along, is_open, method, model, light):
     lacking = model_error(model.calibration.fit, model.wavelength.to_value(u.um), len(light))
-    return Systematic(np.concatenate([factor, lacking * light]), is_open, method, model.held)
+    factor = np.concatenate([np.where(is_open, 0.0, known), along, lacking * light])
+    return Systematic(factor, is_open, method, model.held)
+
+
+def _has_samples(model):
+    """Return whether the calibration has samples of all its free parameters."""
+    posterior = model.calibration.posterior
+    return posterior is not None and set(model.free.names) <= set(posterior.names)
 
 
 def _draws(model, count, rng):
     """Yield values of all free parameters in canonical units."""
     start, factors = model.free.start(), model.free.factors()
-    posterior = model.calibration.posterior
-    if posterior is not None and set(model.free.names) <= set(posterior.names):
+    if _has_samples(model):
+        posterior = model.calibration.posterior
         samples = posterior.samples()
         columns = [posterior.index(name) for name in model.free.names]
         for row in samples[rng.integers(len(samples), size=count)]:

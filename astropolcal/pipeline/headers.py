@@ -265,6 +265,12 @@ def told_beam(headers, instrument, labels=None):
     return {name: is_in for name, (_, is_in) in found.items()}
 
 
+def days_of(calibration):
+    """Return the dates of a calibration's data, or else the start of its validity, oldest first."""
+    start = validity_of(calibration).valid_from
+    return _dates(calibration) or ([] if start is None else [start])
+
+
 def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", dates=True):
     """Refuse frames for which a calibration does not hold, and warn if it is old for some.
 
@@ -297,7 +303,7 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
                     f"{ways.get('other date', '')}"
                 )
             moments.setdefault(moment, label)
-    days = _dates(calibration) or ([held.valid_from] if held.valid_from else [])
+    days = days_of(calibration)
     if not (moments and days):
         return
     _check_changes(calibration, light, days, moments, name, ways["date"])

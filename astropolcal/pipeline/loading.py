@@ -21,6 +21,7 @@ from astropolcal.calibration.system import (
     at_wavelengths,
     distinct,
     match_wavelengths,
+    model_error,
 )
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves, warn_beyond, with_beam
@@ -32,6 +33,7 @@ from astropolcal.exceptions import (
     InstrumentError,
     ParameterError,
 )
+from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import PLACES, finite_position
@@ -44,7 +46,7 @@ from astropolcal.pipeline.headers import (
     told_beam,
 )
 from astropolcal.pipeline.library import Entry, Library
-from astropolcal.units import to_unit
+from astropolcal.units import angle_to_rad, to_unit
 from astropolcal.words import check_choice
 
 __all__ = ["LoadedCalibration", "SystemMueller", "load"]
@@ -483,6 +485,9 @@ class LoadedCalibration:
             raise ParameterError(
                 f"stokes of shape {given.shape}; needed are I, Q, U (and V) at {size} wavelengths"
             )
+        hwp, count = np.atleast_1d(angle_to_rad(hwp, "hwp")), len(beams[0].value)
+        if hwp.shape != (count,) or not np.isfinite(hwp).all():
+            raise ParameterError(f"hwp = {one_line(hwp)}; {count} finite angles are needed")
         sums = _demodulation(hwp, beams[0].positions.get("flc_state", 0), difference)
         # b: beams, f: frames, w: wavelengths, k: measured, s and t: true Stokes parameters, r: rank
         matrix = np.einsum("kbf,bfws->wks", sums, [m.value[..., 0, :] for m in beams])
@@ -497,6 +502,8 @@ class LoadedCalibration:
         flat[:3] = np.einsum("wks,swp->kwp", inverse, rest)
         n = len(flat)
         moved = np.einsum("wjk,wksr->wjsr", inverse, slopes[..., :n, :])
+        lacking = model_error(self.calibration.fit, beams[0].wavelength.to_value(u.um), n)
+        moved = np.concatenate([moved, np.moveaxis(lacking[:, :, :3], 0, -1)], axis=-1)
         # small, and the same for all pixels (p), which only need the products of their light
         tensor = np.einsum("wjsr,wjtr->wjst", moved, moved)
         spread = np.sqrt(np.einsum("wjst,swp,twp->jwp", tensor, flat, flat, optimize=True))
@@ -575,7 +582,7 @@ class LoadedCalibration:
 def _demodulation(hwp, state, difference):
     """Return by what the beams of each frame are multiplied for I, Q and U, (3, 2, n)."""
     check_choice("difference", difference, ("right-left", "left-right"), ParameterError)
-    theta = 4 * np.atleast_1d(u.Quantity(hwp).to_value(u.rad))
+    theta = 4 * hwp
     sign = np.where(np.asarray(state) > 0, -1.0, 1.0) * (1 if difference == "right-left" else -1)
     ideal = np.stack([np.cos(theta), np.sin(theta)], axis=1)
     if np.linalg.matrix_rank(ideal, tol=1e-6) < 2:

@@ -12,6 +12,7 @@ from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
+from astropolcal.pipeline.headers import days_of
 from astropolcal.pipeline.library import Library
 from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
@@ -169,7 +170,7 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
     following = "Give the calibrations dates: with_validity(valid_from=) states one."
     if dated:
-        due, n = moment_of(_start(newest), "date") + limit * u.day, len(dated)
+        due, n = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day, len(dated)
         words = "is due" if due < moment else f"is due by {due.isot[:10]}"
         more = f"; {counted(3 - n, 'more run')} will show what changes" if n < 3 else ""
         following = f"The next calibration {words}{more}."
@@ -180,8 +181,8 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
 def _alarms(content, newest, verdict, moment, goal, limit):
     """Return sentences on what needs care."""
     found, name = [], content["instrument"] or "the instrument"
-    if newest.validity.valid_from is not None:
-        day = _start(newest)
+    # a calibration is as old as its data, from whatever day on it is said to hold
+    for day in days_of(newest.calibration)[-1:]:
         age = (moment - moment_of(day, "date")).to_value(u.day)
         if age > limit and newest.validity.valid_until is None:
             found.append(

@@ -25,7 +25,7 @@ def plot_corrected(corrected, **options):
 
 def plot_images(corrected, *, wavelength=None, figure=None):
     """
-    Draw I, Q, U, Q_phi, U_phi and the error of Q of images.
+    Draw I, Q, U, Q_phi, U_phi (both where north is up) and the error of Q of images.
 
     Parameters
     ----------
@@ -64,10 +64,10 @@ def plot_images(corrected, *, wavelength=None, figure=None):
         raise ParameterError("these are spectra; plot_spectrum draws them")
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
-    limit = _top(np.abs([panels[name] for name in _POLARIZED]))
+    limit = _top(np.abs([panels[name] for name in _POLARIZED if name in panels]))
     extent = _extent(corrected)
     with st.canvas(figure, 12.5, 8.2) as figure:
-        grid = figure.subplots(2, 3, sharex=True, sharey=True)
+        grid = figure.subplots(2, len(panels) // 2, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             drawn, extend = _draw_image(axes, name, image, extent, limit)
             bar = figure.colorbar(drawn, ax=axes, shrink=0.85, extend=extend)
@@ -92,10 +92,11 @@ def _chosen(corrected, wavelength):
 
 def _panels(corrected, chosen):
     """Return the images by name, in the order of the panels."""
-    found = corrected.azimuthal()
-    images = [corrected[name][chosen] for name in "IQU"]
-    images += [found[name][chosen] for name in ("q_phi", "u_phi")]
-    panels = dict(zip(("I", *_POLARIZED), map(st.mean_known, images), strict=True))
+    images = {name: corrected[name] for name in "IQU"}
+    if corrected.north_up:
+        found = corrected.azimuthal()
+        images |= dict(zip(_POLARIZED[2:], (found["q_phi"], found["u_phi"]), strict=True))
+    panels = {name: st.mean_known(image[chosen]) for name, image in images.items()}
     error, kind = corrected.error("Q")[chosen], "statistical"
     if not np.isfinite(error).any():
         error, kind = corrected.error("Q", "systematic")[chosen], "systematic"

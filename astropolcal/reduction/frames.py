@@ -98,7 +98,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             frame.errors, frame.doubts = known.errors, known.doubts
             _check_header(frame, layout, source)
             # per file: gain and exposure time may change within a night
-            detector = detector_of(layout, _unit(header, primary), frame.values)
+            detector = detector_of(layout, _unit_of(header, primary), frame.values)
             if layout.beam_files:
                 detector, cube = match_beams(frame, layout, cube, detector)
             frame.unit = detector.unit.to_string()
@@ -113,11 +113,21 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
     result = frame.photometry
-    frame.digest = hashlib.sha256(np.ascontiguousarray(result.flux).tobytes()).hexdigest()[:24]
+    frame.digest = _digest(result.flux)
     if result.failed.all():
         most = max(set(result.reasons), key=result.reasons.count)
         frame.errors.append(f"no slice can be used: {most}")
     return frame
+
+
+def _digest(array):
+    return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:24]
+
+
+def _unit_of(*headers):
+    """Return the first BUNIT of some headers, or None."""
+    units = (card_value(header, "BUNIT") for header in headers)
+    return next((unit for unit in units if unit is not None), None)
 
 
 @contextmanager
@@ -190,7 +200,7 @@ def _read_beams(path, hdus, layout, masters):
     several = cube.shape != wanted
     if several or masters is not None:
         values = read_header(path, layout, header=primary).values
-        saturation = detector_of(layout, _unit(header, primary), values).saturation
+        saturation = detector_of(layout, _unit_of(header, primary), values).saturation
     if masters is not None:
         cube, good = masters.applied(cube, good, layout, saturation)
     if not good.any():
@@ -207,11 +217,6 @@ def _read_beams(path, hdus, layout, masters):
         cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.maximum(seen, 1)
         cube, good = np.where(full, saturation, cube), seen > 0
     return primary, header, cube, good
-
-
-def _unit(*headers):
-    """Return BUNIT of the first header that has it, None without one."""
-    return next((unit for one in headers if (unit := card_value(one, "BUNIT")) is not None), None)
 
 
 def _check_header(frame, layout, source):
@@ -240,15 +245,16 @@ def _check_header(frame, layout, source):
         )
 
 
-def check_stars(frames, layout):
+def check_stars(frames, layout, needed=True):
     """
     Compute the angles of the sky that headers lack, and check that the plates followed it.
 
-    What is wrong or odd is added to the frames' ``errors`` and ``doubts``.
+    What is wrong or odd is added to the frames' ``errors`` and ``doubts``; that an angle is not
+    known, if all are ``needed``.
     """
     # what could not be opened says nothing
     frames = [frame for frame in frames if frame.values]
-    add_pointing(frames, layout)
+    add_pointing(frames, layout, needed)
     name, most = layout.keywords.get("hwp_true", "hwp_true"), layout.tracking_tolerance
     for frame in frames:
         if not {"parallactic", "altitude"} <= frame.values.keys():
@@ -347,9 +353,21 @@ def match_beams(frame, layout, cube, detector):
     """
     Bring both images of a frame, the left one first, to the electrons of the right one.
 
-    Returns the detector with that of the left beam, and the cube. What contradicts the header of
-    the right file becomes an error of the frame.
+    Returns the detector with that of the left beam, and the cube.
     """
+    other = _left_header(frame, layout)
+    # each camera is read out in its own way
+    left = detector_of(layout, other.unit or detector.unit.to_string(), other.values)
+    # to the electrons of the right one: single differences compare both beams
+    if (factor := left.units_of(detector)) != 1.0:
+        # the left image is the first half of the columns
+        first = np.arange(cube.shape[-1]) < cube.shape[-1] // 2
+        cube = cube * np.where(first, factor, 1.0)
+    return replace(detector, left=left.in_units_of(detector)), cube
+
+
+def _left_header(frame, layout):
+    """Return that of the left beam; what contradicts the right one is an error of the frame."""
     path = layout.left_file(frame.path)
     other = read_header(path, layout)
     frame.errors += [f"{path.name}: {error}" for error in other.errors]
@@ -366,14 +384,7 @@ def match_beams(frame, layout, cube, detector):
         if camera is not None and not mark.endswith(f"{camera:g}"):
             keyword = layout.keywords["camera"]
             frame.errors.append(f"{keyword} = {camera:g}, its name says {mark!r}")
-    # each camera is read out in its own way
-    left = detector_of(layout, other.unit or detector.unit.to_string(), other.values)
-    # to the electrons of the right one: single differences compare both beams
-    if (factor := left.units_of(detector)) != 1.0:
-        # the left image is the first half of the columns
-        first = np.arange(cube.shape[-1]) < cube.shape[-1] // 2
-        cube = cube * np.where(first, factor, 1.0)
-    return replace(detector, left=left.in_units_of(detector)), cube
+    return other
 
 
 def beam_detectors(path, layout, values, unit=None):
@@ -464,13 +475,29 @@ def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
         if not seen.all():
             bad = files[int(np.argmin(seen))]
             raise ObservationError(f"{bad}: the star was not found{ways['centre']}")
-    # frames of equal exposures need no scale, known or not
-    exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
-    differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
     detectors = [
         beam_detectors(file, layout, f.values, f.unit) for file, f in zip(files, found, strict=True)
     ]
-    return _angles(found), centre, exposure / np.median(exposure) if differ else None, detectors
+    return _angles(found), centre, _brightness(files, found, detectors), detectors
+
+
+def _brightness(files, frames, detectors):
+    """Return the relative brightness of a steady source, None where it is the same in all."""
+    units = [right.unit for right, _ in detectors]
+    for file, unit in zip(files, units, strict=True):
+        if unit != units[0]:
+            raise ObservationError(
+                f"{files[0]} is in {units[0]}, {file} in {unit}: correct apart, or bring them to "
+                "one unit"
+            )
+    exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in frames])
+    if not np.isfinite(exposure).all():
+        # what a header does not say is not guessed
+        exposure = np.ones(len(frames))
+    # electrons grow with time; a unit of the data is so many of them, of all exposures of a mean
+    number = np.array([frame.values.get("exposures", 1.0) for frame in frames])
+    scale = exposure * number / [right.gain for right, _ in detectors]
+    return scale / np.median(scale) if np.ptp(scale) > 1e-6 * scale.max() else None
 
 
 def _check_one_target(files, frames):
@@ -495,15 +522,28 @@ def _check_one_target(files, frames):
 
 def _survey(files, layout, raw, find):
     """Return what is known of the files, with the places of a star that is to be found."""
-    if find:
-        # finds the star, which takes the time of this step
-        frames = [reduce_frame(file, layout, source="star", raw=raw) for file in files]
-        check_stars(frames, layout)
-        return frames
-    frames = [read_header(file, layout, raw=raw) for file in files]
-    # whether they are needed depends on the calibration
-    add_pointing(frames, layout, needed=False)
+    # to find the star takes the time of this step
+    frames = [
+        reduce_frame(file, layout, source="star", raw=raw) if find else _known(file, layout, raw)
+        for file in files
+    ]
+    # of a star whose place is known, which angles are needed depends on the calibration
+    check_stars(frames, layout, needed=find)
     return frames
+
+
+def _known(path, layout, raw):
+    """Return what is known of a frame whose light is not measured."""
+    frame = Frame(**vars(read_header(path, layout, raw=raw)))
+    with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
+        # what is not there is refused where it is corrected
+        if len(hdus) > layout.cube_extension and hdus[layout.cube_extension].data is not None:
+            cube = hdus[layout.cube_extension]
+            frame.unit = _unit_of(cube.header, hdus[0].header)
+            frame.digest = _digest(cube.data)
+    if layout.beam_files:
+        _left_header(frame, layout)
+    return frame
 
 
 def _angles(frames):

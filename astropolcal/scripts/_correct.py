@@ -169,6 +169,7 @@ def work(arguments):
         scale=scale,
         left_scale=[left.units_of(right) for right, left in detectors],
         detectors=detectors,
+        unit=detectors[0][0].unit,
         # date and mode were checked when the calibration was chosen
         date=None,
         mode=calibration.validity.mode,
@@ -396,6 +397,9 @@ def _words(summary, systematic, arguments):
     lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
     found, accuracy, lost = _polarization(star, is_open)
     lines += found
+    if held := summary.get("held"):
+        line = f"  without error, as not free in the calibration: {', '.join(held)}"
+        lines += common.wrapped(line, indent=4).split("\n")
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n = len(summary["wavelength_nm"])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate, instruments
+from astropolcal.calibration.result.calibration import validity_of, with_validity
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.pipeline import Library, changes, courses, health, parameter_history
+from astropolcal.pipeline import Entry, Library, changes, courses, health, parameter_history
 from astropolcal.pipeline.monitoring import write_health
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -152,6 +153,13 @@ def test_health_says_what_needs_care(folder):
     assert "the goal is 1e-06 %" in alarms
     (fresh,) = health(folder, now="2023-08-01", max_age=4 * u.yr)["groups"]
     assert not any("days old" in words for words in fresh["alarms"])
+    # it is as old as its data, whatever is stated of when it holds
+    entry = Library(folder).entries[-1]
+    for start, words in (("2029-06-01", "of 2023-07-01, 2376 days old"), ("2020-01-01", "2376")):
+        stated = with_validity(entry.calibration, valid_from=start)
+        library = Library([])
+        library.entries = [Entry(entry.path, stated, validity_of(stated), "0")]
+        assert words in " ".join(health(library, now="2030-01-01")["groups"][0]["alarms"])
     for options in ({"goal": -1}, {"max_age": 3 * u.m}, {"goal": "high"}):
         with pytest.raises(ParameterError, match="above zero"):
             health(folder, **options)

@@ -505,7 +505,15 @@ def test_a_stokes_cube_is_corrected_with_its_errors(calibration, loaded):
         moved = measured([beam.value + 1e-3 * beam.factor[..., r] for beam in beams])
         shift = loaded.correct(np.concatenate([moved, true[3:]]), headers)[0] - stokes
         squares = squares + (1e3 * shift[:3]) ** 2
-    np.testing.assert_allclose(systematic[:3], np.sqrt(squares), rtol=1e-3)
+    # beside it, in proportion to the light, what the model lacks
+    known = {"wavelength_nm": calibration.wavelength.to_value(u.nm).tolist()}
+    for relative, absolute in [(0.0, 0.0), (2.0, 0.5)]:
+        lacking = known | {"relative_percent": [relative] * 3, "absolute_percent": [absolute] * 3}
+        fit = calibration.fit | {"model_error": lacking}
+        _, found = load(dataclasses.replace(calibration, fit=fit)).correct(given, headers)
+        own = np.hypot(absolute * true[0], relative * np.hypot(true[1], true[2])) / 100
+        expected = np.sqrt(squares + np.array([0, 1, 1])[:, None] * own**2)
+        np.testing.assert_allclose(found[:3], expected, rtol=1e-3)
 
 
 def test_stokes_cubes_that_cannot_be_corrected(loaded):
@@ -515,6 +523,9 @@ def test_stokes_cubes_that_cannot_be_corrected(loaded):
         (cube[:, :2], {}, "at 3 wavelengths"),
         (cube, {}, "do not tell Q and U apart"),
         (cube, {"difference": "both"}, "allowed are right-left, left-right"),
+        (cube, {"hwp": [0, 22.5, 45] * u.deg}, "hwp = .*; 2 finite angles are needed"),
+        (cube, {"hwp": [0, np.nan] * u.deg}, "hwp = .*; 2 finite angles are needed"),
+        (cube, {"hwp": [0, 22.5]}, "hwp = .* needs a unit"),
     ]:
         with pytest.raises(ParameterError, match=message):
             loaded.correct(stokes, headers, **options)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import Observations, calibrate
+from astropolcal import Observations, calibrate, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.correction.geometry import derotate
@@ -39,7 +39,8 @@ def frames_of(disk_frames, charis, **settings):
 
 def test_disk_comes_back_exactly(disk_frames, sky, charis):
     for observable in ["intensity", "single", "double"]:
-        found = correct(sky, frames_of(disk_frames, charis), observable=observable)
+        frames = frames_of(disk_frames, charis, north_up=True)
+        found = correct(sky, frames, observable=observable)
         stokes = disk_frames[0]
         np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
         np.testing.assert_allclose(found.u, stokes[2] / stokes[0], atol=1e-10)
@@ -408,6 +409,52 @@ def test_an_aperture_sums(disk_frames, sky, charis):
     np.testing.assert_allclose(found.stokes, true, atol=1e-9)
     with pytest.raises(ParameterError, match="no pixel"):
         correct(sky, frames_of(disk_frames, charis)).aperture(0)
+
+
+def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, seen):
+    """Weights by equal variances are equal weights, and so must be the covariances."""
+    positions = track(2)[1]
+    stokes = np.array([1e5, 2e4, -1e4])[:, None, None] * np.ones((22, 3))
+    beams = seen(sky, positions, charis.wavelength, stokes)
+    unequal = {f"variance_{beam}": np.full(beams[0].shape, v) for beam, v in zip(
+        ("right", "left"), (100.0, 900.0), strict=True)}  # fmt: skip
+    twice = [[0, 1], [2, 3], [4, 5], [6, 7]] * 2
+    shared = [[0, 1], [0, 5], [4, 1], [4, 5], [2, 3], [2, 7], [6, 3], [6, 7]]
+    for observable, pairs in (("single", None), ("double", shared), ("double", twice)):
+        frames = ScienceFrames.from_arrays(
+            *beams, charis.wavelength, positions, pairs=pairs, **unequal
+        )
+        equal, by_variance = (
+            correct(sky, frames, observable=observable, brightness="given", weights=weights)
+            for weights in (None, "variance")
+        )
+        scale = np.sqrt(equal.covariance[0])
+        np.testing.assert_allclose(by_variance.stokes, equal.stokes, rtol=1e-9)
+        np.testing.assert_allclose(
+            by_variance.covariance / scale**2, equal.covariance / scale**2, atol=1e-9
+        )
+    # what is masked is no weight
+    weights = np.ma.array([1e9] + 7 * [1.0], mask=[True] + 7 * [False])
+    with pytest.raises(ParameterError, match="weights = nan"):
+        correct(sky, frames, observable="single", weights=weights)
+
+
+def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
+    """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    chain, hwp = chain | optics.WollastonPrism(name="wollaston"), [0, 45, 22.5, 67.5] * u.deg
+    # the wavelengths are draws of the noise
+    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 1500, 25, 25))
+    known = {"variance_right": np.full(noise[0].shape, 900.0)}
+    known["variance_left"] = known["variance_right"]
+    for camera in ([0, 0, 0, 0], [90, 17, 30, 45], [20, 20, 20, 20]):
+        frames = ScienceFrames.from_arrays(
+            *noise, np.linspace(1, 2, 1500) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
+            **known,
+        )  # fmt: skip
+        star = correct(chain, frames, brightness="given").aperture(9)
+        claimed = star.error("Q").mean()
+        assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera
 
 
 def test_v_and_its_fraction(sky, charis, track, seen):

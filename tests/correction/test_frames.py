@@ -99,10 +99,13 @@ def test_what_does_not_fit():
         ({"wavelength": [1.2] * u.um}, r"wavelength has shape \(1,\); the frames have 2 wave"),
         ({"positions": {"hwp": HWP[:3]}}, r"hwp has 3 positions; there are 4 frames"),
         ({"positions": {"hwp": np.zeros((5, 3)) * u.deg}}, r"hwp has 3 positions; there are 4"),
+        ({"groups": [0, 0, 0]}, r"groups has shape \(3,\); one of each of the 4 frames"),
     ]:
         good = arrays()
         with pytest.raises(ObservationError, match=words):
             dataclasses.replace(good, **changes)
+    with pytest.raises(ObservationError, match="1 names for 4 frames"):
+        arrays(names=["a"])
 
 
 def test_positions_of_all_frames_alike():

@@ -4,13 +4,14 @@
 import dataclasses
 from contextlib import suppress
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 
 from astropolcal.correction import Corrected, ScienceFrames, correct
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,7 @@ def corrected(calibration, charis, track, scene, seen):
         hwp=hwp,
         names=names,
         centre=(4.0, 4.0),
+        north_up=True,
         variance_right=right,
         variance_left=left,
         pixel_scale=16.2,
@@ -92,6 +94,17 @@ def test_maps_are_what_the_object_says(corrected, path):
         np.testing.assert_array_equal(hdus["DOLP"].data[2], found["s_p_statistical"])
         np.testing.assert_array_equal(hdus["AOLP"].data[2], found["s_chi_systematic"])
         np.testing.assert_array_equal(hdus["QPHI"].data[0], corrected.azimuthal()["q_phi"])
+
+
+def test_images_that_are_not_turned_have_no_azimuthal_components(corrected, tmp_path):
+    """Q and U refer to north, but where that is in the images is not known."""
+    seen = dataclasses.replace(corrected, north_up=False)
+    with pytest.raises(ParameterError, match="need images with north up"):
+        seen.azimuthal()
+    seen.write(tmp_path / "out.fits")
+    with fits.open(tmp_path / "out.fits") as hdus:
+        assert "QPHI" not in hdus
+    assert not Corrected.read(tmp_path / "out.fits").north_up
 
 
 def test_a_spectrum_without_errors(sky, charis, star, tmp_path):
@@ -271,6 +284,37 @@ def test_a_complex_column_is_refused(path):
             hdu.header.remove(key, ignore_missing=True)
     hdus.writeto(path, overwrite=True)
     with pytest.raises(ObservationError, match="leakage is complex"):
+        Corrected.read(path)
+
+
+def test_units_that_fits_does_not_know_come_back(corrected, tmp_path):
+    for unit in (u.electron, u.electron / u.s, u.adu / u.s):
+        dataclasses.replace(corrected, unit=unit).write(tmp_path / "out.fits", overwrite=True)
+        assert Corrected.read(tmp_path / "out.fits").unit == unit
+
+
+def test_long_names_without_error_come_back(corrected, tmp_path):
+    # 28 characters are as many as a card has room for
+    names = ["a" * 28, "mirror_of_the_telescope." + "b" * 80, "c.d", "e" * 29]
+    held = dataclasses.replace(corrected.systematic, held=names)
+    given = corrected.provenance | {"held": names}
+    weak = ["0.98 Q -0.19 U", *corrected.weak[1:]]
+    one = dataclasses.replace(corrected, systematic=held, provenance=given, weak=weak)
+    one.write(tmp_path / "out.fits")
+    assert Corrected.read(tmp_path / "out.fits").systematic.held == names
+
+
+def test_how_much_resampling_took_comes_back(corrected, path, tmp_path):
+    dataclasses.replace(corrected, resampling=0.6).write(tmp_path / "turned.fits")
+    again = Corrected.read(tmp_path / "turned.fits")
+    np.testing.assert_allclose(
+        again.aperture(2).covariance, corrected.aperture(2).covariance / 0.6, rtol=1e-12
+    )
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["RESAMPLE"] = 0.0
+        for key in ("CHECKSUM", "DATASUM"):
+            hdus[0].header.remove(key, ignore_missing=True)
+    with pytest.raises(ObservationError, match=r"RESAMPLE = 0\.0"):
         Corrected.read(path)
 
 

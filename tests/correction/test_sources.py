@@ -10,6 +10,7 @@ from astropy.utils.masked import Masked
 from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.reduction.photometry import Detector
 
 ALL = slice(None)
 
@@ -289,6 +290,52 @@ def test_a_file_without_an_image(tmp_path):
     for stacked in (False, True):
         with pytest.raises(ObservationError, match=r"a.fits: a cube of shape \(\)"):
             CubeFiles([tmp_path / "a.fits"], [(3, 3), (3, 2)], 3, extension=0, stacked=stacked)
+
+
+def test_exposures_that_are_no_measurement_take_no_part_in_their_mean(tmp_path):
+    # of a mean of all exposures
+    reader = Detector(u.adu, gain=40.0, read_noise=0.0, saturation=1e7)
+    cube, error = np.full((4, 6, 12), 100.0), np.ones((4, 6, 12))
+    # a pixel that its error marks as bad, and one that two exposures lack
+    cube[0, 3, 3], error[0, 3, 3], cube[:2, 4, 3] = 1e6, 0.0, np.nan
+    names = {"error": "error.fits", "inverse variance": "weight.fits", "": "plain.fits"}
+    for weights, name in names.items():
+        hdus = [fits.PrimaryHDU(cube), fits.ImageHDU(error)][: 2 if weights else 1]
+        fits.HDUList(hdus).writeto(tmp_path / name)
+        options = {
+            "weights": weights or "error",
+            "detectors": None if weights else [[reader] * 2],
+        }
+        source = CubeFiles(
+            [tmp_path / name], [(3, 3), (9, 3)], 3, extension=0, stacked=True, **options
+        )
+        flux, variance = (
+            read(0, slice(0, 1), slice(0, 1))[0, 0] for read in (source.fluxes, source.variances)
+        )
+        one = 1.0 if weights else 10.0
+        assert (flux[2, 1], variance[2, 1]) == (100.0, one / 2)
+        assert (flux[0, 0], variance[0, 0]) == (100.0, one / 4)
+        if weights:
+            assert (flux[1, 1], variance[1, 1]) == (100.0, one / 3)
+
+
+def test_saturated_pixels_have_no_value(tmp_path):
+    # of the left beam another camera
+    both = [Detector(u.adu, 1.0, 0.0, saturation) for saturation in (1000.0, 2000.0)]
+    cube = np.full((3, 6, 12), 100.0)
+    cube[0, 3, 3], cube[0, 2, 3], cube[0, 3, 9] = 1000.0, 999.0, 1000.0
+    fits.PrimaryHDU(cube).writeto(tmp_path / "a.fits")
+    for stacked in (False, True):
+        source = CubeFiles(
+            [tmp_path / "a.fits"], [(3, 3), (9, 3)], 3, extension=0, stacked=stacked,
+            detectors=[both],
+        )  # fmt: skip
+        for read in (source.fluxes, source.variances):
+            right, left = (read(beam, slice(0, 1), slice(0, 1))[0, 0] for beam in (0, 1))
+            # one exposure spoils a mean
+            assert np.isnan(right[1, 1])
+            assert np.isnan(right).sum() == 1
+            assert np.isfinite(left).all()
 
 
 @pytest.mark.parametrize("kind", [">f4", ">f8"])

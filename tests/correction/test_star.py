@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The polarization of a star, measured or stated, and images without it."""
 
+import dataclasses
 import warnings
 
 import astropy.units as u
@@ -176,6 +177,27 @@ def test_a_wavelength_without_values_stays_without(scene_with_star):
     assert np.isnan(result.stokes[:, 1]).all()
     assert np.isfinite(result.stokes[:, [0, 2]]).all()
     assert np.isnan(result.star["q"][1])
+
+
+def test_a_v_that_is_not_determined_leaves_the_other_errors(scene_with_star):
+    _, stokes, *_ = scene_with_star
+    three = corrected(stokes)
+    known = three.covariance
+    # II, IQ, IU, IV, QQ, QU, QV, UU, UV, VV
+    planes = np.full((10, *known.shape[1:]), np.nan)
+    planes[[0, 1, 2, 4, 5, 7]] = known
+    four = dataclasses.replace(
+        three,
+        components="IQUV",
+        stokes=np.concatenate([stokes, np.full_like(stokes[:1], np.nan)]),
+        covariance=planes,
+        leakage=np.zeros((3, 4)),
+        determined=np.tile([True, True, True, False], (3, 1)),
+    )
+    expected, found = (one.without_star(annulus=RING) for one in (three, four))
+    for component in "IQU":
+        np.testing.assert_allclose(found.error(component), expected.error(component))
+    assert np.isnan(found.error("V")).all()
 
 
 def test_the_product_says_what_was_subtracted(scene_with_star, tmp_path):

@@ -112,6 +112,20 @@ def test_open_directions_are_infinite_or_ignored(open_calibration, track):
         linear_systematic(model, solution, open_directions="maybe")
 
 
+def test_samples_know_no_more_of_open_directions(open_calibration, track):
+    model = RowModel(open_calibration, track()[1], open_calibration.wavelength)
+    solution = estimator(model.rows())
+    for choice in ("infinite", 1.0):
+        linear = linear_systematic(model, solution, open_directions=choice)
+        sampled = sampled_systematic(model, solution, n_samples=100, seed=1, open_directions=choice)
+        np.testing.assert_array_equal(sampled.open, linear.open)
+        np.testing.assert_allclose(
+            np.sqrt(np.diag(sampled.covariance(STOKES, 9)))[1:],
+            np.sqrt(np.diag(linear.covariance(STOKES, 9)))[1:],
+            rtol=0.2,
+        )
+
+
 def test_open_directions_are_counted_in_degrees_of_their_angles(charis, open_calibration, track):
     """Other fits of the same data, each with one angle 0.2 deg away, are wrong by the claim."""
     positions, chain = track()[1], open_calibration.chain

@@ -49,7 +49,13 @@ def entry(what=None, **changes):
 
 
 def where(kind="pattern", share=0.6, **changes):
-    return {"detail": f"a {kind}", "kind": kind, "share": share, "p_value": 1e-9} | changes
+    return {
+        "axis": "frame",
+        "detail": f"a {kind}",
+        "kind": kind,
+        "share": share,
+        "p_value": 1e-9,
+    } | changes
 
 
 def content(*causes, **changes):

@@ -7,7 +7,13 @@ from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.frames import Frame, beam_detectors, match_beams, open_cube
+from astropolcal.reduction.frames import (
+    Frame,
+    beam_detectors,
+    match_beams,
+    open_cube,
+    survey_frames,
+)
 from astropolcal.reduction.photometry import detector_of
 
 KEYWORDS = {
@@ -66,6 +72,12 @@ def test_a_camera_that_lost_exposures_is_as_bright_and_noisier(files):
     np.testing.assert_allclose(cube, expected)
     ratio = detector.left.variance(cube) / whole.left.variance(expected)
     np.testing.assert_allclose(ratio, 3 / 2)
+
+
+def test_beams_of_other_plate_angles_are_refused_where_no_star_is_looked_for(files):
+    survey_frames([files()], LAYOUT, centre=(4, 4))
+    with pytest.raises(ObservationError, match=r"hwp = 22\.5, but 67\.5 in n_00000001_cam2"):
+        survey_frames([files(HWP=67.5)], LAYOUT, centre=(4, 4))
 
 
 @pytest.mark.parametrize(

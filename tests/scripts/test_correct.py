@@ -314,7 +314,9 @@ def told(monkeypatch):
         monkeypatch.setattr(
             frame_files,
             "_survey",
-            lambda *_: [FrameHeader(f, values=dict(known[f])) for f in files],
+            lambda *_: [
+                FrameHeader(f, values=dict(known[f]), unit=known[f].get("unit")) for f in files
+            ],
         )
         return survey_frames(files, CHARIS.files, centre=centre)
 
@@ -359,6 +361,39 @@ def test_frames_are_as_bright_as_their_exposures(told):
         frames = [{"hwp": 0.0} | ({} if s is None else {"exposure_time": s}) for s in seconds]
         found = told(*frames)[2]
         assert found is None if scale is None else found.tolist() == scale, (seconds, scale)
+
+
+def test_rates_are_as_bright_at_all_exposures(told):
+    frames = [{"hwp": 0.0, "exposure_time": s, "unit": "adu/s"} for s in (10.0, 20.0)]
+    table, _, scale, detectors = told(*frames)
+    assert scale is None
+    assert [right.unit for right, _ in detectors] == [u.adu / u.s] * len(table)
+    # an adu is not an electron
+    with pytest.raises(ObservationError, match="is in adu, CRSA00000001"):
+        told({"hwp": 0.0}, {"hwp": 0.0, "unit": "electron"})
+
+
+def test_frames_are_checked_where_the_place_of_the_star_is_known(tmp_path):
+    def found(*frames):
+        files = []
+        for number, cards in enumerate(frames):
+            data = np.arange(8.0).reshape(2, 2, 2) + cards.pop("first", number)
+            cube = fits.ImageHDU(data, fits.Header({"BUNIT": cards.pop("BUNIT", "adu")}))
+            plate = {"RET-ANG1": 0.0, "RET-POS1": 80.0, "PARANG": 20.0, "ALTITUDE": 70.0}
+            primary = fits.PrimaryHDU(header=fits.Header(plate | {"D_IMRANG": 60.0} | cards))
+            files.append(tmp_path / f"CRSA0000000{number}_cube.fits")
+            fits.HDUList([primary, cube]).writeto(files[-1], overwrite=True)
+        return survey_frames(files, CHARIS.files, centre=(70, 85))
+
+    (right, left), _ = found({"BUNIT": "electron"}, {"BUNIT": "electron"})[3]
+    # the cube says it, not the first header
+    assert right.gain == left.gain == 1.0
+    with pytest.raises(ObservationError, match=r"1_cube\.fits: the same data as .*0_cube\.fits"):
+        found({}, {"first": 0, "OBJECT": "renamed"})
+    with pytest.raises(
+        ObservationError, match=r"1_cube\.fits: RET-POS1 = 95 deg is \+15\.00 deg off"
+    ):
+        found({}, {"RET-POS1": 95.0})
 
 
 def test_star_that_is_not_found_names_the_file(monkeypatch):
@@ -455,7 +490,7 @@ def test_report_has_units():
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
             "wavelength_nm": np.array([1600.0]),
-            "aperture": aperture,
+            "aperture": aperture, "held": ["m3.b1", "m3.m1"],
         }  # fmt: skip
         outputs = {"output": "o.fits", "spectrum": None, "plot": None, "json": "-", "full": False}
         lines = _correct._words(summary, systematic, SimpleNamespace(**outputs))
@@ -465,6 +500,8 @@ def test_report_has_units():
         assert "    angle of linear polarization: 30.0 deg" in lines, (systematic, words)
         assert "      statistical error: 2 deg" in lines, (systematic, words)
         assert lines.count(f"      systematic error: {words}") == 2, (systematic, words)
+        # a telescope as published does not err less than one that was calibrated
+        assert any("m3.b1, m3.m1" in line for line in lines), (systematic, words)
         verdict = lines[lines.index("") + 1]
         is_open = words == "infinite"
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
