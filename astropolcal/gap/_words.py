@@ -305,9 +305,11 @@ def _instead(content):
     found = [one for one in content["where"] if one["axis"] == "course"]
     if not found or content["verdict"] == "none":
         return ""
-    those = "this" if len(content["causes"]) == 1 else "these together"
     other = found[-1]["detail"].partition(",")[0]
     more = f" These data do not tell it from the same of {other}." if len(found) > 1 else ""
+    if not content["causes"]:
+        return f"It may be one thing: {found[0]['detail']}.{more}"
+    those = "this" if len(content["causes"]) == 1 else "these together"
     return (
         f"It may be one thing instead: {found[0]['detail']}. That does as well as {those} and "
         f"explains {share(found[0]['share'])} of the gap.{more}"

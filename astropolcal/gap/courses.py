@@ -50,6 +50,8 @@ class Course:
     behind : float
         By how much it does worse than the causes that were found, beyond what its larger freedom
         gains from noise, in standard deviations of that.
+    p_value : float
+        Probability that noise alone lowers chi-square so much, for this place and kind alone.
     """
 
     place: str
@@ -60,17 +62,13 @@ class Course:
     lowered: float = 0.0
     freedom: int = 0
     behind: float = np.inf
+    p_value: float = 1.0
 
     @property
     def words(self):
         """What it is, in words."""
         what = Cell(self.place, self.kind, "constant").title
         return f"{what}, with a course through the run that no table has"
-
-    @property
-    def p_value(self):
-        """Probability that noise alone lowers chi-square so much, for this place and kind alone."""
-        return float(stats.chi2.sf(self.lowered, self.freedom))
 
     def fit(self, rounds):
         """Fit law and course in turn, until nothing is gained."""
@@ -124,4 +122,5 @@ def courses(model, names):
     for one in found:
         freer = max(one.freedom - (base.freedom - model.linear.freedom), 1.0)
         one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
+        one.p_value = float(stats.chi2.sf(one.lowered / temper, one.freedom))
     return sorted(found, key=lambda one: one.behind)

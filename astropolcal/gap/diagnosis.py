@@ -385,7 +385,7 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
     left_p = improved.p_value
     return Diagnosis(
-        verdict=_verdict(causes, nominal, left_p),
+        verdict=_verdict(causes, nominal, left_p, selection.courses),
         nominal=nominal,
         improved=improved,
         causes=causes,
@@ -428,12 +428,12 @@ def _cause(group, improved, explained, before=None, after=None):
     )
 
 
-def _verdict(causes, nominal, left_p):
+def _verdict(causes, nominal, left_p, courses):
     """Return what can be said of the gap."""
     if not causes:
         # noise that the residuals themselves told cannot be exceeded by them
         known = all(channel.stated for channel in nominal.problem.channels)
-        return "unexplained" if left_p < REMAINDER and known else "none"
+        return "unexplained" if known and (left_p < REMAINDER or courses) else "none"
     sure = min(cause.probability for cause in causes)
     if sure >= _SURE and all(cause.is_named for cause in causes):
         return "named"

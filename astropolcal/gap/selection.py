@@ -178,7 +178,10 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _apart(task, first)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
-        return Selection([], base, first, 0.0, [_errors(base, groups)])
+        task.say("one perturbation of any course")
+        seen = courses(base, ()) if runs < 2 else []
+        seen = [one for one in seen if one.p_value * len(seen) < REMAINDER]
+        return Selection([], base, first, 0.0, [_errors(base, groups)], _alike_courses(seen))
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
@@ -197,12 +200,13 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
-    alike = [
-        one
-        for one, chance in zip(rivals, chances, strict=True)
-        if chance > _MAY_BE and one.behind < rivals[0].behind + 1
-    ]
-    return Selection(found, best.model, first, unlisted, history, alike)
+    told = rivals if max(chances, default=0.0) > _MAY_BE else []
+    return Selection(found, best.model, first, unlisted, history, _alike_courses(told))
+
+
+def _alike_courses(found):
+    """Return the best courses, which the data do not tell apart."""
+    return [one for one in found if one.behind < found[0].behind + 1]
 
 
 def _errors(model, groups):
