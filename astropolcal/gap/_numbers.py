@@ -22,7 +22,7 @@ ACCURACIES = ("s_res", "s_mean", "s_cv")
 # parameters correlated more than this with what is uncertain are named
 _STRONG, _MOST_TRADES = 0.5, 3
 # perturbations that are angles
-_ANGLES = ("retardance", "rotation")
+ANGLES = ("retardance", "rotation")
 # directions below this share of the largest take nothing up
 _TINY = 1e-9
 
@@ -64,7 +64,7 @@ class Fitted:
         slot, optic = self.problem.free.by_name[name], name.partition(".")[0]
         chains = self.model.chains
         carrier = next((o for c in chains for o in leaves(c) if o.name == optic), None)
-        if isinstance(carrier, Perturbation) and carrier.kind.startswith(_ANGLES):
+        if isinstance(carrier, Perturbation) and carrier.kind.startswith(ANGLES):
             return "deg", np.deg2rad(1.0)
         return str(slot.unit or ""), slot.factor
 

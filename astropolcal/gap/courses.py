@@ -42,9 +42,10 @@ class Course:
     reduced : Reduced
         Sums over the wavelengths of its derivatives.
     law : `~numpy.ndarray`
-        Coefficients of the law in wavelength.
-    wave : list of `~numpy.ndarray`
-        The course in each dataset, (F,).
+        The law in wavelength, (W,), which is 1 where it is largest; coefficients during the fit.
+    wave, std : list of `~numpy.ndarray`
+        The course in each dataset, (F,), radian or shares, and its errors, without what model and
+        lamp take up; zero and infinite in frames that do not tell it.
     lowered, freedom : float, int
         By how much it lowers chi-square, and by how many directions.
     behind : float
@@ -59,6 +60,7 @@ class Course:
     reduced: Reduced
     law: np.ndarray
     wave: list = field(default_factory=list)
+    std: list = field(default_factory=list)
     lowered: float = 0.0
     freedom: int = 0
     behind: float = np.inf
@@ -96,9 +98,11 @@ class Course:
         is_open = rest > _ABSORBED
         factor = np.where(is_open, 1 / np.where(is_open, rest, 1.0) - 1, -1.0)
         solved = target + left @ (factor * (left.T @ target))
-        wave = np.zeros(len(gram))
+        wave, variance = np.zeros(len(gram)), np.full(len(gram), np.inf)
         wave[told] = solved / root
-        self.wave = np.split(wave, np.cumsum([len(g) for g in reduced.gram])[:-1])
+        variance[told] = (1 + left**2 @ factor) / root**2
+        edges = np.cumsum([len(g) for g in reduced.gram])[:-1]
+        self.wave, self.std = np.split(wave, edges), np.split(np.sqrt(variance), edges)
         self.lowered = float(target @ solved)
         self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
 
@@ -114,12 +118,18 @@ def courses(model, names):
     ]
     for one in found:
         one.fit(_ROUNDS)
+    found = [one for one in found if one.lowered > 0]
     found.sort(key=lambda one: one.freedom - one.lowered)
     for one in found[:_BEST]:
         one.fit(_MORE)
     # to first order, as the courses are
     lost, temper = base.chi2 - model.fit.chi2, max(1.0, model.mean_square)
     for one in found:
+        one.law = basis @ one.law
+        largest = one.law[np.argmax(np.abs(one.law))]
+        one.law = one.law / largest
+        one.wave = [wave * largest for wave in one.wave]
+        one.std = [np.sqrt(temper) * std * abs(largest) for std in one.std]
         freer = max(one.freedom - (base.freedom - model.linear.freedom), 1.0)
         one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
         one.p_value = float(stats.chi2.sf(one.lowered / temper, one.freedom))

@@ -6,7 +6,7 @@ import textwrap
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._numbers import Fitted
+from astropolcal.gap._numbers import ANGLES, Fitted
 from astropolcal.gap._words import is_determined, labels, share, shortened
 from astropolcal.gap.cells import places
 from astropolcal.gap.residuals import frame_blocks
@@ -118,7 +118,8 @@ def plot_gap_frames(diagnosis, *, figure=None):
     Draw the residuals frame by frame, before and after, with what the causes do.
 
     Single differences, mean of that third of the wavelengths in which the causes do most. The
-    line is what the model predicts with the causes in it, less what it predicts without.
+    line is what the model predicts with the causes in it, less what it predicts without. Where one
+    perturbation of any course may be in place of the causes, its size in every frame stands below.
 
     Parameters
     ----------
@@ -146,10 +147,11 @@ def plot_gap_frames(diagnosis, *, figure=None):
     >>> plot_gap_frames(diagnosis).axes[0].get_xlabel()[:5]
     'frame'
     """
-    datasets = _datasets(diagnosis)
-    with st.canvas(figure, 9, 1.4 + 2.5 * len(datasets)) as figure:
-        panels = figure.subplots(len(datasets), 1, squeeze=False)[:, 0]
-        for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=True):
+    datasets, course = _datasets(diagnosis), next(iter(diagnosis.courses), None)
+    rows = len(datasets) * (1 if course is None else 2)
+    with st.canvas(figure, 9, 1.4 + 2.5 * rows) as figure:
+        panels = figure.subplots(rows, 1, squeeze=False)[:, 0]
+        for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=False):
             thirds = [part for part in np.array_split(np.argsort(nm), 3) if part.size]
             does = [st.rms(before[0][part] - after[0][part]) for part in thirds]
             third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
@@ -165,7 +167,23 @@ def plot_gap_frames(diagnosis, *, figure=None):
             axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
             axes.set_ylabel(f"observed {st.MINUS} model (%)")
             _frame_axis(axes, observations)
+        for i, axes in enumerate(panels[len(datasets) :]):
+            name, observations, *_ = datasets[i]
+            _course_panel(axes, course, i, 1000 * diagnosis.nominal.problem.wavelength)
+            axes.set_title(f"{name}: {course.place}, {course.kind}, any course", loc="left")
+            _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
+
+
+def _course_panel(axes, course, i, nm):
+    """Draw the size of a perturbation in the frames of a dataset that tell it."""
+    known, angle = np.isfinite(course.std[i]), course.kind.startswith(ANGLES)
+    scale = np.rad2deg(1) if angle else 100
+    value, error = (scale * values[i][known] for values in (course.wave, course.std))
+    look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
+    axes.axhline(0, color=st.GREY, linewidth=0.8)
+    axes.errorbar(np.flatnonzero(known) + 0.5, value, error, **look)
+    axes.set_ylabel(f"size at {nm[np.argmax(course.law)]:.0f} nm ({'deg' if angle else '%'})")
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
