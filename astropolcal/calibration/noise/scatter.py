@@ -134,6 +134,8 @@ class _Part:
     kernels: tuple
     amplitude: np.ndarray
     shares: np.ndarray = None
+    #: Which components residuals can tell at all.
+    told: np.ndarray = None
 
     def dense(self, columns):
         """Return columns as an array of pairs, wavelengths and columns; masked data are zero."""
@@ -249,7 +251,7 @@ class Scatter:
             inner[:, :, some] = product.reshape(rank, 2 * n, -1)
         seen += np.einsum("iaj,jbi->ab", inner[:, :n], inner[:, n:], optimize=True)
         size = np.diag(full)
-        told = np.diag(seen) > _LEFT * size
+        told = part.told = np.diag(seen) > _LEFT * size
         if not np.isfinite(seen).all():
             return np.eye(len(size))[0]
         shares = _solved(seen, found, told)
@@ -276,15 +278,15 @@ class Scatter:
     def at_settings(self, i):
         """Return the error of q and u that all pairs at a setting share, per wavelength.
 
-        NaN where the dataset has no data.
+        NaN where the dataset has no data, and where its settings do not tell such an error.
         """
         part = self.parts[i]
-        variance = sum(
-            share * np.diag(kernel)
-            for share, (together, kernel) in zip(part.shares, part.components(), strict=True)
-            if together
-        ) + np.zeros(len(part.kernels[0]))
-        found = np.full(variance.size, np.nan)
+        found = np.full(len(part.kernels[0]), np.nan)
+        parts = zip(part.shares, part.told, part.components(), strict=True)
+        known = [(share, told, kernel) for share, told, (together, kernel) in parts if together]
+        if not any(told for _, told, _ in known):
+            return found
+        variance = sum(share * np.diag(kernel) for share, _, kernel in known)
         found[part.bin] = np.sqrt(variance)[part.bin] * part.amplitude * self._level[part.rows]
         return found
 
