@@ -30,7 +30,6 @@ from astropolcal.calibration.identifiability.sky import (
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import Measurement
-from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAMP = META | {"source": "polarized"}
@@ -334,20 +333,8 @@ def test_error_of_the_model_alone():
 def test_settings_that_tell_no_error_of_the_model_do_not_make_it_smaller(make):
     """Of two angles of the derotator the parameters take all that they share: nothing is known."""
     chain = make.truth(make.chain())
-    tables = []
-    for i, angles in enumerate([np.linspace(45, 132.5, 8), np.array([60.0, 100.0])]):
-        table = make.observe(chain, make.frames(angles * u.deg), seed=i).to_table()
-        hwp, derotator = (table[k].to_value(u.rad) for k in ("hwp", "derotator"))
-        # q and u are off by half a percent at each angle
-        rng = np.random.default_rng(i)
-        off = {angle: rng.normal(0, 5e-3, 2) for angle in np.unique(derotator)}
-        waves = np.stack([np.cos(4 * hwp), np.sin(4 * hwp)], axis=1)
-        change = np.sum(np.array([off[angle] for angle in derotator]) * waves, axis=1)
-        change = 0.5 * change * (table["flux_right"] + table["flux_left"])
-        table["flux_right"] += change
-        table["flux_left"] -= change
-        table.meta["source"] = "polarized lamp"
-        tables.append(Observations.from_table(table, name=f"lamp {i}"))
+    many, two = make.frames(), make.frames([60, 100] * u.deg)
+    tables = [make.off_at_settings(chain, frames, i) for i, frames in enumerate([many, two])]
     known = []
     for chosen in (tables, tables[:1], tables[1:]):
         cal = calibrate([chain] * len(chosen), chosen, search=False, cross_validate=False)

@@ -433,7 +433,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     finding.branches += undecided_signs(measurement)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
-    lacking = None
+    lacking = scatter = None
     if settings["errors"] == "white":
         own = white_covariance(measurement, whitened, weighting)
     else:
@@ -468,7 +468,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     fit["masked"] = [dict(each.mask_reasons) for each in observations]
-    fit["bounds"] = errors_at_bounds(measurement, whitened)
+    fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     # the pairs of frames at odds with the fit, for summary, JSON and file
     outliers = columns(outlying_data(calibration))

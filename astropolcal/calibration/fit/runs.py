@@ -294,8 +294,7 @@ class _Run:
         along = problem.rows @ found.half.T
         middle = np.eye(found.rank) * self.level**2
         if self.scatter is not None:
-            self.scatter.slopes = along
-            middle = self.scatter.middle()
+            middle = self.scatter.middle(along)
         variance, turn = np.linalg.eigh(middle)
         root = turn.T / np.sqrt(np.maximum(variance, _RANK * variance.max(initial=0)))[:, None]
         rows = root @ (found.singular[: found.rank, None] * found.right[: found.rank])

@@ -264,11 +264,11 @@ class Scatter:
         shares[0] = max(shares[0], _INDEPENDENT if shares.any() else 1.0)
         return shares
 
-    def middle(self):
-        """Return the covariance of the pulls of the residuals on the determined directions."""
-        total = np.zeros((self.slopes.shape[1],) * 2)
+    def middle(self, slopes):
+        """Return the covariance of the pulls of the residuals on directions, (n_data, n)."""
+        total = np.zeros((slopes.shape[1],) * 2)
         for part in self.parts:
-            scaled = self.slopes[part.rows] * part.amplitude[:, None]
+            scaled = slopes[part.rows] * part.amplitude[:, None]
             for share, (before, behind) in zip(part.shares, part.halves(scaled), strict=True):
                 if share:
                     total += share * np.tensordot(before, behind, axes=((0, 1), (0, 1)))
