@@ -349,14 +349,17 @@ def model_error(measurement, scatter):
 
     ``relative_percent`` multiplies the polarization, from polarized sources; ``absolute_percent``
     does not, from all others. Standard errors of q and u per wavelength; zero, and in ``missing``,
-    where none tells.
+    where none tells. ``settings`` is the least number of them that tells one, if there is one.
     """
-    squares = {"relative": [], "absolute": []}
+    squares, settings = {"relative": [], "absolute": []}, []
     if not scatter.is_known:
         return None
     for i, dataset in enumerate(measurement.datasets):
         polarized = kind_of_source(dataset.observations.source) == "polarized"
-        squares["relative" if polarized else "absolute"].append(scatter.at_settings(i) ** 2)
+        square = scatter.at_settings(i) ** 2
+        squares["relative" if polarized else "absolute"].append(square)
+        if np.nansum(square) > 0:
+            settings.append(scatter.parts[i].patterns.shape[1] // 2)
     found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
     for key, rows in squares.items():
         known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
@@ -365,7 +368,7 @@ def model_error(measurement, scatter):
         found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
         if not count.any():
             found["missing"].append(key)
-    return found
+    return found | ({"settings": min(settings)} if settings else {})
 
 
 def kind_of_source(source):
