@@ -35,6 +35,18 @@ def as_tables(observations):
     return tables
 
 
+def refuse_repeated(tables):
+    """Refuse tables of the same content: data that count twice would make all errors too small."""
+    first = {}
+    for i, table in enumerate(tables):
+        other = first.setdefault(table.content_hash, i)
+        if other != i:
+            raise ObservationError(
+                f"table {i + 1} ({table.name}) has the content of table {other + 1} "
+                f"({tables[other].name}); give every table once"
+            )
+
+
 def as_pairs(chain, observations, positions):
     """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
     observations = as_tables(observations)

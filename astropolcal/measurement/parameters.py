@@ -374,15 +374,20 @@ class FreeParameters:
         parts = [p.residual(vector[slot.slice]) for slot, p in self.priors if not p.is_flat]
         return np.concatenate(parts) if parts else np.empty(0)
 
-    def prior_jacobian(self, vector):
-        """Return the derivative of `prior_residuals`, shape (n_free, n_residuals)."""
+    def prior_jacobian(self, vector, for_errors=False):
+        """Return the derivative of `prior_residuals`, shape (n_free, n_residuals).
+
+        ``for_errors`` no prior tells more than its own width, as at a cusp it seems to.
+        """
         parts = []
         for slot, prior in self.priors:
             if not prior.is_flat:
                 block = np.zeros((self.size, slot.size))
                 # a prior looks at each element alone, so the block is
                 # diagonal, (slot.size, slot.size)
-                np.fill_diagonal(block[slot.slice], prior.slope(vector[slot.slice]))
+                slope = prior.slope(vector[slot.slice])
+                most = 1 / prior.width if for_errors else np.inf
+                np.fill_diagonal(block[slot.slice], np.clip(slope, -most, most))
                 parts.append(block)
         return np.concatenate(parts, axis=1) if parts else np.empty((self.size, 0))
 
@@ -450,8 +455,10 @@ class FreeParameters:
 # ---- priors --------------------------------------------------------------------------------
 
 
-# step of the numerical derivative of a general prior's residual, in its standard deviations
+# step of the numerical derivative of a general prior's residual, in its widths
 _STEP = 1e-5
+# quantiles of a normal distribution one standard deviation below and above its mean
+_CENTRAL = (0.158655, 0.841345)
 
 
 @dataclass(frozen=True)
@@ -525,6 +532,14 @@ class BoundPrior:
         return _plain(self.distribution.mean()), _plain(self.distribution.std())
 
     @cached_property
+    def width(self):
+        """Half of what holds 68.27 % of the probability, canonical; a variance may be infinite."""
+        if self._is_normal:
+            return self._moments[1] * self.factor
+        low, high = self.distribution.ppf(_CENTRAL)
+        return (high - low) / 2 * self.factor
+
+    @cached_property
     def support(self):
         """Where the density is not zero, canonical."""
         low, high = self.distribution.support()
@@ -573,13 +588,12 @@ class BoundPrior:
     def slope(self, canonical):
         """Return the derivative of `residual` per canonical unit."""
         canonical = np.asarray(canonical, dtype=float)
-        std = self._moments[1] * self.factor
         if self._is_normal:
-            return np.broadcast_to(1 / std, canonical.shape).copy()
+            return np.broadcast_to(1 / self.width, canonical.shape).copy()
         low, high = self.support
         # never beyond the support, where the density is zero and the residual infinite
-        up = np.minimum(canonical + _STEP * std, high)
-        down = np.maximum(canonical - _STEP * std, low)
+        up = np.minimum(canonical + _STEP * self.width, high)
+        down = np.maximum(canonical - _STEP * self.width, low)
         return (self.residual(up) - self.residual(down)) / (up - down)
 
 

@@ -11,6 +11,7 @@ import pytest
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
 from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 # star_data.py, which several folders use
@@ -54,6 +55,21 @@ def observe(truth, frames=None, wavelength=None, **options):
     return simulate(truth, wavelength, charis_frames() if frames is None else frames, **options)
 
 
+def off_at_settings(truth, frames=None, seed=0, size=5e-3):
+    """The same of a lamp whose q and u are off by as much (rms) at each derotator angle."""
+    lam = CHARIS.wavelength
+    table = observe(truth, frames, lam, seed=seed).to_table()
+    hwp, derotator = (table[k].to_value(u.rad) for k in ("hwp", "derotator"))
+    _, setting = np.unique(derotator, return_inverse=True)
+    off = np.random.default_rng(seed).normal(0, size, (setting.max() + 1, 2))[setting]
+    change = off[:, 0] * np.cos(4 * hwp) + off[:, 1] * np.sin(4 * hwp)
+    change = 0.5 * change * (table["flux_right"] + table["flux_left"])
+    table["flux_right"] += change
+    table["flux_left"] -= change
+    table.meta["source"] = "polarized lamp"
+    return Observations.from_table(table, name=f"lamp {seed}")
+
+
 @pytest.fixture(scope="session")
 def make():
     """The helpers of this file, for tests."""
@@ -65,6 +81,7 @@ def make():
         truth=charis_truth,
         frames=charis_frames,
         observe=observe,
+        off_at_settings=off_at_settings,
         fits=fits,
         pulls_of=pulls_of,
     )
@@ -112,7 +129,6 @@ def pulls():
 @pytest.fixture(scope="session")
 def charis_data(shared_data):
     """Read a dataset of real measurements by a part of its name."""
-    from astropolcal.observations import Observations
 
     def read(name):
         (path,) = (shared_data / "data" / "charis").glob(f"{name}*.ecsv")

@@ -54,6 +54,28 @@ def test_one_sided_error_is_where_the_profile_has_risen_by_one(make):
                 assert max(ends) == np.inf, weights
 
 
+def test_correlated_residuals_count_at_a_bound_too(make):
+    """Beyond it the standard error would allow as much as it does inward of it."""
+    inward, wanted = [], []
+    for seed in range(6):
+        chain = make.truth(make.chain())
+        data = make.off_at_settings(chain, seed=seed)
+        free = calibrate(chain, data, search=False, cross_validate=False)
+        value, std = (float(free.parameter_values()[POLARIZER][key]) for key in ("value", "std"))
+        # so that chi-square still falls a little beyond
+        bound = value - 0.1 * std
+        chain["calibration_polarizer"].theta.bounds = (85, bound)
+        chain["calibration_polarizer"].theta = bound * u.deg
+        held = calibrate(chain, data, search=False, cross_validate=False)
+        known = held.parameter_values()[POLARIZER]
+        assert known["at_bound"]
+        low, _ = profile(held, POLARIZER, n=13).interval()
+        assert bound - low.value == pytest.approx(float(known["std_inward"]), rel=0.05)
+        inward.append(float(known["std_inward"]))
+        wanted.append((np.sqrt(1.01) - 0.1) * std)
+    assert np.median(np.divide(inward, wanted)) == pytest.approx(1, rel=0.1)
+
+
 # --- errors next to a bound ---------------------------------------------------------------------
 
 

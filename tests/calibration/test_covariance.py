@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
@@ -220,3 +221,21 @@ def test_from_a_file_the_open_stays_open(make, tmp_path):
     np.testing.assert_allclose(there, here, rtol=1e-6)
     rng = np.random.default_rng(0)
     assert not np.isfinite(np.diag(again.propagate(rng.normal(size=(5, len(again)))))).any()
+
+
+def test_a_prior_tells_no_more_than_its_width(make):
+    """A cusp (Laplace, exponential) pins the value, and yet the data alone know it better."""
+    lam = [1.2, 1.6, 2.2] * u.um
+    chain = make.truth(make.chain(wavelength=lam, fixed=False))
+    chain["derotator"].theta.fixed = chain["hwp"].theta.fixed = True
+    data = make.observe(chain, wavelength=lam, seed=1)
+    name = "calibration_polarizer.theta"
+    fitted = calibrate(chain, data, search=False, cross_validate=False).parameter_values()[name]
+    value, std = float(fitted["value"]), float(fitted["std"])
+    for law in (stats.laplace, stats.cauchy, stats.expon, stats.norm):
+        chain["calibration_polarizer"].theta.prior = law(value, 20 * std)
+        cal = calibrate(chain, data, search=False, cross_validate=False)
+        known = cal.parameter_values()[name]
+        # an exponential law is a bound, too
+        key = "std_inward" if law is stats.expon else "std"
+        assert float(known[key]) == pytest.approx(std, rel=0.05), law.name

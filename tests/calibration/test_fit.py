@@ -16,11 +16,16 @@ from astropy.modeling.fitting import (
 )
 
 from astropolcal import instruments, optics
-from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration import Calibration, calibrate, calibrate_runs
 from astropolcal.calibration.fit.strategies import search_branches
 from astropolcal.calibration.result.summary import to_dict
 from astropolcal.chain import insert_optic, leaves
-from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    CalibrationFileError,
+    FitError,
+    ObservationError,
+)
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
 from astropolcal.observations.observables import NormalizedSingleDifference
@@ -321,6 +326,17 @@ def test_more_parameters_than_data_are_refused(make):
     data = make.observe(chain, make.frames([45] * u.deg), FEW, seed=1)
     with pytest.raises(FitError, match=r"21 free parameters but only 16 data"):
         calibrate(chain, data)
+
+
+def test_a_table_that_is_given_twice_is_refused(make, few):
+    """It has no more information than given once, and made all errors smaller."""
+    chain, truth, data = few
+    again = make.observe(truth, wavelength=FEW, seed=11, meta=data.meta, name="copy")
+    for tables in ([data, data], [data, again]):
+        with pytest.raises(ObservationError, match="once"):
+            calibrate(chain, tables, cross_validate=False)
+        with pytest.raises(ObservationError, match="once"):
+            calibrate_runs(chain, tables, vary=None)
 
 
 def test_fit_that_does_not_arrive_warns(few, monkeypatch):

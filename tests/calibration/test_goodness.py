@@ -12,11 +12,13 @@ from astropolcal.calibration.noise import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
+    noise_from_roughness,
 )
 from astropolcal.calibration.validation import lack_of_fit
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, Normal
+from astropolcal.observations import Observations
 from astropolcal.simulation import simulate
 from astropolcal.words import p_words
 
@@ -220,6 +222,31 @@ def test_wrong_model_is_found_by_replicates(make):
     cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
     test = lack_of_fit(cal.measurement, cal, noise_from_replicates(cal.measurement))
     assert test.p_value < 1e-12
+
+
+def test_verdicts_hold_where_wavelengths_share_their_noise_and_none_is_stated(make):
+    """A true model agrees with flicker of all wavelengths, and with photons of uneven spectra."""
+    lam = make.charis.wavelength
+    chain = make.truth(make.chain(wavelength=lam))
+    frames = make.frames(np.repeat([50, 65, 80], 3) * u.deg)
+    spectrum = 1e7 * np.exp(-0.5 * np.linspace(-2, 2, lam.size) ** 2)
+    sharing, bare, rng = [], [], np.random.default_rng(5)
+    for seed in range(24):
+        table = simulate(chain, lam, frames, flux=spectrum, seed=seed).to_table()
+        table.remove_columns(["flux_right_err", "flux_left_err"])
+        plain = Measurement(chain, Observations.from_table(table, name="photons"))
+        vector = fit(plain)
+        bare.append(lack_of_fit(plain, vector, noise_from_roughness(plain, vector)).p_value)
+        flicker = np.repeat(rng.normal(0, 2e-3, len(frames)), lam.size)
+        table["flux_right"] = table["flux_right"] * (1 + flicker)
+        table["flux_left"] = table["flux_left"] * (1 - flicker)
+        m = Measurement(chain, Observations.from_table(table, name="flicker"))
+        vector = fit(m)
+        for noise in (noise_from_replicates, noise_from_null_channel):
+            sharing.append(lack_of_fit(m, vector, noise(m, vector)).p_value)
+    for found in (bare, sharing):
+        found = np.array(found)
+        assert np.mean((found < 0.01) | (found > 0.99)) < 0.1
 
 
 # --- priors --------------------------------------------------------------------------

@@ -44,6 +44,16 @@ def test_profile_is_the_parabola_of_the_error(make):
             assert "at one sigma" in str(made), (weights, name)
 
 
+def test_correlated_residuals_widen_the_interval_as_they_do_the_error(make):
+    """They may share an error at each setting, which makes the errors several times larger."""
+    chain = make.truth(make.chain())
+    data = make.off_at_settings(chain, seed=3)
+    cal = calibrate(chain, data, search=False, cross_validate=False)
+    for name in ["hwp.w_sio2", "calibration_polarizer.theta"]:
+        low, high = profile(cal, name, n=7).interval()
+        assert u.isclose((high - low) / 2, cal.covariance.std(name), rtol=0.05), name
+
+
 def test_others_are_refitted(cal):
     """Two thicknesses correlate: holding all others would give a far narrower parabola."""
     made = profile(cal, "hwp.w_sio2", n=5)

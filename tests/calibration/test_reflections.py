@@ -137,13 +137,12 @@ def test_figures_of_mirrors_and_targets(free, metal, tmp_path, unpainted):
 # --- a star that no fit saw -------------------------------------------------------------------
 
 
-def night(truth, name="HD 30675", scale=1.0, **options):
+def night(truth, name="HD 30675", scale=1.0, cycles=6, **options):
     known = standards.get(name).stokes(WAVELENGTH)
     chain = replace_optic(truth, "star", star_chain("star")["star"])
     chain["star"].q, chain["star"].u = scale * known.q, scale * known.u
-    return observe_star(
-        chain, 6, source="polarized standard star", parallactic=(10, 60), target=name, **options
-    )
+    options = {"parallactic": (10, 60), "source": "polarized standard star"} | options
+    return observe_star(chain, cycles, target=name, **options)
 
 
 @pytest.mark.slow
@@ -163,6 +162,23 @@ def test_a_star_that_is_not_as_the_catalogue_has_it(free):
     table = star_check(cal, star_chain("star"), night(truth, scale=2.0, seed=3))
     known = table["dolp_known"].to_value(u.percent)
     np.testing.assert_allclose(table["dolp_error"].to_value(u.percent), known, atol=0.05)
+
+
+def test_only_errors_that_are_known_are_named(free):
+    """A single cycle has no scatter, and a wavelength may have no cycle."""
+    cal, truth = free
+    star = night(truth, seed=3)
+    masked = star.with_mask(np.arange(len(WAVELENGTH)) == np.ones((star.n_frames, 1)), "cloud")
+    table = star_check(cal, star_chain("star"), masked)
+    assert np.isfinite(table["dolp_err"]).tolist() == [True, False, True]
+    assert np.isfinite(table["dolp_error"]).tolist() == [True, False, True]
+    for cycles in (6, 1):
+        ends = {"parallactic": (10, 10 + 8 * cycles), "altitude": (55, 55 + 2 * cycles)}
+        star = night(truth, seed=3, cycles=cycles, **ends)
+        table = star_check(cal, star_chain("star"), star)
+        assert np.isfinite(table["dolp_err"]).all() == (cycles > 1)
+        whose = "star, calibration and catalogue" if cycles > 1 else "calibration and catalogue"
+        assert table.meta["words"].count(f"times the errors of {whose}") == 2
 
 
 @pytest.mark.slow

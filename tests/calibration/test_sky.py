@@ -330,6 +330,22 @@ def test_error_of_the_model_alone():
         assert "and an error of the model" in table.meta["words"]
 
 
+def test_settings_that_tell_no_error_of_the_model_do_not_make_it_smaller(make):
+    """Of two angles of the derotator the parameters take all that they share: nothing is known."""
+    chain = make.truth(make.chain())
+    many, two = make.frames(), make.frames([60, 100] * u.deg)
+    tables = [make.off_at_settings(chain, frames, i) for i, frames in enumerate([many, two])]
+    known = []
+    for chosen in (tables, tables[:1], tables[1:]):
+        cal = calibrate([chain] * len(chosen), chosen, search=False, cross_validate=False)
+        known.append(np.median(cal.fit["model_error"]["relative_percent"]))
+        told = "relative" not in cal.fit["model_error"]["missing"]
+        (table,) = target_accuracies(cal, [(0.3, None)])
+        assert told == ("and an error of the model" in table.meta["words"])
+        assert told == (len(chosen) > 1 or chosen[0].n_frames > 16)
+    assert known[0] == pytest.approx(known[1], rel=0.15)
+
+
 def test_file_holds_and_gives_the_same_numbers(tmp_path):
     cal = fitted(lamp(), star(0.02, -0.01))
     cal.write(tmp_path / "cal.asdf")

@@ -21,6 +21,7 @@ from astropolcal import Calibration, Observations, calibrate, instruments, optic
 from astropolcal.calibration.result import verdict as verdicts
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
+from astropolcal.simulation import half_wave_plate_cycles
 
 CHARIS = instruments.get("charis")
 
@@ -282,3 +283,18 @@ def test_a_long_first_line_counts_what_it_leaves_out():
     assert line.startswith("NOT USABLE AS IT IS: another reason another")
     assert line.endswith(" ... (and 1 more)")
     assert len(line) <= 80
+
+
+def test_errors_that_rest_on_few_numbers_are_named_so(make):
+    """In simulations the errors of three angles that residuals share are less than half of it."""
+    chain = make.truth(make.chain())
+    for count in (3, 8):
+        frames = make.frames(np.linspace(45, 132.5, count) * u.deg)
+        data = make.off_at_settings(chain, frames, seed=3)
+        cautions = calibrate(chain, data, search=False, cross_validate=False).verdict().cautions
+        assert any("lower limits: 3 settings" in one for one in cautions) == (count == 3)
+    lam, plate = [1.2, 1.6, 2.2] * u.um, [0, 45, 22.5, 67.5] * u.deg
+    chain = make.charis.chain(derotator="linear", wavelength=lam)
+    data = make.observe(chain, half_wave_plate_cycles(plate, [50, 80] * u.deg), lam, seed=2)
+    cautions = calibrate(chain, data, cross_validate=False).verdict().cautions
+    assert any("1 degree of freedom only" in one for one in cautions)

@@ -59,7 +59,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.datasets import as_pairs
+from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
@@ -174,7 +174,8 @@ def calibrate(
         outside its bounds, an optic gives wrong derivatives, or the two-step strategy has no
         polarized source.
     ChainError, ObservationError, ParameterError
-        If chain and observations do not fit together, or a noise given is not a possible one.
+        If chain and observations do not fit together, a table is given twice, or a noise given is
+        not a possible one.
 
     Examples
     --------
@@ -201,6 +202,7 @@ def calibrate(
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
         chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    refuse_repeated([dataset.observations for dataset in measurement.datasets])
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
@@ -431,7 +433,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     finding.branches += undecided_signs(measurement)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
-    lacking = None
+    lacking = scatter = None
     if settings["errors"] == "white":
         own = white_covariance(measurement, whitened, weighting)
     else:
@@ -466,7 +468,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     fit["masked"] = [dict(each.mask_reasons) for each in observations]
-    fit["bounds"] = errors_at_bounds(measurement, whitened)
+    fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     # the pairs of frames at odds with the fit, for summary, JSON and file
     outliers = columns(outlying_data(calibration))

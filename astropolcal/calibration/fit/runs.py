@@ -43,6 +43,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path
 from astropolcal.measurement import Measurement
+from astropolcal.measurement.datasets import refuse_repeated
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import stated_date
 from astropolcal.progress import in_one_thread, stage, steps
@@ -107,6 +108,8 @@ def calibrate_runs(
     FitError
         If there are fewer than two runs, nothing is free, or the runs are of different instruments
         or have different wavelengths.
+    ObservationError
+        If a table is given twice.
     ParameterError
         If a run has no date or that of another where something may vary with time, two events lie
         between the same two runs, or an optic, a parameter or a course is unknown.
@@ -152,6 +155,7 @@ def _parts(chains, runs):
     runs = [[run] if isinstance(run, Observations) else list(run) for run in runs]
     if len(runs) < 2:
         raise FitError(f"{len(runs)} run: at least two are needed; one is for calibrate")
+    refuse_repeated([table for run in runs for table in run])
     chains = [chains] * len(runs) if isinstance(chains, Model) else list(chains)
     if len(chains) != len(runs):
         raise FitError(f"{len(chains)} chains for {len(runs)} runs; give one for each, or one")
@@ -290,8 +294,7 @@ class _Run:
         along = problem.rows @ found.half.T
         middle = np.eye(found.rank) * self.level**2
         if self.scatter is not None:
-            self.scatter.slopes = along
-            middle = self.scatter.middle()
+            middle = self.scatter.middle(along)
         variance, turn = np.linalg.eigh(middle)
         root = turn.T / np.sqrt(np.maximum(variance, _RANK * variance.max(initial=0)))[:, None]
         rows = root @ (found.singular[: found.rank, None] * found.right[: found.rank])

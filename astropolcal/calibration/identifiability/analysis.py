@@ -179,7 +179,7 @@ def examine(measurement, weights=None):
     """
     vector, free = measurement.vector(), measurement.free
     data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
-    whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector))
+    whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector, for_errors=True))
     level = np.nan if weights is None else 1.0
     name = measurement.datasets[0].observations.instrument
     view = view_of_measurement(measurement, vector, name)

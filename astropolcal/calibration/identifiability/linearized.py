@@ -126,6 +126,11 @@ class Whitened:
         return self.along(self.rows)
 
     @cached_property
+    def prior_slopes(self):
+        """The same of the priors."""
+        return self.along(self.prior_rows)
+
+    @cached_property
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
         # diagonal of the hat matrix J (J^T J + P)^-1 J^T

@@ -51,6 +51,8 @@ class NoiseEstimate:
         What it includes and what it does not.
     sigma_of_data : `~numpy.ndarray`
         Standard deviation of every datum, dimensionless, shape (n_data,).
+    independent : `~numpy.ndarray` or float
+        How many of the wavelengths of the dataset have independent noise, as a share.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class NoiseEstimate:
     method: str
     words: str
     sigma_of_data: np.ndarray
+    independent: object = 1.0
 
 
 def data_by_wavelength(measurement):
@@ -95,22 +98,39 @@ def rms(values):
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
-def _of_data(measurement, sigma, dof, method, words):
+def _of_data(measurement, sigma, dof, method, words, independent=1.0):
     """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
     percent = 100 * np.array([rms(sigma[row]) for row in rows]) * u.percent
     dof = np.broadcast_to(dof, len(rows))
-    return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma)
+    return NoiseEstimate(numbers, wavelength, percent, dof, method, words, sigma, independent)
 
 
-def _of_cells(measurement, squares, dof, method, words):
-    """Return an estimate from sums of squares and freedom at each wavelength of each dataset.
+def _of_deviations(measurement, parts, method, words):
+    """Return an estimate from deviations (n, n_bins) and freedom at each wavelength, by dataset.
 
     Without any degree of freedom the noise there is not known.
     """
+    dof = np.concatenate([freedom for _, freedom in parts])
+    squares = np.concatenate([np.sum(off**2, axis=0) for off, _ in parts])
     sigma = np.sqrt(np.where(dof > 0, squares / np.maximum(dof, 1), np.nan))
     sizes = [row.size for row in data_by_wavelength(measurement)[2]]
-    return _of_data(measurement, np.repeat(sigma, sizes), dof, method, words)
+    shares = np.repeat([_independent(*part) for part in parts], [len(f) for _, f in parts])
+    return _of_data(measurement, np.repeat(sigma, sizes), dof, method, words, shares)
+
+
+def _independent(off, freedom):
+    """Return how many wavelengths deviate independently, as a share of all."""
+    off = off[:, (freedom > 0) & off.any(axis=0)]
+    size = off.shape[1]
+    if size < 2:
+        return 1.0
+    unit = off / np.linalg.norm(off, axis=0)
+    # mean square of the correlation of two wavelengths, less what it is by chance
+    found = (np.sum((unit.T @ unit) ** 2) - size) / (size * (size - 1))
+    chance = 1 / freedom[freedom > 0].mean()
+    common = (found - chance) / (1 - chance) if chance < 1 else 1.0
+    return 1 / (1 + (size - 1) * max(common, 0.0))
 
 
 # ---- known ------------------------------------------------------------------------------
@@ -243,18 +263,9 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     """
     residuals = measurement.residuals(vector)
     limit = float(angle_to_rad(tolerance, "tolerance"))
-    group = np.empty(measurement.n_data, dtype=int)
-    for part, where in zip(measurement.datasets, measurement.segments, strict=True):
-        group[where] = _same_settings(part, limit)[part.group_of_datum]
-    rows = data_by_wavelength(measurement)[2]
-    squares, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=int)
-    for i, row in enumerate(rows):
-        if row.size:
-            _, label, counts = np.unique(group[row], return_inverse=True, return_counts=True)
-            mean = np.bincount(label, residuals[row]) / counts
-            squares[i] = np.sum((residuals[row] - mean[label]) ** 2)
-            dof[i] = row.size - counts.size
-    if not dof.any():
+    datasets = zip(measurement.datasets, measurement.segments, strict=True)
+    parts = [_replicate_scatter(part, residuals[where], limit) for part, where in datasets]
+    if not any(freedom.any() for _, freedom in parts):
         names = ", ".join(part.observations.name for part in measurement.datasets)
         raise FitError(
             f"{names}: no two data at the same settings within {np.rad2deg(limit):g} deg; "
@@ -264,7 +275,19 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
         "scatter among repeated data: photon and read noise, flicker, repeatability of the "
         "stages; not what is the same in every repetition"
     )
-    return _of_cells(measurement, squares, dof, "replicates", words)
+    return _of_deviations(measurement, parts, "replicates", words)
+
+
+def _replicate_scatter(part, residuals, tolerance):
+    """Return deviations from the mean of the same settings, and freedom at each wavelength."""
+    dense, present = np.zeros(part.valid.shape), part.valid.T.astype(float)
+    dense[part.valid] = residuals
+    setting = _same_settings(part, tolerance)
+    member = (setting[:, None] == np.arange(setting.max() + 1)).astype(float)
+    count = member.T @ present
+    mean = member.T @ dense.T / np.maximum(count, 1)
+    off = present * (dense.T - member @ mean)
+    return off, (present.sum(axis=0) - (count > 0).sum(axis=0)).astype(int)
 
 
 def _same_settings(part, tolerance):
@@ -359,22 +382,17 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     _need_two_beams(measurement, "the null channel")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
-    squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if not (dof > 0).any():
+    if not any(freedom.any() for _, freedom in parts):
         raise FitError(
             f"the null channel has no degree of freedom left by the {null_model} null model; "
             "two plate angles per derotator angle (constant) or six derotator angles per plate "
             "angle (smooth) are needed"
         )
-    # z is a mean of two frames: its variance is half that of a frame, as is that of a double
-    # difference; an observable of m frames has 2 / m of the null's
-    shares = [2.0 / part.observable.frames_per_datum for part in measurement.datasets]
-    squares = np.repeat(shares, [len(part.bins) for part in measurement.datasets]) * squares
     words = (
         f"how far the null channel scatters beyond the null of the chain and a {null_model} term; "
         "this is an upper limit: photon and read noise, flicker and what the chain lacks are in it"
     )
-    return _of_cells(measurement, squares, dof, "null channel", words)
+    return _of_deviations(measurement, parts, "null channel", words)
 
 
 def _need_two_beams(measurement, what):
@@ -385,7 +403,7 @@ def _need_two_beams(measurement, what):
 
 
 def _null_scatter(part, vector, null_model):
-    """Return sum of squares of the null's residuals and freedom at each wavelength."""
+    """Return the null's residuals, as noise of a datum, and freedom at each wavelength."""
     obs = part.observations
     right, left = obs.flux_right, obs.flux_left
     pairs = obs.pairs()
@@ -394,7 +412,10 @@ def _null_scatter(part, vector, null_model):
     null = 0.5 * ((right - left) / (right + left) - predicted)[pairs].sum(axis=1)
     signal = 0.5 * (predicted[pairs[:, 0]] - predicted[pairs[:, 1]])
     design = _null_design(obs, pairs[:, 0], null_model)
-    squares, dof = np.zeros(obs.n_bins), np.zeros(obs.n_bins, dtype=int)
+    off, dof = np.zeros(null.shape), np.zeros(obs.n_bins, dtype=int)
+    # z is a mean of two frames: its variance is half that of a frame, as is that of a double
+    # difference; an observable of m frames has 2 / m of the null's
+    scale = np.sqrt(2.0 / part.observable.frames_per_datum)
     for i, (z, x) in enumerate(zip(null.T, signal.T, strict=True)):
         good = np.isfinite(z)
         if good.any():
@@ -402,9 +423,9 @@ def _null_scatter(part, vector, null_model):
             # its constant part is in the design
             columns = np.column_stack([design, x**2])[good]
             fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=RANK)
-            squares[i] = np.sum((z[good] - columns @ fit) ** 2)
+            off[good, i] = scale * (z[good] - columns @ fit)
             dof[i] = good.sum() - rank
-    return squares, dof
+    return off, dof
 
 
 def _predicted_differences(part, vector):
@@ -463,9 +484,9 @@ def noise_from_roughness(measurement, vector=None):
     Returns
     -------
     ``NoiseEstimate``
-        Besides photon and read noise it includes flicker that changes the ratio of the beams, and
-        what optics do that is sharp in wavelength and no harmonic. Infinite degrees of freedom
-        where the stated errors stand.
+        Besides photon and read noise it includes what else differs from wavelength to wavelength
+        and is not a harmonic; not flicker that neighbouring wavelengths share. Infinite degrees of
+        freedom where the stated errors stand.
 
     Raises
     ------
@@ -513,10 +534,13 @@ def noise_from_roughness(measurement, vector=None):
         sigmas.append(np.sqrt(of_data / part.observable.frames_per_datum))
         known = np.isfinite(variance) & (variance > 0) & frames.valid
         stands = np.allclose(sigma[known], np.sqrt(variance[known])) and known.any()
-        freedom += [np.inf if stands else _TELLS * frames.valid.sum()] * len(part.bins)
+        # with stated errors one number is estimated, without those of a few wavelengths each
+        share = 1.0 if known.any() else _FEWEST_ROUGH / obs.n_bins
+        freedom += [np.inf if stands else share * _TELLS * frames.valid.sum()] * len(part.bins)
     words = (
         "the stated errors, or more where single frames are rough along the wavelengths: photon "
-        "and read noise, flicker, and what is sharp in wavelength"
+        "and read noise, and what else is sharp in wavelength; not flicker that neighbouring "
+        "wavelengths share"
     )
     return _of_data(measurement, np.concatenate(sigmas), freedom, "roughness", words)
 
@@ -555,7 +579,13 @@ def frame_noise(channel, residual, angles):
         if not stated.any():
             if not rough > 0:
                 raise FitError("no errors in the table, and the residuals tell no noise")
-            sigma[i] = rough
+            # nothing states which data are noisier: mean squares around each wavelength
+            total, count = (
+                np.convolve(np.sum(one, axis=1), np.ones(_FEWEST_ROUGH))[1:-1]
+                for one in (keep * second**2, keep)
+            )
+            level = np.sqrt(np.divide(total, count, out=total * 0, where=count > 0)) / shrunk
+            sigma[i] = np.where(level > 0, level, rough)[:, None]
             continue
         if np.isfinite(rough):
             total = (sigma[i][:-2] ** 2 + 4 * sigma[i][1:-1] ** 2 + sigma[i][2:] ** 2) / 6

@@ -134,6 +134,8 @@ class _Part:
     kernels: tuple
     amplitude: np.ndarray
     shares: np.ndarray = None
+    #: Which components residuals can tell at all.
+    told: np.ndarray = None
 
     def dense(self, columns):
         """Return columns as an array of pairs, wavelengths and columns; masked data are zero."""
@@ -249,7 +251,7 @@ class Scatter:
             inner[:, :, some] = product.reshape(rank, 2 * n, -1)
         seen += np.einsum("iaj,jbi->ab", inner[:, :n], inner[:, n:], optimize=True)
         size = np.diag(full)
-        told = np.diag(seen) > _LEFT * size
+        told = part.told = np.diag(seen) > _LEFT * size
         if not np.isfinite(seen).all():
             return np.eye(len(size))[0]
         shares = _solved(seen, found, told)
@@ -262,11 +264,11 @@ class Scatter:
         shares[0] = max(shares[0], _INDEPENDENT if shares.any() else 1.0)
         return shares
 
-    def middle(self):
-        """Return the covariance of the pulls of the residuals on the determined directions."""
-        total = np.zeros((self.slopes.shape[1],) * 2)
+    def middle(self, slopes):
+        """Return the covariance of the pulls of the residuals on directions, (n_data, n)."""
+        total = np.zeros((slopes.shape[1],) * 2)
         for part in self.parts:
-            scaled = self.slopes[part.rows] * part.amplitude[:, None]
+            scaled = slopes[part.rows] * part.amplitude[:, None]
             for share, (before, behind) in zip(part.shares, part.halves(scaled), strict=True):
                 if share:
                     total += share * np.tensordot(before, behind, axes=((0, 1), (0, 1)))
@@ -276,15 +278,15 @@ class Scatter:
     def at_settings(self, i):
         """Return the error of q and u that all pairs at a setting share, per wavelength.
 
-        NaN where the dataset has no data.
+        NaN where the dataset has no data, and where its settings do not tell such an error.
         """
         part = self.parts[i]
-        variance = sum(
-            share * np.diag(kernel)
-            for share, (together, kernel) in zip(part.shares, part.components(), strict=True)
-            if together
-        ) + np.zeros(len(part.kernels[0]))
-        found = np.full(variance.size, np.nan)
+        found = np.full(len(part.kernels[0]), np.nan)
+        parts = zip(part.shares, part.told, part.components(), strict=True)
+        known = [(share, told, kernel) for share, told, (together, kernel) in parts if together]
+        if not any(told for _, told, _ in known):
+            return found
+        variance = sum(share * np.diag(kernel) for share, _, kernel in known)
         found[part.bin] = np.sqrt(variance)[part.bin] * part.amplitude * self._level[part.rows]
         return found
 
@@ -347,14 +349,17 @@ def model_error(measurement, scatter):
 
     ``relative_percent`` multiplies the polarization, from polarized sources; ``absolute_percent``
     does not, from all others. Standard errors of q and u per wavelength; zero, and in ``missing``,
-    where none tells.
+    where none tells. ``settings`` is the least number of them that tells one, if there is one.
     """
-    squares = {"relative": [], "absolute": []}
+    squares, settings = {"relative": [], "absolute": []}, []
     if not scatter.is_known:
         return None
     for i, dataset in enumerate(measurement.datasets):
         polarized = kind_of_source(dataset.observations.source) == "polarized"
-        squares["relative" if polarized else "absolute"].append(scatter.at_settings(i) ** 2)
+        square = scatter.at_settings(i) ** 2
+        squares["relative" if polarized else "absolute"].append(square)
+        if np.nansum(square) > 0:
+            settings.append(scatter.parts[i].patterns.shape[1] // 2)
     found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
     for key, rows in squares.items():
         known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
@@ -363,7 +368,7 @@ def model_error(measurement, scatter):
         found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
         if not count.any():
             found["missing"].append(key)
-    return found
+    return found | ({"settings": min(settings)} if settings else {})
 
 
 def kind_of_source(source):

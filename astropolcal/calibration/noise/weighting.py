@@ -249,8 +249,9 @@ class Problem:
     def around(self, vector=None):
         """Return the linear problem around a vector, by default the solution."""
         vector, free = self.solution if vector is None else vector, self.measurement.free
-        rows, n = self.jacobian(vector).T, self.measurement.n_data
-        return Whitened(rows[:, :n], physical_scale(free), rows[:, n:], free.at_bounds(vector))
+        data = self.measurement.jacobian(vector) * self.weights
+        priors = free.prior_jacobian(vector, for_errors=True) * self.noise
+        return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
 
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS):
         """Return the vector, chi-square, and what scipy says of the fit.

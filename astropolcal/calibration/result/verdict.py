@@ -31,6 +31,8 @@ _MISFIT = 2 * u.percent
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
 _CLEARLY = 2
+# errors that rest on fewer numbers are themselves known to a third or worse
+_FEW_FREEDOM, _FEW_SETTINGS = 5, 6
 
 
 @dataclass
@@ -113,6 +115,7 @@ def verdict(calibration, targets=TARGETS):
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         cautions += [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
+        cautions += _few(calibration)
         # a fit minds the bounds of what leads only
         beyond = [n for n, e in known.items() if e["tied"] and is_outside(e["value"], e["bounds"])]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
@@ -212,6 +215,18 @@ def _mirrors(calibration, known):
                 f"{told}?"
             )
     return found
+
+
+def _few(calibration):
+    """Say that errors rest on few numbers, which makes them lower limits."""
+    fit, weights = calibration.fit, calibration.settings.get("weights")
+    freedom = fit.get("n_data", np.inf) - calibration.identifiability.rank
+    if weights in (None, "wavelength") and freedom < _FEW_FREEDOM:
+        degrees = counted(freedom, "degree of freedom", "degrees of freedom")
+        yield f"errors rest on {degrees} only"
+    settings = (fit.get("model_error") or {}).get("settings", _FEW_SETTINGS)
+    if settings < _FEW_SETTINGS:
+        yield f"errors are lower limits: {settings} settings tell what residuals share"
 
 
 def _misfit(calibration):

@@ -331,9 +331,38 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
-    prior = whitened.along(whitened.prior_rows) * weighting.level
-    slack = _inward(measurement, whitened)[-1] if whitened.held.any() else None
-    return sandwich(measurement, whitened, weighting, scatter.middle() + prior.T @ prior, slack)
+    middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
+    slack = _inward(measurement, whitened, scatter)[-1] if whitened.held.any() else None
+    return sandwich(measurement, whitened, weighting, middle, slack)
+
+
+def _middle(scatter, level, data, priors):
+    """Return the covariance of the pulls on directions, from their derivatives (n, n_directions).
+
+    Without ``scatter`` data are independent.
+    """
+    known = scatter is not None and scatter.is_known
+    own = scatter.middle(data) if known else level**2 * data.T @ data
+    return own + level**2 * priors.T @ priors
+
+
+def widening(problem, with_scatter):
+    """Return by how much the scatter makes the error of each parameter larger, (n_free,).
+
+    Over that where chi-square with the weights of the fit rises by one; of what is at a bound
+    inward, and one of what has no error.
+    """
+    measurement, whitened, weighting = problem.measurement, problem.around(), problem.weighting
+    scatter = Scatter(measurement, weighting, whitened) if with_scatter else None
+    middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
+    stated = sandwich(measurement, whitened, weighting, middle).stds * measurement.free.factors()
+    plain = weighting.level * np.sqrt(np.diag(whitened.covariance()))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        times = stated / plain
+    if whitened.held.any():
+        held, columns, *_ = _inward(measurement, whitened, scatter)
+        times[held] = _levels(measurement, scatter, columns) / weighting.level
+    return np.where(np.isfinite(times) & (times > 0), times, 1.0)
 
 
 def white_covariance(measurement, whitened, weighting):
@@ -403,19 +432,24 @@ _ANYWHERE = 0.6827
 _UNIFORM = 1 / np.sqrt(12)
 
 
-def errors_at_bounds(measurement, whitened):
+def errors_at_bounds(measurement, whitened, scatter=None):
     """Return one-sided errors at bounds (``inward``) and what they do to others (``released``).
 
     With all others refitted, chi-square rises inward by 2 g t + t^2 / s^2: g is the gradient that
-    pushes against the bound, s the error were there none. The one-sided error is where that is one.
+    pushes against the bound, s the error were there none. The one-sided error is where that is one,
+    in units of how the residuals scatter along the parameter, or of independent data.
     """
     if not whitened.held.any():
         return {"inward": {}, "released": {}}
-    held, columns, response, steps, moved = _inward(measurement, whitened)
+    held, columns, response, steps, moved = _inward(measurement, whitened, scatter)
     names, per_unit = measurement.free.names, whitened.scale / measurement.free.factors()
     released = _released(names, whitened, held, columns, response)
     slack = np.linalg.norm(moved, axis=0) * per_unit
-    root = np.linalg.pinv(np.linalg.qr(columns, mode="r")) * measurement.weighting.level
+    inverse = np.linalg.pinv(np.linalg.qr(columns, mode="r"))
+    n, level = measurement.n_data, measurement.weighting.level
+    # columns of an orthonormal basis, and the root of how these are pulled
+    variances, axes = np.linalg.eigh(_middle(scatter, level, *np.split(columns @ inverse, [n])))
+    root = inverse @ axes * np.sqrt(variances.clip(0))
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
         i = names.index(name)
@@ -426,7 +460,14 @@ def errors_at_bounds(measurement, whitened):
     return {"inward": inward, "released": released}
 
 
-def _inward(measurement, whitened):
+def _levels(measurement, scatter, columns):
+    """Return by how much what is held is pulled along its own derivatives, over their length."""
+    level, size = measurement.weighting.level, np.linalg.norm(columns, axis=0)
+    pulled = np.diag(_middle(scatter, level, *np.split(columns, [measurement.n_data])))
+    return np.where(size > 0, np.sqrt(pulled) / np.where(size > 0, size, 1.0), level)
+
+
+def _inward(measurement, whitened, scatter):
     """Return what is held, its derivatives, how others follow, one-sided errors, and the slack.
 
     The slack is how all parameters move while one at its bound goes inward by its one-sided error,
@@ -452,7 +493,8 @@ def _inward(measurement, whitened):
     # the triangular factor is as good as all rows
     rest = residual - basis @ (basis.T @ residual)
     square = np.linalg.qr(np.column_stack([columns * inward, rest]), mode="r")
-    steps = [_rises(square, weighting.level, i, width) for i, width in enumerate(widths)]
+    levels = _levels(measurement, scatter, columns)
+    steps = [_rises(square, level, i, widths[i]) for i, level in enumerate(levels)]
     # what the data do not limit is anywhere up to the opposite bound
     far = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)
     moved = np.zeros((held.size, whitened.scale.size))

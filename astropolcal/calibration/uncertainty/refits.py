@@ -4,6 +4,7 @@ Errors of parameters that do not come from one covariance: refits, and robust es
 
 Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
 one, all others refitted, is a better statement than a standard error, and need not be symmetric.
+Where residuals are correlated it has to rise by more, as much as that makes the error larger.
 Where the data do not determine a parameter, its profile is flat.
 
 Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
@@ -35,6 +36,7 @@ from astropolcal.calibration.uncertainty.covariance import (
     full_covariance,
     sandwich,
     white_covariance,
+    widening,
 )
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.progress import counting, in_one_thread, shown
@@ -70,7 +72,8 @@ class Profile:
         Where it was held, ascending, with the calibrated value among them.
     delta_chi2 : `~numpy.ndarray`
         Rise of chi-square over the calibration's, in units of the residual
-        variance where the errors of the data are not given.
+        variance where the errors of the data are not given; divided by how much
+        larger the scatter of the residuals makes the variance of the parameter.
     vectors : `~numpy.ndarray`
         All parameters in canonical units at each value, shape (n_values, n_free).
     bounds : tuple of float
@@ -229,7 +232,9 @@ def profile(calibration, name, values=None, n=21):
         if not (grid[0] >= low and grid[-1] <= high):
             raise ParameterError(f"{name}: values outside its bounds {low:g} to {high:g}")
     chi2, vectors = _follow(refit, index, grid * factor, int(np.argmin(np.abs(grid - best))))
-    rise = (chi2 - chi2.min()) / refit.weighting.level**2
+    is_white = calibration.settings.get("errors") == "white"
+    sigma = refit.weighting.level * widening(refit, not is_white)[index]
+    rise = (chi2 - chi2.min()) / sigma**2
     quantity = 1 if unit is None else u.Unit(unit)
     return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
 

@@ -303,7 +303,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     hat = _Hat.of(measurement, vector, noise.sigma_of_data, weights, whitened) if fitted else None
     table, whole = _test_by_wavelength(measurement, vector, noise, hat)
     priors = _test_of_priors(measurement, vector, hat)
-    chi2, expected, p_value = _together(table, whole, noise.dof, priors)
+    chi2, expected, p_value = _together(table, whole, noise, priors)
     words = _verdict(chi2, expected, p_value, noise, priors)
     return LackOfFit(table, chi2, expected, p_value, words, priors)
 
@@ -423,24 +423,24 @@ def _moments(hat, n, products, own):
     return mean, mean**2 / square
 
 
-def _together(table, whole, dof_noise, priors):
+def _together(table, whole, noise, priors):
     """Return chi-square, freedom and probability of all wavelengths and priors together."""
-    p = np.asarray(table["p_value"])
+    p, shares = np.asarray(table["p_value"]), np.broadcast_to(noise.independent, len(table))
     chi2, mean = float(np.nansum(table["chi2"])), float(np.nansum(table["expected"]))
     if priors is not None:
-        p = np.append(p, priors["p_value"])
+        p, shares = np.append(p, priors["p_value"]), np.append(shares, 1.0)
         chi2, mean = chi2 + priors["chi2"], mean + priors["expected"]
-    p = p[np.isfinite(p)]
-    if not p.size:
+    known = np.isfinite(p)
+    if not known.any():
         return chi2, mean, np.nan
-    if np.isinf(dof_noise).all():
+    if np.isinf(noise.dof).all():
         mean, dof = whole
         return chi2, float(mean), float(_chi2_above(chi2 / mean * dof, dof))
     with np.errstate(divide="ignore"):
-        # p of the wavelengths are uniform and independent if the model is true: -2 sum ln p is then
-        # chi-square of twice their number
-        fisher = -2 * np.sum(np.log(p))
-    return chi2, mean, float(_chi2_above(fisher, 2 * p.size))
+        # p of the wavelengths are uniform if the model is true: of independent ones -2 sum ln p is
+        # then chi-square of twice their number, and of others of as many as are independent
+        fisher = -2 * np.sum(shares[known] * np.log(p[known]))
+    return chi2, mean, float(_chi2_above(fisher, 2 * shares[known].sum()))
 
 
 def _verdict(chi2, expected, p_value, noise, priors):

@@ -21,6 +21,7 @@ from astropolcal.observations.grid import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
+from astropolcal.words import listed
 
 __all__ = ["fitted_stars", "star_accuracy", "star_check", "star_stokes"]
 
@@ -53,7 +54,7 @@ def star_stokes(calibration, chain, observations, positions=None):
         One row per wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
         standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
         and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one per cycle, NaN
-        where a cycle does not determine them.
+        where a cycle does not determine them. A single cycle has no error, and so no ``dolp``.
 
     Raises
     ------
@@ -115,16 +116,17 @@ def star_stokes(calibration, chain, observations, positions=None):
 
 def _table(wavelength, found):
     count = np.isfinite(found[0]).sum(axis=1)
-    mean = np.nanmean(found, axis=2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
-        error = np.nanstd(found, axis=2) / np.sqrt(np.maximum(count - 1, 0))
+    mean = _mean(found)
+    # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
+    error = np.sqrt(_mean((found - mean[..., None]) ** 2) / np.where(count > 1, count - 1, np.nan))
     table = QTable({"wavelength": wavelength})
     _add(table, q=mean[0], u=mean[1], q_err=error[0], u_err=error[1])
     # rms of both components: the degree has the error of one of them
     spread = np.hypot(*error) / np.sqrt(2)
-    dolp = np.hypot(*mean)
-    _add(table, dolp=stokes.debias_dolp(dolp, spread), dolp_err=spread)
+    dolp, known = np.hypot(*mean), np.isfinite(spread)
+    debiased = np.full(dolp.shape, np.nan)
+    debiased[known] = stokes.debias_dolp(dolp[known], spread[known])
+    _add(table, dolp=debiased, dolp_err=spread)
     table["aolp"] = stokes.polarization_angle(*mean) * u.deg
     with np.errstate(divide="ignore", invalid="ignore"):
         # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
@@ -132,6 +134,12 @@ def _table(wavelength, found):
     table["n_cycles"] = count
     _add(table, q_cycles=found[0], u_cycles=found[1])
     return table
+
+
+def _mean(values):
+    """Return means of what is known along the last axis, NaN of nothing."""
+    with np.errstate(invalid="ignore"):
+        return np.nansum(values, axis=-1) / np.isfinite(values).sum(axis=-1)
 
 
 def _add(table, **fractions):
@@ -184,8 +192,8 @@ def star_accuracy(table, q=0.0, u_=0.0):
     result = QTable({"wavelength": table["wavelength"]})
     _add(result, dolp_error=np.hypot(*mean) - length)
     result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
-    s_q, s_u = np.sqrt(np.nanmean(off**2, axis=2))
-    _add(result, s_dolp=np.sqrt(np.nanmean(squares, axis=1)), s_q=s_q, s_u=s_u)
+    s_q, s_u = np.sqrt(_mean(off**2))
+    _add(result, s_dolp=np.sqrt(_mean(squares)), s_q=s_q, s_u=s_u)
     return result
 
 
@@ -401,10 +409,15 @@ def _add_known(table, q, stokes_u, covariance):
 
 
 def _pull(table, key):
-    """Return by how many errors of star, calibration and catalogue together the star is off."""
-    parts = (table[f"{key}{suffix}"].value for suffix in ("_err", "_sys_err", "_known_err"))
-    stated = np.sqrt(sum(np.nan_to_num(part, posinf=np.inf) ** 2 for part in parts))
-    return np.nanmedian(np.abs(table[f"{key}_error"].value) / stated)
+    """Say by how many errors the star is off, and whose they are: not all need be known."""
+    suffixes = {"star": "_err", "calibration": "_sys_err", "catalogue": "_known_err"}
+    parts = {whose: table[f"{key}{suffix}"].value for whose, suffix in suffixes.items()}
+    known = {whose: part for whose, part in parts.items() if not np.isnan(part).all()}
+    if not known:
+        return "no error is known"
+    stated = np.sqrt(sum(part**2 for part in known.values()))
+    times = np.nanmedian(np.abs(table[f"{key}_error"].value) / stated)
+    return f"{times:.1f} times the errors of {listed(known)}"
 
 
 def _error_along(direction, matrix):
@@ -418,15 +431,12 @@ def _words(table):
     off = np.abs(table["dolp_error"].to_value(u.percent))
     words = (
         f"DoLP off by {np.nanmedian(off):.2g} % (median over the wavelengths; worst "
-        f"{np.nanmax(off):.2g} %; {_pull(table, 'dolp'):.1f} times all errors), single cycles by "
+        f"{np.nanmax(off):.2g} %; {_pull(table, 'dolp')}), single cycles by "
         f"{np.nanmedian(table['s_dolp'].to_value(u.percent)):.2g} %"
     )
     turned = table["aolp_error"].to_value(u.deg)
     if np.isfinite(turned).any():
-        words += (
-            f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {_pull(table, 'aolp'):.1f} times "
-            "the errors of calibration, star and catalogue together"
-        )
+        words += f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {_pull(table, 'aolp')}"
     return words
 
 

@@ -102,6 +102,8 @@ _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sk
 # where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
 _EXTREMES = (0.0, 22.5, 45.0) * u.deg
 _OPEN = ("infinite", "ignore")
+# which sources tell which error of the model
+_OF_SOURCES = {"relative": "polarized", "absolute": "unpolarized"}
 # angles among which those of a calibration are sought
 _ANY = np.arange(0.0, 180.0, 7.5) * u.deg
 
@@ -170,10 +172,8 @@ def _accuracies(calibration, targets, view, ignore=False):
     if view is None:
         return []
     errors, tables, count = SkyErrors(calibration, view, ignore), [], view.good.shape[1]
-    model = calibration.fit.get("model_error")
     words = (
-        f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
-        f"{view.telescope}; "
+        f"from the covariance of the fit {_of_model(calibration)}; {view.telescope}; "
         + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
         + (f", rms over {count} settings" if count > 1 else "")
     )
@@ -189,6 +189,16 @@ def _accuracies(calibration, targets, view, ignore=False):
         table.meta |= {"dolp": dolp, "aolp": aolp, "words": words}
         tables.append(table)
     return tables
+
+
+def _of_model(calibration):
+    """Say which errors of the model there are; what no dataset tells counts as zero."""
+    known = calibration.fit.get("model_error")
+    missing = known.get("missing", []) if known else _OF_SOURCES
+    none = [source for key, source in _OF_SOURCES.items() if key in missing]
+    if len(none) == len(_OF_SOURCES):
+        return "without an error of the model"
+    return "and an error of the model" + "".join(f", but none from {one} sources" for one in none)
 
 
 def _target(dolp, aolp):
