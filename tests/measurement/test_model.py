@@ -23,7 +23,6 @@ FITTERS = [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter]
 
 # frames without a modulator
 PLAIN = sorted(name for name, one in OBSERVABLES.items() if one.frames_per_datum < 4)
-DOUBLE = [name for name, observable in OBSERVABLES.items() if observable.frames_per_datum == 2]
 
 
 def numerical(measurement, vector, step=1e-6):
@@ -532,13 +531,11 @@ def test_fitters_agree(solutions):
         assert (difference < tolerance).all()
 
 
-@pytest.mark.parametrize("fitter", FITTERS)
-def test_fit_uses_the_analytic_jacobian(frames, fitter, monkeypatch):
+def test_fit_uses_the_analytic_jacobian(frames, monkeypatch):
     """Finite differences would call ``evaluate`` once a parameter for every step."""
     chain, data = _full_rank([1.2, 1.6, 2.0, 2.2] * u.um, frames)
-    measurement = Measurement(chain, data)
-    counts = {"evaluate": 0, "fit_deriv": 0}
-    for name in counts:
+    counts = {}
+    for name in ("evaluate", "fit_deriv"):
         method = getattr(Measurement, name)
 
         def counted(self, *args, _method=method, _name=name):
@@ -546,10 +543,13 @@ def test_fit_uses_the_analytic_jacobian(frames, fitter, monkeypatch):
             return _method(self, *args)
 
         monkeypatch.setattr(Measurement, name, counted)
-    fitter()(measurement, measurement.index, measurement.observed)
-    assert counts["fit_deriv"] > 0
-    assert counts["evaluate"] < measurement.free.size + 2 * counts["fit_deriv"] + 5
-    assert counts["evaluate"] <= 40
+    for fitter in FITTERS:
+        measurement = Measurement(chain, data)
+        counts |= {"evaluate": 0, "fit_deriv": 0}
+        fitter()(measurement, measurement.index, measurement.observed)
+        assert counts["fit_deriv"] > 0, fitter
+        assert counts["evaluate"] < measurement.free.size + 2 * counts["fit_deriv"] + 5, fitter
+        assert counts["evaluate"] <= 40, fitter
 
 
 def test_bounds_hold_in_a_fit(frames):
