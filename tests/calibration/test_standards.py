@@ -147,12 +147,6 @@ def test_observable_and_ties_are_those_of_the_calibration(make, chain, observati
     np.testing.assert_allclose(percent(table["s_standard"]), rms)
 
 
-def test_a_calibration_from_a_file_predicts_the_same(tmp_path, calibrated, chain, standard):
-    calibrated.write(tmp_path / "cal.asdf")
-    read = standard_accuracy(Calibration.read(tmp_path / "cal.asdf"), chain, standard)
-    np.testing.assert_allclose(read["chi"], standard_accuracy(calibrated, chain, standard)["chi"])
-
-
 # --- what is refused ---------------------------------------------------------------------
 
 
