@@ -24,16 +24,6 @@ LAM = [1.2, 1.6, 2.2] * u.um
 FAINT = {"flux": 1e6, "read_noise": 500.0}
 
 
-@pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
-def measurement(make, chain):
-    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
-
-
 def fit(measurement, weights=1.0, steps=4):
     """Gauss-Newton from the truth, which is close enough."""
     vector = measurement.vector()

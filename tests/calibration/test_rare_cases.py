@@ -44,11 +44,6 @@ ANGLES = [45, 60, 80, 100] * u.deg
 
 
 @pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
 def data(make, chain):
     return make.observe(chain, half_wave_plate_cycles(derotator=ANGLES), LAM, seed=3)
 

@@ -23,11 +23,6 @@ META = {"source": "polarized"}
 
 
 @pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
 def observations(make, chain):
     return make.observe(chain, wavelength=LAM, seed=1, meta=META, name="lamp")
 

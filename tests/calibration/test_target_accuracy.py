@@ -295,16 +295,6 @@ def _scatter_of_star(observations):
 # --- groups -------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
-def measurement(make, chain):
-    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
-
-
 def test_cycles_end_where_an_angle_comes_again(make, chain):
     data = make.observe(chain, make.frames([45, 45, 45, 80] * u.deg), LAM, seed=1)
     m = Measurement(chain, data)
