@@ -135,15 +135,15 @@ def test_there_are_tutorials():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-def test_tutorial_becomes_a_notebook(path):
-    parser = pytest.importorskip("sphinx_gallery.py_source_parser")
-    notebook = pytest.importorskip("sphinx_gallery.notebook")
-    from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
+def test_tutorial_becomes_a_notebook():
+    for path in TUTORIALS:
+        parser = pytest.importorskip("sphinx_gallery.py_source_parser")
+        notebook = pytest.importorskip("sphinx_gallery.notebook")
+        from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
 
-    _, blocks = parser.split_code_and_text_blocks(str(path))
-    made = notebook.jupyter_notebook(blocks, dict(DEFAULT_GALLERY_CONF), str(path.parent))
-    cells = json.loads(json.dumps(made))["cells"]
-    kinds = [cell["cell_type"] for cell in cells]
-    assert kinds[0] == "markdown"
-    assert kinds.count("code") >= 3
+        _, blocks = parser.split_code_and_text_blocks(str(path))
+        made = notebook.jupyter_notebook(blocks, dict(DEFAULT_GALLERY_CONF), str(path.parent))
+        cells = json.loads(json.dumps(made))["cells"]
+        kinds = [cell["cell_type"] for cell in cells]
+        assert kinds[0] == "markdown", path
+        assert kinds.count("code") >= 3, path

@@ -59,15 +59,6 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_the_system_refuses_is_one_of_our_errors(tmp_path):
-    for error in [AstropolcalError, CalibrationFileError]:
-        with (
-            pytest.raises(error, match="cannot be written"),
-            atomic_path(tmp_path / "no" / "x.txt", error) as temporary,
-        ):
-            temporary.write_text("x")
-
-
 def test_a_block_that_writes_nothing_is_an_error(tmp_path):
     with pytest.raises(AstropolcalError, match="cannot be written"), atomic_path(tmp_path / "x"):
         pass
@@ -117,15 +108,14 @@ def test_what_killed_runs_left_goes_after_a_day(tmp_path):
         with atomic_path(tmp_path / "note.txt") as temporary:
             temporary.write_text("x")
         assert other.exists() is not goes, (name, age, goes)
-
-
-def test_remains_of_a_file_without_suffix(tmp_path):
+    # of a file without a suffix too
     other = tmp_path / ".note.7-0123abcd.tmp"
     other.write_text("left")
     os.utime(other, (0, 0))
     with atomic_path(tmp_path / "note") as temporary:
         temporary.write_text("x")
-    assert [path.name for path in tmp_path.iterdir()] == ["note"]
+    assert (tmp_path / "note").exists()
+    assert not other.exists()
 
 
 def test_refusals_say_what_to_do(tmp_path):
@@ -419,6 +409,7 @@ def test_yaml_that_must_not_be_loaded():
     for text, words in [
         ("&a [*a]", "refers to itself"),
         ("a: &a\n  b: {c: *a}", "refers to itself"),
+        ("- &a [x]\n- &a [*a]", "refers to itself"),
         ("- *unknown", "undefined alias|refers to itself"),
         ("[" * 64 + "]" * 64, "nested deeper than the 64 levels"),
         ("{a: " * 64 + "1" + "}" * 64, "nested deeper than the 64 levels"),
@@ -437,19 +428,14 @@ def test_yaml_that_may_be_loaded():
         "[" * 62 + "]" * 62,
         "a: &a [1, 2]\nb: *a\nc: *a",
         "a: '<<'",
+        # the second &a is of another list: what it was before does not count any more
+        "- &a [x]\n- *a\n- &a [y]\n- *a",
         laughs(3),
         "--- {a: 1}\n...\n--- {b: 2}\n",
         "\n".join(f"- {i}" for i in range(3000)),
     ]:
         check_yaml(text)
         check_yaml(text.encode())
-
-
-def test_an_anchor_may_be_given_anew():
-    """The second &a is of another list: what it was before does not count any more."""
-    check_yaml("- &a [x]\n- *a\n- &a [y]\n- *a")
-    with pytest.raises(AstropolcalError, match="refers to itself"):
-        check_yaml("- &a [x]\n- &a [*a]")
 
 
 def test_what_is_no_yaml():

@@ -100,28 +100,27 @@ def test_law_of_a_file_layout_is_the_instruments():
     assert charis.sky_law.modes == ("pupil", "field")
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"), [("charis", "pupil"), ("irdis", "field"), ("irdis", "pupil")]
-)
-def test_plate_and_derotator_keep_what_they_should(name, mode):
+def test_plate_and_derotator_keep_what_they_should():
     """With ideal optics the direction that is measured stands still on the sky."""
-    instrument = instruments.get(name)
-    train = leaves(instrument.chain("star", wavelength=instrument.wavelength[:1]))
-    law = instrument.sky_law
-    (f, g), (d, e) = law.plate_law(mode), law.derotator_law(mode)
+    for name, mode in [("charis", "pupil"), ("irdis", "field"), ("irdis", "pupil")]:
+        instrument = instruments.get(name)
+        train = leaves(instrument.chain("star", wavelength=instrument.wavelength[:1]))[1:-1]
+        law = instrument.sky_law
+        laws = {"hwp": law.plate_law(mode), "derotator": law.derotator_law(mode)}
 
-    def measured(p, a):
-        at = {"parallactic": p, "altitude": a, "hwp": f * p + g * a, "derotator": d * p + e * a}
-        total = np.eye(4)
-        for leaf in train[1:-1]:
-            turn = leaf.stage_sign * at[leaf.stage] if leaf.stage else 0.0
-            ideal = mueller.rotation_matrix(turn * u.deg)
-            if not isinstance(leaf, optics.Rotator):
-                ideal = ideal.T @ mueller.linear_retarder(180 * u.deg) @ ideal
-            total = ideal @ total
-        return np.rad2deg(np.arctan2(total[2, 1], total[1, 1])) / 2
+        def measured(p, a, train=train, laws=laws):
+            at = {stage: f * p + g * a for stage, (f, g) in laws.items()}
+            at |= {"parallactic": p, "altitude": a}
+            total = np.eye(4)
+            for leaf in train:
+                turn = leaf.stage_sign * at[leaf.stage] if leaf.stage else 0.0
+                ideal = mueller.rotation_matrix(turn * u.deg)
+                if not isinstance(leaf, optics.Rotator):
+                    ideal = ideal.T @ mueller.linear_retarder(180 * u.deg) @ ideal
+                total = ideal @ total
+            return np.rad2deg(np.arctan2(total[2, 1], total[1, 1])) / 2
 
-    start, turned, higher = measured(0, 50), measured(20, 50), measured(0, 70)
-    assert (higher - start + 90) % 180 == pytest.approx(90)
-    assert (turned - start + 90) % 180 == pytest.approx(90)
-    assert {"parallactic", "altitude"} <= set(stages(instrument.chain("star")))
+        start, turned, higher = measured(0, 50), measured(20, 50), measured(0, 70)
+        assert (higher - start + 90) % 180 == pytest.approx(90), (name, mode)
+        assert (turned - start + 90) % 180 == pytest.approx(90), (name, mode)
+        assert {"parallactic", "altitude"} <= set(stages(instrument.chain("star"))), (name, mode)

@@ -71,12 +71,10 @@ def test_get_knows_name_and_aliases_in_any_case():
         assert isinstance(instruments.get(name), CHARIS), name
 
 
-def test_get_suggests_a_near_match():
+def test_get_names_what_is_known():
     with pytest.raises(InstrumentError, match=r"unknown instrument 'chari'.*did you mean 'charis'"):
         instruments.get("chari")
-
-
-def test_get_lists_what_is_known_when_nothing_is_near():
+    # nothing near
     with pytest.raises(InstrumentError, match=r"known are .*charis") as caught:
         instruments.get("zzzzzz")
     assert "did you mean" not in str(caught.value)
@@ -87,30 +85,22 @@ def test_registered_class_is_found_and_returned(registry):
     assert instruments.register(Plugin) is Plugin
     assert isinstance(instruments.get("pip"), Plugin)
     assert Plugin.name in instruments.names()
-
-
-def test_registering_the_same_class_twice_is_harmless(registry):
+    # twice is harmless
     assert instruments.register(CHARIS) is CHARIS
 
 
-def test_name_that_is_taken_is_refused(registry):
+def test_what_cannot_be_registered_is_refused(registry):
     other = type("Other", (Plugin,), {"name": "charis"})
     with pytest.raises(InstrumentError, match="'charis' is registered already"):
         instruments.register(other)
-
-
-def test_only_named_instrument_classes_are_registered(registry):
     for thing in [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})]:
         with pytest.raises(InstrumentError, match="not an Instrument with a name"):
             instruments.register(thing)
 
 
-def test_entry_point_is_listed_without_being_loaded(entry_point):
+def test_entry_point_is_loaded_when_asked_for(entry_point):
     assert instruments.names() == sorted([*instruments._REGISTRY, Plugin.name])
     assert Plugin.name not in instruments._REGISTRY
-
-
-def test_entry_point_is_loaded_when_asked_for(entry_point):
     assert isinstance(instruments.get("PIP"), Plugin)
     assert Plugin.name in instruments._REGISTRY
 
@@ -177,9 +167,7 @@ def test_number_of_free_parameters():
     for derotator, count in [("elliptical", 5 + 4 * N_BINS), ("linear", 5 + 2 * N_BINS)]:
         chain = CHARIS().chain(derotator=derotator)
         assert FreeParameters([chain], N_BINS).size == count, (derotator, count)
-
-
-def test_dichroic_adds_no_free_parameter_and_no_change():
+    # the dichroic adds none, and changes nothing
     with_it, without = (CHARIS().chain(optics_in=o) for o in (["dichroic"], []))
     assert FreeParameters([with_it], N_BINS).size == FreeParameters([without], N_BINS).size
     light = (1.0, 0.3, 0.4, 0.1)
@@ -197,6 +185,9 @@ def test_bounds_of_the_derotator():
             bounds,
             expected,
         )
+    # a linear one takes its bounds from the same choice
+    chain = CHARIS().chain(derotator="linear", bounds="paper")
+    assert chain["derotator"].retardance.bounds == (-360, 0)
 
 
 def test_bounds_of_the_paper():
@@ -210,15 +201,14 @@ def test_bounds_of_the_paper():
     assert chain["wollaston"].theta.fixed
 
 
-def test_linear_derotator_takes_its_bounds_from_the_same_choice():
-    chain = CHARIS().chain(derotator="linear", bounds="paper")
-    assert chain["derotator"].retardance.bounds == (-360, 0)
-
-
-def test_chain_follows_the_wavelength_grid():
+def test_chain_follows_the_wavelength_grid_and_options():
     chain = CHARIS().chain(wavelength=[1.2, 1.6, 2.2] * u.um)
     assert chain["derotator"].horizontal.shape == (3,)
     assert chain["wollaston"].efficiency.shape == (3,)
+    # the options of several chains too
+    table = _observations(source="polarized", date="2025-10-05")
+    (chain,) = CHARIS().chains_for([table], derotator="linear")
+    assert isinstance(chain["derotator"], optics.LinearRetarder)
 
 
 def test_unknown_choice_is_refused():
@@ -251,18 +241,19 @@ def test_setup_reads_what_is_in_the_beam():
         assert _setup(source="polarized", **meta) == ("polarized", expected), (meta, expected)
 
 
-def test_inconclusive_date_is_an_error():
+def test_setup_that_is_not_understood_is_an_error():
     for day in [None, "2025-09-01", "2025-10", " "]:
         meta = {} if day is None else {"date": day}
         with pytest.raises(InstrumentError, match="neither nasmyth_beam_switcher nor a conclusive"):
             _setup(source="polarized", **meta)
-
-
-def test_word_that_is_not_understood_is_an_error():
     for key in ["nasmyth_beam_switcher", "yjh50_dichroic"]:
         meta = {"date": "2025-10-05", key: "perhaps"}
         with pytest.raises(InstrumentError, match=f"night: {key} = 'perhaps'; allowed are"):
             _setup(source="polarized", **meta)
+    for source in ["moon", "unpolarized_standard", None]:
+        meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
+        with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):
+            _setup(**meta)
 
 
 def test_spelling_of_a_source_does_not_matter():
@@ -276,13 +267,6 @@ def test_spelling_of_a_source_does_not_matter():
         for name in ("charis", "irdis", "vampires"):
             assert instruments.get(name).setup(table)[0] == source
         assert is_star(spelling) == ("star" in source)
-
-
-def test_source_that_is_not_supported_is_an_error():
-    for source in ["moon", "unpolarized_standard", None]:
-        meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
-        with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):
-            _setup(**meta)
 
 
 # --- chains for several datasets ------------------------------------------------------
@@ -311,16 +295,8 @@ def test_table_of_another_instrument_is_refused():
     table = _observations(instrument="VAMPIRES", source="polarized", date="2025-10-05")
     with pytest.raises(InstrumentError, match="night: the table is of instrument 'VAMPIRES'"):
         CHARIS().chains_for([table])
-
-
-def test_table_that_names_no_instrument_is_taken():
+    # one that names none is taken
     assert CHARIS().check(_observations()) is None
-
-
-def test_options_reach_the_chain():
-    table = _observations(source="polarized", date="2025-10-05")
-    (chain,) = CHARIS().chains_for([table], derotator="linear")
-    assert isinstance(chain["derotator"], optics.LinearRetarder)
 
 
 def test_positions_are_those_of_the_stages():

@@ -2,11 +2,9 @@
 """SPHERE/IRDIS: its chain against the published formulae, its headers, correction, diagnosis."""
 
 import datetime
-import io
 from contextlib import nullcontext
 from dataclasses import replace
 
-import asdf
 import astropy.units as u
 import numpy as np
 import pytest
@@ -27,9 +25,8 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
-from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
+from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, get_effect
 from astropolcal.instruments import IRDIS, SkyLaw
-from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations, pointing
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -118,36 +115,6 @@ def test_mueller_matrix_is_that_of_the_published_formulae(published):
                     np.testing.assert_allclose(ours[i, k], theirs, rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_double_difference_coefficients_are_the_published_ones(published):
-    """Half the difference of single differences, left minus right, to 1e-8."""
-    for coating in COATINGS:
-        plus, minus = random_pointings(N_POINTINGS), random_pointings(N_POINTINGS, seed=2)
-        minus["hwp"] = plus["hwp"] + 45
-        sky = IRDIS_.on_sky(IRDIS_.published(), coating=coating)
-        rows = []
-        for angles in (plus, minus):
-            positions = {name: values * u.deg for name, values in angles.items()}
-            right, left = measurement_rows(sky, positions, IRDIS_.wavelength)
-            rows.append(left - right)
-        ours = 0.5 * (rows[0] - rows[1])
-        for k, band in enumerate(IRDIS_.filters):
-            for i in range(N_POINTINGS):
-                singles = [
-                    np.subtract(
-                        *(
-                            system(published, band, coating, {n: v[i] for n, v in a.items()}, side)[
-                                0
-                            ]
-                            for side in (1, -1)
-                        )
-                    )
-                    for a in (plus, minus)
-                ]
-                theirs = 0.5 * (singles[0] - singles[1])
-                np.testing.assert_allclose(ours[k, i], theirs, rtol=0, atol=1e-8)
-
-
 def test_coatings_differ_by_what_was_published(published):
     """The diattenuation of the telescope fell by a quarter to a third."""
     before, after = (IRDIS_.chain("star", coating=c)["ut"].diattenuation.value for c in COATINGS)
@@ -166,9 +133,6 @@ def test_star_chain_has_the_optics_in_order():
     assert chain["altitude"].mount == "altitude"
     assert chain["ut"].retardance.fixed
     assert not chain["ut"].diattenuation.fixed
-
-
-def test_internal_chain_begins_with_its_source():
     for source in ["polarized", "unpolarized"]:
         first = leaves(IRDIS_.chain(source))[0].name
         assert first == {"polarized": "calibration_polarizer", "unpolarized": "lamp"}[source], (
@@ -209,12 +173,16 @@ def test_on_sky_puts_the_telescope_before_the_plate():
     np.testing.assert_array_equal(sky["ut"].diattenuation.value, expected)
 
 
-def test_on_sky_asks_which_filter_a_chain_of_one_is_of():
+def test_telescope_of_a_chain_of_one_filter_and_of_no_date():
     chain = IRDIS_.chain("polarized", wavelength=[1.245] * u.um)
     with pytest.raises(ChainError, match=r"which of the filters Y, J, H, Ks"):
         IRDIS_.on_sky(chain)
     sky = IRDIS_.on_sky(chain, wavelength=[1.245] * u.um, coating="after")
     assert sky["ut"].retardance.value == pytest.approx(173.414169049)
+    # of no date, the newer one
+    with pytest.warns(AstropolcalWarning, match=r"neither date nor coating.*from 2017-04-16 on"):
+        found = IRDIS_.on_sky(IRDIS_.published())
+    np.testing.assert_array_equal(_ut(found), _ut(IRDIS_.chain("star", coating="after")))
 
 
 def _ut(chain):
@@ -233,12 +201,6 @@ def test_telescope_on_sky_is_that_of_the_date():
         np.testing.assert_array_equal(_ut(found), _ut(IRDIS_.chain("star", coating=coating)))
 
 
-def test_telescope_of_no_date_is_the_newer_one_and_says_so():
-    with pytest.warns(AstropolcalWarning, match=r"neither date nor coating.*from 2017-04-16 on"):
-        found = IRDIS_.on_sky(IRDIS_.published())
-    np.testing.assert_array_equal(_ut(found), _ut(IRDIS_.chain("star", coating="after")))
-
-
 def test_telescope_that_cannot_be_is_refused():
     for options, words in [
         ({"coating": "new"}, "coating = 'new'; allowed are before, after"),
@@ -249,11 +211,6 @@ def test_telescope_that_cannot_be_is_refused():
     ]:
         with pytest.raises(InstrumentError, match=words):
             IRDIS_.on_sky(IRDIS_.published(), **options)
-
-
-def test_on_sky_needs_a_plate():
-    with pytest.raises(ChainError, match="no optic 'hwp'"):
-        IRDIS_.on_sky(optics.LinearPolarizer(name="p") | optics.WollastonPrism(name="w"))
 
 
 # --- setup and dates ------------------------------------------------------------------------
@@ -302,20 +259,6 @@ def test_internal_source_needs_no_date():
     table = simulate(IRDIS_.published(), IRDIS_.wavelength, frames, noise=False, meta=meta)
     assert IRDIS_.setup(table) == ("polarized", ())
     assert IRDIS_.particulars(table) == {}
-
-
-def test_table_of_unknown_source_is_refused():
-    table = star_table()
-    table.meta["source"] = "twilight"
-    with pytest.raises(InstrumentError, match=r"night: source .* = 'twilight'"):
-        IRDIS_.setup(table)
-
-
-def test_prediction_is_in_place_on_a_star():
-    """The model of a table has the fluxes from which it was made."""
-    table = star_table("before")
-    residuals = Measurement(IRDIS_.chains_for([table]), [table]).residuals()
-    np.testing.assert_allclose(residuals, 0, atol=1e-9)
 
 
 def test_plate_follows_the_sky_so_that_commanded_angles_mean_q_and_u():
@@ -501,9 +444,6 @@ def test_header_that_cannot_be_used_is_refused():
     ]:
         with pytest.raises(error, match=words):
             IRDIS_.frame_table([header(), header(**changes)])
-
-
-def test_no_headers_are_refused():
     with pytest.raises(ObservationError, match="no headers"):
         IRDIS_.frame_table([])
 
@@ -585,18 +525,6 @@ def test_calibrated_internal_source_corrects_a_star():
         np.testing.assert_allclose(done.u, -0.02, atol=3e-4)
 
 
-def test_chain_survives_a_file():
-    buffer = io.BytesIO()
-    asdf.AsdfFile({"chain": IRDIS_.chain("star", coating="before")}).write_to(buffer)
-    buffer.seek(0)
-    with asdf.open(buffer, lazy_load=False, memmap=False) as file:
-        read = file["chain"]
-    assert read.submodel_names == IRDIS_.chain("star").submodel_names
-    assert read["ut"].diattenuation.value.tolist() == pytest.approx(
-        IRDIS_.chain("star", coating="before")["ut"].diattenuation.value.tolist()
-    )
-
-
 # --- what a diagnosis asks of it ------------------------------------------------------------------
 
 
@@ -630,43 +558,16 @@ def test_relay_stands_behind_the_plate_where_there_is_no_derotator():
     assert with_one == [EFFECTS["static_retarder"]]
 
 
-def test_effects_of_the_plate_need_a_plate():
+def test_an_effect_of_irdis_needs_its_place():
     assert len([n for n in applicable(minimal()) if n.startswith("hwp_")]) > 5
     assert not {n for n in applicable(minimal(plate=False)) if n.startswith("hwp_")}
-
-
-def test_telescope_effects_apply_on_sky_only():
+    # those of the telescope, on the sky only
     star, internal = IRDIS_.chain("star"), IRDIS_.chain("polarized")
     for name in ("parallactic_sign", "altitude_sign", "sky_background"):
         assert name in applicable(star)
         assert name not in applicable(internal)
-
-
-def test_effect_of_what_is_free_is_not_offered():
-    """The diattenuation of the telescope is a free parameter of the chain already."""
+    # the diattenuation of the telescope is a free parameter of the chain already
     assert "m3_diattenuation" not in applicable(IRDIS_.chain("unpolarized standard star"))
-
-
-@pytest.mark.slow
-def test_every_effect_with_a_place_in_irdis_does_what_it_must():
-    """Identity at zero, new names, and analytic derivatives, of the whole library."""
-    for source in ["lamp", "star"]:
-        if source == "star":
-            table = star_table(n=8)
-        else:
-            frames = half_wave_plate_cycles(derotator=[0, 30, 60] * u.deg)
-            meta = IRDIS_.published_meta()
-            table = simulate(IRDIS_.published(), IRDIS_.wavelength, frames, seed=1, meta=meta)
-        chains = IRDIS_.chains_for([table])
-        names = applicable(chains[0])
-        assert {
-            "hwp_tilt",
-            "hwp_sign",
-            "derotator_encoder_eccentricity",
-            "static_retarder",
-        } <= names, source
-        for name in sorted(names):
-            check_effect(name, chains, [table])
 
 
 def test_an_effect_edits_one_optic_of_a_kind():

@@ -19,7 +19,6 @@ from astropolcal.chain import (
     insert_optic,
     join,
     leaves,
-    replace_optic,
     system_mueller,
     system_mueller_derivatives,
 )
@@ -47,27 +46,6 @@ def whole(chain, positions, wavelength=WAVELENGTH):
 
 
 # --- composition --------------------------------------------------------------------
-
-
-@given(seed=SEED, data=st.data())
-@settings(max_examples=25)
-def test_chain_cut_anywhere_is_the_product_of_its_parts(random_chain, seed, data):
-    chain, positions = draw(random_chain, seed)
-    train = list(leaves(chain))
-    cut = data.draw(st.integers(1, len(train) - 1))
-    first, second = (whole(join(part), positions) for part in (train[:cut], train[cut:]))
-    np.testing.assert_allclose(second @ first, whole(chain, positions), rtol=0, atol=1e-12)
-
-
-@given(seed=SEED, data=st.data())
-@settings(max_examples=15)
-def test_brackets_do_not_matter(random_chain, seed, data):
-    chain, positions = draw(random_chain, seed)
-    train = list(leaves(chain))
-    while len(train) > 1:
-        i = data.draw(st.integers(0, len(train) - 2))
-        train[i : i + 2] = [train[i] | train[i + 1]]
-    np.testing.assert_array_equal(whole(train[0], positions), whole(chain, positions))
 
 
 def _does_nothing(name):
@@ -112,17 +90,6 @@ def test_turning_every_optic_turns_the_chain(random_chain, seed, angle):
     expected = mueller.rotate(whole(chain, positions), angle * u.deg)
     # rotators do not turn with the rest, but commute with what turns them
     np.testing.assert_allclose(whole(join(turned), positions), expected, rtol=0, atol=1e-11)
-
-
-@given(seed=SEED, turns=st.integers(-2, 2))
-@settings(max_examples=20)
-def test_half_turns_change_nothing(random_chain, seed, turns):
-    chain, positions = draw(random_chain, seed)
-    expected = whole(chain, positions)
-    for leaf in leaves(chain):
-        theta = leaf.theta.value * u.deg + turns * 180 * u.deg
-        chain = replace_optic(chain, leaf.name, leaf.with_parameters(theta=theta))
-    np.testing.assert_allclose(whole(chain, positions), expected, rtol=0, atol=1e-11)
 
 
 # --- units --------------------------------------------------------------------------

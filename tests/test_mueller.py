@@ -63,14 +63,6 @@ def test_linear_retarder_of_the_paper():
     np.testing.assert_array_equal(mueller.linear_retarder(0.7 * u.rad), expected)
 
 
-def test_diattenuator_retarder_of_the_paper():
-    eps, c, s = 0.28, 0.96 * np.cos(0.7), 0.96 * np.sin(0.7)
-    expected = [[1, eps, 0, 0], [eps, 1, 0, 0], [0, 0, c, s], [0, 0, -s, c]]
-    np.testing.assert_allclose(
-        mueller.diattenuator_retarder(eps, 0.7 * u.rad), expected, atol=1e-15
-    )
-
-
 def paper_elliptical_retarder(h, d, r):
     """The elliptical retarder of the paper, term by term."""
     total = np.sqrt(h * h + d * d + r * r)

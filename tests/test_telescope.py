@@ -1,16 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The chain of a star: source, telescope, tertiary mirror, and what the tables say of it."""
 
-import sys
 import warnings
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parent))
-
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import instruments, mueller, standards
@@ -26,8 +21,6 @@ from astropolcal.instruments.telescope import (
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations
 from astropolcal.optics import PolarizedSource
-
-BINS = 22
 
 
 def names(chain):

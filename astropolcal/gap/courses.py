@@ -107,9 +107,32 @@ class Course:
         self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
 
 
-def courses(model, names):
-    """Return the courses in place of some causes of a fitted model, the best first."""
-    probes, base = Probes(model, names), model.without(names)
+def courses(model, base):
+    """
+    Return the courses in place of all causes of a fitted model, the best first.
+
+    ``base`` is the model without them. Derivatives are those at the one or at the other, where a
+    course does better: many causes that are not the true ones are far from where it is.
+    """
+    names = [name for name in model.added if name not in base.added]
+    temper, best = max(1.0, model.mean_square), {}
+    for at, absent in ((model, names), (base, ())) if names else ((base, ()),):
+        without = at.without(absent)
+        # to first order, as the courses are
+        lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
+        for one in _fitted(at, absent):
+            freer = max(one.freedom - freedom, 1.0)
+            one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
+            one.p_value = float(stats.chi2.sf(one.lowered / temper, one.freedom))
+            one.std = [np.sqrt(temper) * std for std in one.std]
+            known = best.setdefault((one.place, one.kind), one)
+            best[one.place, one.kind] = min(known, one, key=lambda course: course.behind)
+    return sorted(best.values(), key=lambda one: one.behind)
+
+
+def _fitted(model, absent):
+    """Return the courses at a fitted model of which some effects are taken out."""
+    probes = Probes(model, absent)
     basis = law_basis(probes.problem.wavelength, _DEGREE)
     constant = np.linalg.lstsq(basis, np.ones(len(basis)))[0]
     found = [
@@ -122,15 +145,10 @@ def courses(model, names):
     found.sort(key=lambda one: one.freedom - one.lowered)
     for one in found[:_BEST]:
         one.fit(_MORE)
-    # to first order, as the courses are
-    lost, temper = base.chi2 - model.fit.chi2, max(1.0, model.mean_square)
     for one in found:
-        one.law = basis @ one.law
-        largest = one.law[np.argmax(np.abs(one.law))]
-        one.law = one.law / largest
+        law = basis @ one.law
+        largest = law[np.argmax(np.abs(law))]
+        one.law = law / largest
         one.wave = [wave * largest for wave in one.wave]
-        one.std = [np.sqrt(temper) * std * abs(largest) for std in one.std]
-        freer = max(one.freedom - (base.freedom - model.linear.freedom), 1.0)
-        one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
-        one.p_value = float(stats.chi2.sf(one.lowered / temper, one.freedom))
-    return sorted(found, key=lambda one: one.behind)
+        one.std = [std * abs(largest) for std in one.std]
+    return found

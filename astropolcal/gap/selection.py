@@ -179,7 +179,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = courses(base, ()) if runs < 2 else []
+        seen = courses(base, base) if runs < 2 else []
         seen = [one for one in seen if one.p_value * len(seen) < REMAINDER]
         return Selection([], base, first, 0.0, [_errors(base, groups)], _alike_courses(seen))
     if first.probes.has_more_steps:
@@ -196,7 +196,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = courses(best.model, [one.name for one in best.chosen]) if runs < 2 else []
+    rivals = courses(best.model, base) if runs < 2 else []
     chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)

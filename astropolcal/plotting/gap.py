@@ -22,6 +22,8 @@ _CHANNELS = {
 }
 # share of the residuals that the colour scale of the maps covers
 _COVERED = 99.5
+# frames that tell a size so many times worse than the best one are left out
+_UNTOLD = 20.0
 # characters of a dataset's name above a panel
 _LONGEST_NAME = 30
 
@@ -119,7 +121,7 @@ def plot_gap_frames(diagnosis, *, figure=None):
 
     Single differences, mean of that third of the wavelengths in which the causes do most. The
     line is what the model predicts with the causes in it, less what it predicts without. Where one
-    perturbation of any course may be in place of the causes, its size in every frame stands below.
+    perturbation of any course may be in place of the causes, its size in the frames that tell it stands below.
 
     Parameters
     ----------
@@ -147,8 +149,12 @@ def plot_gap_frames(diagnosis, *, figure=None):
     >>> plot_gap_frames(diagnosis).axes[0].get_xlabel()[:5]
     'frame'
     """
-    datasets, course = _datasets(diagnosis), next(iter(diagnosis.courses), None)
-    rows = len(datasets) * (1 if course is None else 2)
+    datasets, told = _datasets(diagnosis), []
+    for course in diagnosis.courses[:1]:
+        least = min(std.min() for std in course.std)
+        told = [(i, std < _UNTOLD * least) for i, std in enumerate(course.std)]
+        told = [(i, frames) for i, frames in told if frames.any()]
+    rows = len(datasets) + len(told)
     with st.canvas(figure, 9, 1.4 + 2.5 * rows) as figure:
         panels = figure.subplots(rows, 1, squeeze=False)[:, 0]
         for axes, (name, observations, nm, before, after) in zip(panels, datasets, strict=False):
@@ -167,22 +173,23 @@ def plot_gap_frames(diagnosis, *, figure=None):
             axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
             axes.set_ylabel(f"observed {st.MINUS} model (%)")
             _frame_axis(axes, observations)
-        for i, axes in enumerate(panels[len(datasets) :]):
+        for axes, (i, frames) in zip(panels[len(datasets) :], told, strict=True):
             name, observations, *_ = datasets[i]
-            _course_panel(axes, course, i, 1000 * diagnosis.nominal.problem.wavelength)
+            _course_panel(axes, course, i, frames, 1000 * diagnosis.nominal.problem.wavelength)
             axes.set_title(f"{name}: {course.place}, {course.kind}, any course", loc="left")
+            axes.set_xlim(panels[i].get_xlim())
             _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
 
 
-def _course_panel(axes, course, i, nm):
+def _course_panel(axes, course, i, frames, nm):
     """Draw the size of a perturbation in the frames of a dataset that tell it."""
-    known, angle = np.isfinite(course.std[i]), course.kind.startswith(ANGLES)
+    angle = course.kind.startswith(ANGLES)
     scale = np.rad2deg(1) if angle else 100
-    value, error = (scale * values[i][known] for values in (course.wave, course.std))
+    value, error = (scale * values[i][frames] for values in (course.wave, course.std))
     look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
     axes.axhline(0, color=st.GREY, linewidth=0.8)
-    axes.errorbar(np.flatnonzero(known) + 0.5, value, error, **look)
+    axes.errorbar(np.flatnonzero(frames) + 0.5, value, error, **look)
     axes.set_ylabel(f"size at {nm[np.argmax(course.law)]:.0f} nm ({'deg' if angle else '%'})")
 
 

@@ -1,24 +1,20 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A CHARIS-like truth, away from all bounds, and what it measures."""
 
-import sys
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
+from astropolcal.measurement import Measurement
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
-# star_data.py, which several folders use
-sys.path.append(str(Path(__file__).parents[1]))
-
 CHARIS = instruments.get("charis")
 DEROTATOR = np.linspace(45, 132.5, 8) * u.deg
+LAM = [1.2, 1.6, 2.2] * u.um
 
 
 def charis_chain(kind="linear", *, fixed=True, wavelength=None, **options):
@@ -106,6 +102,17 @@ def pulls_of(truth, cal):
     free = FreeParameters([truth], 22)
     error = (cal.measurement.vector() - free.start()) / free.factors()
     return error / cal.covariance.stds
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """The truth at three wavelengths."""
+    return charis_truth(charis_chain(wavelength=LAM))
+
+
+@pytest.fixture(scope="module")
+def measurement(chain):
+    return Measurement(chain, observe(chain, wavelength=LAM, seed=1))
 
 
 @pytest.fixture(scope="session")

@@ -20,16 +20,6 @@ from astropolcal.observations import Observations
 LAM = [1.2, 1.6, 2.2] * u.um
 
 
-@pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
-def measurement(make, chain):
-    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
-
-
 # --- formulae ---------------------------------------------------------------------------
 
 

@@ -133,9 +133,7 @@ def test_parameter_itself_has_its_own_error(full_rank):
     made = propagate(full_rank, lambda chain: chain["hwp"].w_sio2.quantity.copy())
     assert u.isclose(made.std, full_rank.covariance.std("hwp.w_sio2"), rtol=1e-6)
     assert made.value.shape == made.std.shape == ()
-
-
-def test_calibration_is_not_changed(full_rank):
+    # calibration is not changed
     before = full_rank.chain["hwp"].w_sio2.value.copy()
     propagate(full_rank, lambda chain: chain["hwp"].w_sio2.value.copy())
     assert full_rank.chain["hwp"].w_sio2.value == before
@@ -299,14 +297,11 @@ def test_linear_retarder(make):
     np.testing.assert_allclose(made.std.value, expected, rtol=1e-6)
 
 
-def test_optics_without_the_quantity_are_refused(full_rank):
+def test_optics_without_the_quantity_and_other_wavelengths_are_refused(full_rank):
     with pytest.raises(ChainError, match="has no retardance"):
         derived_retardance(full_rank, "wollaston")
     with pytest.raises(ChainError, match="no optic 'quarter'"):
         derived_retardance(full_rank, "quarter")
-
-
-def test_mueller_at_other_wavelengths_is_refused(full_rank):
     with pytest.raises(ParameterError, match="calibrated wavelengths only"):
         derived_mueller(full_rank, AT, LAM * 1.01)
     assert derived_mueller(full_rank, AT, LAM.to(u.nm)).value.shape == (2, 3, 4, 4)
@@ -410,9 +405,7 @@ def test_positions_must_determine_q_and_u(full_rank):
     ]:
         with pytest.raises(error, match=message):
             derived_sky(full_rank, 0.1, 0.0, positions)
-
-
-def test_unphysical_source_is_refused(full_rank):
+    # unphysical source is refused
     with pytest.raises(ParameterError, match="more than 100 %"):
         derived_sky(full_rank, 0.9, 0.9, AT)
 
@@ -433,9 +426,7 @@ def test_file_gives_the_same_errors_where_all_is_determined(full_rank, from_file
             rtol=1e-5,
             atol=1e-12,
         )
-
-
-def test_file_holds_no_data_to_predict(from_file):
+    # file holds no data to predict
     with pytest.raises(CalibrationFileError, match="holds no observations"):
         derived_data(from_file)
 

@@ -26,16 +26,6 @@ LAM = [1.2, 1.6, 2.2] * u.um
 FAINT = {"flux": 1e6, "read_noise": 500.0}
 
 
-@pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
-def measurement(make, chain):
-    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
-
-
 def fit(measurement, weights=1.0, steps=4):
     """Gauss-Newton from the truth, which is close enough."""
     vector = measurement.vector()
@@ -147,15 +137,18 @@ def test_calibration_brings_its_weights(chain, measurement):
     assert "agree with the noise" in same.words
 
 
-def test_wrong_model_is_found(make, measurement):
-    """A linear derotator fitted to data of an elliptical one."""
+def test_wrong_model_is_found(make):
+    """A linear derotator fitted to data of an elliptical one, by stated noise and replicates."""
     truth = make.truth(make.chain("elliptical", wavelength=LAM))
-    data = make.observe(truth, wavelength=LAM, seed=3)
+    twice = np.repeat([45, 70, 95, 120], 2) * u.deg
+    data = make.observe(truth, make.frames(twice), LAM, seed=3)
     cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
     test = lack_of_fit(cal.measurement, cal)
     assert test.p_value < 1e-12
     assert (test.table["p_value"] < 1e-12).all()
     assert "the model misses something" in test.words
+    test = lack_of_fit(cal.measurement, cal, noise_from_replicates(cal.measurement))
+    assert test.p_value < 1e-12
 
 
 def test_errors_that_stand_on_a_noise_given_are_held_against_it(chain, measurement):
@@ -213,40 +206,6 @@ def test_f_test_with_replicates_is_calibrated(make, chain):
     assert test.expected == pytest.approx(96 - m.free.size - 3 * 16, abs=1)
     assert uniform(total) > 0.01
     assert uniform(single) > 0.01
-
-
-def test_wrong_model_is_found_by_replicates(make):
-    truth = make.truth(make.chain("elliptical", wavelength=LAM))
-    twice = np.repeat([45, 70, 95, 120], 2) * u.deg
-    data = make.observe(truth, make.frames(twice), LAM, seed=3)
-    cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
-    test = lack_of_fit(cal.measurement, cal, noise_from_replicates(cal.measurement))
-    assert test.p_value < 1e-12
-
-
-def test_verdicts_hold_where_wavelengths_share_their_noise_and_none_is_stated(make):
-    """A true model agrees with flicker of all wavelengths, and with photons of uneven spectra."""
-    lam = make.charis.wavelength
-    chain = make.truth(make.chain(wavelength=lam))
-    frames = make.frames(np.repeat([50, 65, 80], 3) * u.deg)
-    spectrum = 1e7 * np.exp(-0.5 * np.linspace(-2, 2, lam.size) ** 2)
-    sharing, bare, rng = [], [], np.random.default_rng(5)
-    for seed in range(24):
-        table = simulate(chain, lam, frames, flux=spectrum, seed=seed).to_table()
-        table.remove_columns(["flux_right_err", "flux_left_err"])
-        plain = Measurement(chain, Observations.from_table(table, name="photons"))
-        vector = fit(plain)
-        bare.append(lack_of_fit(plain, vector, noise_from_roughness(plain, vector)).p_value)
-        flicker = np.repeat(rng.normal(0, 2e-3, len(frames)), lam.size)
-        table["flux_right"] = table["flux_right"] * (1 + flicker)
-        table["flux_left"] = table["flux_left"] * (1 - flicker)
-        m = Measurement(chain, Observations.from_table(table, name="flicker"))
-        vector = fit(m)
-        for noise in (noise_from_replicates, noise_from_null_channel):
-            sharing.append(lack_of_fit(m, vector, noise(m, vector)).p_value)
-    for found in (bare, sharing):
-        found = np.array(found)
-        assert np.mean((found < 0.01) | (found > 0.99)) < 0.1
 
 
 # --- priors --------------------------------------------------------------------------
@@ -394,3 +353,28 @@ def test_charis_residuals_are_no_noise(charis_data):
         assert (test.table["p_value"] < 1e-12).all(), (number, low, high)
         null = noise_from_null_channel(cal.measurement, null_model="smooth")
         assert lack_of_fit(cal.measurement, cal, null).p_value < 1e-12, (number, low, high)
+
+
+def test_verdicts_hold_where_wavelengths_share_their_noise_and_none_is_stated(make):
+    """A true model agrees with flicker of all wavelengths, and with photons of uneven spectra."""
+    lam = make.charis.wavelength
+    chain = make.truth(make.chain(wavelength=lam))
+    frames = make.frames(np.repeat([50, 65, 80], 3) * u.deg)
+    spectrum = 1e7 * np.exp(-0.5 * np.linspace(-2, 2, lam.size) ** 2)
+    sharing, bare, rng = [], [], np.random.default_rng(5)
+    for seed in range(24):
+        table = simulate(chain, lam, frames, flux=spectrum, seed=seed).to_table()
+        table.remove_columns(["flux_right_err", "flux_left_err"])
+        plain = Measurement(chain, Observations.from_table(table, name="photons"))
+        vector = fit(plain)
+        bare.append(lack_of_fit(plain, vector, noise_from_roughness(plain, vector)).p_value)
+        flicker = np.repeat(rng.normal(0, 2e-3, len(frames)), lam.size)
+        table["flux_right"] = table["flux_right"] * (1 + flicker)
+        table["flux_left"] = table["flux_left"] * (1 - flicker)
+        m = Measurement(chain, Observations.from_table(table, name="flicker"))
+        vector = fit(m)
+        for noise in (noise_from_replicates, noise_from_null_channel):
+            sharing.append(lack_of_fit(m, vector, noise(m, vector)).p_value)
+    for found in (bare, sharing):
+        found = np.array(found)
+        assert np.mean((found < 0.01) | (found > 0.99)) < 0.1

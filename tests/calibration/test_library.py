@@ -94,14 +94,6 @@ def test_hash_is_that_of_the_content(calibration, tmp_path):
     assert content_hash(with_validity(calibration, mode="J")) != content_hash(calibration)
 
 
-def test_end_is_not_included():
-    held = Validity(valid_from="2025-10-01", valid_until="2025-12-01")
-    assert held.holds("2025-10-01")
-    assert held.holds("2025-11-30T23:59:59")
-    assert not held.holds("2025-12-01")
-    assert not held.holds("2025-09-30T23:59:59")
-
-
 @given(st.datetimes(datetime.datetime(1990, 1, 1), datetime.datetime(2090, 1, 1)))
 def test_moments_compare_as_times_do(moment):
     start = Time("2025-10-05T09:30:00.250")
@@ -130,13 +122,6 @@ def test_validity_of_an_unknown_instrument(calibration):
     other = dataclasses.replace(calibration, settings=calibration.settings | {"instrument": "lab"})
     assert validity_of(other).optics_in is None
     assert "not known" in str(validity_of(other))
-
-
-def test_month_alone_is_its_first_day(calibration):
-    record = dataclasses.replace(calibration.datasets[0], meta={"date": "2025-02"})
-    assert validity_of(dataclasses.replace(calibration, datasets=[record])).valid_from == (
-        "2025-02-01"
-    )
 
 
 # ---- looking up --------------------------------------------------------------------------

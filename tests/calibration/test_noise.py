@@ -94,9 +94,7 @@ def test_impossible_gain_is_refused(faint):
             noise_from_errors(faint, **settings)
         with pytest.raises(FitError, match="read_noise = -1"):
             noise_from_errors(faint, gain=1.0, read_noise=-1.0)
-
-
-def test_table_without_errors_needs_a_gain(faint):
+    # table without errors needs a gain
     table = faint.datasets[0].observations.to_table()
     table.remove_columns(["flux_right_err", "flux_left_err"])
     bare = Measurement(faint.chains[0], Observations.from_table(table))
@@ -147,12 +145,10 @@ def test_small_differences_of_position_are_modelled(make, strong):
         noise_from_replicates(measurement, tolerance=0.01 * u.deg)
 
 
-def test_nothing_repeated_is_said(faint):
+def test_nothing_repeated_is_said(faint, make, chain):
     with pytest.raises(FitError, match="simulated: no two data at the same settings"):
         noise_from_replicates(faint)
-
-
-def test_other_states_of_a_modulator_are_no_replicates(make, chain):
+    # other states of a modulator are no replicates
     frames = make.frames(TWICE)
     frames["flc_state"] = np.tile(np.repeat(["A", "B"], 8), 8)
     data = simulate(chain, LAM, frames, seed=1, **FAINT)

@@ -20,7 +20,6 @@ from astropolcal.calibration.result.calibration import (
     validity_of,
 )
 from astropolcal.calibration.system import at_wavelengths, match_wavelengths, split_chain
-from astropolcal.chain import leaves
 from astropolcal.exceptions import (
     CalibrationFileError,
     ChainError,
@@ -79,17 +78,13 @@ def test_between_the_grid_a_law_answers_and_a_table_does_not():
     np.testing.assert_allclose(lam.value, [1400, 1600])
     with pytest.raises(WavelengthRangeError, match=r"1400\.00 nm is none of the 3.*wollaston\.eff"):
         match_wavelengths(GRID, _several(), [1400, 1600] * u.nm)
-
-
-def test_beyond_the_grid_nothing_answers():
+    # beyond the grid nothing answers
     for wanted in [1100, 2300]:
         with pytest.raises(
             WavelengthRangeError, match=rf"{wanted}\.00 nm is outside.*1200\.00 nm to 2200"
         ):
             match_wavelengths(GRID, _law(), wanted * u.nm)
-
-
-def test_a_wavelength_has_a_unit_of_length():
+    # a wavelength has a unit of length
     for wanted in [1600, "H", 1600 * u.s]:
         with pytest.raises(ParameterError, match="needs a unit such as nm"):
             match_wavelengths(GRID, _several(), wanted)
@@ -118,9 +113,7 @@ def test_a_chain_is_split_where_the_instrument_begins():
     # the axes of the telescope are stages, but not the instrument's
     assert [leaf.name for leaf in outer] == ["parallactic", "m3", "altitude"]
     assert inner[0].name == "hwp"
-
-
-def test_a_chain_without_stages_is_all_instrument():
+    # a chain without stages is all instrument
     outer, inner = split_chain(optics.Diattenuator(name="a") | optics.WollastonPrism(name="b"))
     assert [len(outer), len(inner)] == [0, 2]
 
@@ -173,9 +166,7 @@ def test_chains_that_cannot_be_told_apart_are_named():
         inner_optics(_with_and_without(), ["lens"], label="mine")
     with pytest.raises(ChainError, match="no chain without hwp"):
         inner_optics(_with_and_without(), beam={"hwp": False})
-
-
-def test_equal_chains_are_one():
+    # equal chains are one
     cal = _with_and_without()
     cal.chains = [cal.chains[0], cal.chains[0].copy()]
     assert len(inner_optics(cal)) == 3
@@ -244,6 +235,13 @@ def test_angles_of_frames_are_in_radian():
     # a copy: a pipeline may write into it
     frames.frames["hwp"][0] = 0 * u.deg
     np.testing.assert_allclose(frames.position("hwp")[0], np.deg2rad(22.5))
+    # two turns are the most an encoder counts
+    frames = FrameAngles([_header(D_IMRANG=-720.0), _header(D_IMRANG=720.0)], CHARIS)
+    np.testing.assert_allclose(frames.position("derotator"), [-4 * np.pi, 4 * np.pi])
+    # cards of a real header will do
+    header = fits.Header(_header().items())
+    assert describe(header)["instrument"] == "charis"
+    np.testing.assert_allclose(FrameAngles([header], CHARIS).position("hwp"), np.deg2rad(22.5))
 
 
 def test_angles_that_cannot_be_used():
@@ -257,16 +255,13 @@ def test_angles_that_cannot_be_used():
     ]:
         with pytest.raises(error, match=words):
             FrameAngles(headers, CHARIS).position("derotator")
-
-
-def test_a_stage_without_a_keyword():
+    # a stage without a keyword
     with pytest.raises(ObservationError, match="'wheel': no keyword is known for it"):
         FrameAngles([_header()], CHARIS).position("wheel")
-
-
-def test_two_turns_are_the_most_an_encoder_counts():
-    frames = FrameAngles([_header(D_IMRANG=-720.0), _header(D_IMRANG=720.0)], CHARIS)
-    np.testing.assert_allclose(frames.position("derotator"), [-4 * np.pi, 4 * np.pi])
+    # an instrument without files has no map
+    instrument = SimpleNamespace(name="lab", files=None, headers=None)
+    with pytest.raises(InstrumentError, match="lab: no map of header keywords; give positions"):
+        FrameAngles([_header()], instrument)
 
 
 def test_positions_on_sky_may_be_sexagesimal_or_degrees():
@@ -282,18 +277,6 @@ def test_positions_on_sky_may_be_sexagesimal_or_degrees():
         FrameAngles([_header(RA="north", DEC="0")], CHARIS)
 
 
-def test_cards_of_a_real_header_will_do():
-    header = fits.Header(_header().items())
-    assert describe(header)["instrument"] == "charis"
-    np.testing.assert_allclose(FrameAngles([header], CHARIS).position("hwp"), np.deg2rad(22.5))
-
-
-def test_an_instrument_without_files_has_no_map():
-    instrument = SimpleNamespace(name="lab", files=None, headers=None)
-    with pytest.raises(InstrumentError, match="lab: no map of header keywords; give positions"):
-        FrameAngles([_header()], instrument)
-
-
 # --- statements ---------------------------------------------------------------------------------
 
 
@@ -307,9 +290,7 @@ def test_sets_of_optics_have_one_form():
     ]:
         assert optics_sets(given) == sets, words
         assert optics_words(sets) == words, words
-
-
-def test_what_is_no_set_of_optics():
+    # what is no set of optics
     for given in ["nbs", [1], ["nbs", ["a"]], [["a", 2]]]:
         with pytest.raises(CalibrationFileError, match="names of optics are needed"):
             optics_sets(given)
@@ -335,7 +316,7 @@ def test_validity_in_words_and_as_a_dictionary():
     )
 
 
-def test_the_start_belongs_to_the_range_and_the_end_does_not():
+def test_range_of_a_validity():
     for date, inside in [
         ("2025-09-30T23:59:59.999", False),
         ("2025-10-01", True),
@@ -346,9 +327,7 @@ def test_the_start_belongs_to_the_range_and_the_end_does_not():
         assert Validity(valid_from="2025-10-01", valid_until="2026-01-01").holds(date) == inside, (
             inside
         )
-
-
-def test_without_limits_every_moment_is_inside():
+    # without limits every moment is inside
     assert Validity().holds("1999-01-01")
     assert Validity(valid_until="2000-01-01").holds("1999-01-01")
     assert not Validity(valid_until="2000-01-01").holds("2001-01-01")
@@ -366,9 +345,7 @@ def test_start_is_the_first_date_that_is_one():
         chain = _several()
         cal = _calibration(*[chain] * len(dates), metas=[{"date": d} for d in dates])
         assert validity_of(cal).valid_from == start, start
-
-
-def test_date_that_cannot_be_read_does_not_pass_for_any_date():
+    # date that cannot be read does not pass for any date
     cal = _calibration(
         _several(), _several(), metas=[{"date": "2025-10-05"}, {"date": "5 Oct 2025"}]
     )
@@ -389,12 +366,6 @@ def test_nonsense_in_a_file_is_told():
         validity_of(cal)
     with pytest.raises(CalibrationFileError, match="validity: no 'color'; allowed are mode"):
         with_validity(cal, color="red")
-
-
-def test_stating_nothing_changes_nothing():
+    # stating nothing changes nothing
     cal = _calibration(_several())
     assert with_validity(cal) is cal
-
-
-def test_leaves_of_the_test_chain_are_what_it_says():
-    assert [leaf.name for leaf in leaves(_several())] == ["hwp", "wollaston"]

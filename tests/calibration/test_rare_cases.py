@@ -44,11 +44,6 @@ ANGLES = [45, 60, 80, 100] * u.deg
 
 
 @pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
 def data(make, chain):
     return make.observe(chain, half_wave_plate_cycles(derotator=ANGLES), LAM, seed=3)
 
@@ -281,13 +276,10 @@ def test_a_group_that_alone_determines_something_is_named(make, chain, monkeypat
 # --- derived quantities, stars, targets -----------------------------------------------------
 
 
-def test_a_chain_without_a_beam_splitter_has_no_efficiency():
+def test_a_chain_without_a_beam_splitter_or_that_stands_still():
     plain = optics.LinearRetarder(retardance=90 * u.deg, name="plate")
     with pytest.raises(ChainError, match="no optic of the chain has an efficiency"):
         derived_efficiency(SimpleNamespace(chains=[plain], wavelength=LAM))
-
-
-def test_a_chain_that_stands_still_has_no_sky():
     still = optics.Diattenuator(name="mirror") | optics.WollastonPrism(name="wollaston")
     calibration = SimpleNamespace(chains=[still], wavelength=LAM, ties={})
     with pytest.raises(ChainError, match="no optic on a stage; give the chain from the sky"):
@@ -319,9 +311,7 @@ def test_errors_of_a_catalogue_lie_along_and_across_its_polarization():
             np.testing.assert_allclose(table["aolp_known"].value, theta, atol=1e-9)
             np.testing.assert_allclose(table["dolp_known_err"].value, dolp, atol=1e-6)
             np.testing.assert_allclose(table["aolp_known_err"].value, aolp, atol=1e-6)
-
-
-def test_a_star_of_no_polarization_has_no_angle():
+    # a star of no polarization has no angle
     table = QTable({"wavelength": [1.2] * u.um})
     _add_known(table, np.zeros(1), np.zeros(1), 1e-8 * np.eye(2)[None])
     assert np.isnan(table["aolp_known"][0])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal import calibrate, instruments, optics
 from astropolcal.calibration import examine
 from astropolcal.calibration.identifiability.analysis import (
     harmonic_conditions,
@@ -35,9 +35,7 @@ def test_condition_numbers():
     ]:
         found = harmonic_conditions(np.deg2rad(np.arange(n) * 11.25))
         np.testing.assert_allclose(list(found.values()), expected, rtol=1e-3)
-
-
-def test_too_few_angles_separate_nothing():
+    # too few angles separate nothing
     found = harmonic_conditions(np.deg2rad([0, 45, 22.5, 67.5]))
     assert found[(0, 4)] == pytest.approx(np.sqrt(2))
     assert found[(0, 2, 4)] == np.inf
@@ -101,15 +99,11 @@ def test_all_mirror_solutions_of_free_retarders():
     measurement = _measurement(_polarimeter())
     found = _mirrors(measurement)
     assert [words.split(":")[0] for words in found] == ["hwp", "derotator", "hwp, derotator"]
-
-
-def test_bounds_exclude_mirror_solutions():
+    # bounds exclude mirror solutions
     bounds = dict.fromkeys(("horizontal", "diagonal", "circular"), (0, 360))
     measurement = _measurement(_polarimeter(bounds=bounds))
     assert [w.split(":")[0] for w in _mirrors(measurement)] == ["hwp"]
-
-
-def test_a_waveplate_of_two_layers_has_no_other_hand():
+    # a waveplate of two layers has no other hand
     chain = CHARIS.chain("polarized", wavelength=WAVELENGTH)
     measurement = _measurement(chain)
     found = _mirrors(measurement)
@@ -206,10 +200,3 @@ def test_a_run_can_be_examined_before_it_is_fitted(calibration):
     chain = calibration.chain
     planned = examine(Measurement(chain, simulate(chain, WAVELENGTH, frames, noise=False)))
     assert len(planned.sampling) == 1 < len(before.sampling)
-
-
-def test_the_report_is_in_the_file(calibration, tmp_path):
-    calibration.write(tmp_path / "cal.asdf")
-    again = Calibration.read(tmp_path / "cal.asdf")
-    assert again.to_dict() == calibration.to_dict()
-    assert str(again.identifiability) == str(calibration.identifiability)

@@ -348,15 +348,15 @@ def test_log_prob_belongs_to_the_chain(small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("thin", [1, 4])
-@pytest.mark.parametrize("interval", [1, 7, 100])
-def test_resumed_chain_is_the_uninterrupted_one(small, tmp_path, thin, interval):
-    path = tmp_path / "chain.h5"
-    options = {"checkpoint": path, "checkpoint_every": interval, "thin": thin}
-    for n_steps in (20, 33, 60):
-        found = quiet_sample(small, **(RUN | {"n_steps": n_steps}), **options)
-        assert len(found.chain) == n_steps // thin
-    assert found == quiet_sample(small, **RUN, thin=thin)
+def test_resumed_chain_is_the_uninterrupted_one(small, tmp_path):
+    for interval in [1, 7, 100]:
+        for thin in [1, 4]:
+            path = tmp_path / f"chain{thin}_{interval}.h5"
+            options = {"checkpoint": path, "checkpoint_every": interval, "thin": thin}
+            for n_steps in (20, 33, 60):
+                found = quiet_sample(small, **(RUN | {"n_steps": n_steps}), **options)
+                assert len(found.chain) == n_steps // thin, (interval, thin)
+            assert found == quiet_sample(small, **RUN, thin=thin), (interval, thin)
 
 
 def test_shorter_run_than_the_checkpoint_reads_its_beginning(small, tmp_path):
@@ -481,20 +481,24 @@ def test_truncated_checkpoint_goes_on_from_its_last_whole_step(small, tmp_path):
         quiet_sample(small, **RUN, checkpoint=path)
 
 
-@pytest.mark.parametrize("torn", [0, 37, 59])
-def test_steps_from_a_damaged_one_on_are_computed_again(small, tmp_path, torn, monkeypatch):
-    path = tmp_path / "chain.h5"
-    whole = quiet_sample(small, **RUN, checkpoint=path)
-    steps, start = stored_steps(path)
-    content = bytearray(path.read_bytes())
-    content[start + torn * steps.itemsize + 5] ^= 0x5A
-    path.write_bytes(content)
-    kept, append = [], checkpoint_module.Chain.append
-    monkeypatch.setattr(
-        checkpoint_module.Chain, "append", lambda *a: (append(*a), kept.append(a[0].count))
-    )
-    assert quiet_sample(small, **RUN, checkpoint=path) == whole
-    assert kept == list(range(torn + 1, 61))
+def test_steps_from_a_damaged_one_on_are_computed_again(small, tmp_path):
+    for torn in (0, 37, 59):
+        path = tmp_path / f"chain{torn}.h5"
+        whole = quiet_sample(small, **RUN, checkpoint=path)
+        steps, start = stored_steps(path)
+        content = bytearray(path.read_bytes())
+        content[start + torn * steps.itemsize + 5] ^= 0x5A
+        path.write_bytes(content)
+        kept, append = [], checkpoint_module.Chain.append
+
+        def counted(chain, *parts, append=append, kept=kept):
+            append(chain, *parts)
+            kept.append(chain.count)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(checkpoint_module.Chain, "append", counted)
+            assert quiet_sample(small, **RUN, checkpoint=path) == whole, torn
+        assert kept == list(range(torn + 1, 61)), torn
 
 
 def test_steps_that_another_run_has_left_behind_are_computed_again(small, tmp_path):
@@ -631,11 +635,13 @@ def test_no_place_to_start(small, monkeypatch):
         sample(small, **RUN)
 
 
-@pytest.mark.parametrize("package", ["emcee", "h5py"])
-def test_missing_package(small, tmp_path, monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(AstropolcalError, match=rf'{package}, .*pip install "astropolcal\[mcmc\]"'):
-        sample(small, **RUN, checkpoint=tmp_path / "chain.h5")
+def test_missing_package(small, tmp_path):
+    for package in ("emcee", "h5py"):
+        words = rf'{package}, .*pip install "astropolcal\[mcmc\]"'
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(sys.modules, package, None)
+            with pytest.raises(AstropolcalError, match=words):
+                sample(small, **RUN, checkpoint=tmp_path / "chain.h5")
 
 
 def test_short_chain_warns(small):

@@ -23,11 +23,6 @@ META = {"source": "polarized"}
 
 
 @pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
 def observations(make, chain):
     return make.observe(chain, wavelength=LAM, seed=1, meta=META, name="lamp")
 
@@ -145,12 +140,6 @@ def test_observable_and_ties_are_those_of_the_calibration(make, chain, observati
     direct = cal.measurement_of(standard)
     rms = [100 * np.sqrt(np.mean(direct.residuals()[direct.bins == i] ** 2)) for i in range(3)]
     np.testing.assert_allclose(percent(table["s_standard"]), rms)
-
-
-def test_a_calibration_from_a_file_predicts_the_same(tmp_path, calibrated, chain, standard):
-    calibrated.write(tmp_path / "cal.asdf")
-    read = standard_accuracy(Calibration.read(tmp_path / "cal.asdf"), chain, standard)
-    np.testing.assert_allclose(read["chi"], standard_accuracy(calibrated, chain, standard)["chi"])
 
 
 # --- what is refused ---------------------------------------------------------------------

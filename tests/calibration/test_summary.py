@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
-import pytest
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
@@ -77,6 +76,9 @@ def test_long_lines_are_broken_behind_their_bullet():
     assert lines[1].startswith("    word")
     assert lines[-2:] == ["short", ""]
     assert " ".join(" ".join(lines).split()) == " ".join((long + " short").split())
+    # elements in words are named by their wavelength
+    (words,) = _wrap(_calibration(), ["hwp.retardance[1] by +1 deg, a.b[9]"])
+    assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
 
 
 def test_heading():
@@ -115,9 +117,7 @@ def test_a_parameter_for_all_wavelengths():
     ]:
         (line,) = parameter_lines({"a.theta": entry}, several=False)
         assert line == f"  {'a.theta':<28}{words}"
-
-
-def test_fixed_ones_and_those_of_a_wavelength_are_not_among_them():
+    # fixed ones and those of a wavelength are not among them
     known = {"a.b": _entry(1.0, fixed=True), "c.d": _entry([1.0, 2.0], [0.01, np.nan])}
     assert parameter_lines(known, several=False) == []
     (line,) = parameter_lines(known)
@@ -155,9 +155,7 @@ def test_accuracy_of_a_dataset_says_what_is_masked_and_why():
     assert lines[2].split() == ["median", "2.000", "-", "-", "-"]
     assert lines[-1] == "  (16 frames x 3 wavelengths, 5 cells masked; cloud: 3; hot: 2)"
     assert _accuracy_lines(_record(), {})[-1] == "  (16 frames x 3 wavelengths)"
-
-
-def test_a_table_from_before_a_column_existed():
+    # a table from before a column existed
     record = _record(s_res=np.ones(3))
     record.accuracy.remove_column("s_standard")
     assert _accuracy_lines(record, {})[2].split()[-1] == "-"
@@ -276,11 +274,6 @@ def test_what_is_at_a_bound_and_what_hangs_on_it():
     )
 
 
-def test_elements_in_words_are_named_by_their_wavelength():
-    (words,) = _wrap(_calibration(), ["hwp.retardance[1] by +1 deg, a.b[9]"])
-    assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
-
-
 def test_row_of_a_target_has_a_dash_for_what_is_not_known():
     columns = {key: [0.2, 0.2, np.inf] for key in ("s_Q", "s_U", "s_p")}
     table = QTable({key: value * u.percent for key, value in columns.items()})
@@ -328,9 +321,7 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         "on sky the AoLP changes by up to 0.3 deg and the DoLP by up to 0.02 % of itself, "
         "regardless of the DoLP",
     ]
-
-
-def test_many_open_directions_are_counted():
+    # many open directions are counted
     cal = _with_directions(
         _direction(f"a.b{i} by +1 deg cannot be distinguished", 1.0) for i in range(5)
     )
@@ -338,20 +329,21 @@ def test_many_open_directions_are_counted():
     assert open_lines(_with_directions([])) == []
 
 
-@pytest.mark.parametrize(("n", "shown", "says"), [(7, 7, None), (12, 12, None), (22, 5, 5)])
-def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
+def test_mirrors_at_all_of_a_few_wavelengths(monkeypatch):
     from astropolcal.calibration.result import summary as _sky_summary
 
-    def values(calibration, name):
-        keys = ["diattenuation", "diattenuation_err"]
-        keys += [f"diattenuation_{metal}" for metal in _sky_summary.METALS]
-        return QTable({key: np.ones(n) * u.percent for key in keys}, meta={"name": name})
+    for n, shown, says in [(7, 7, None), (12, 12, None), (22, 5, 5)]:
 
-    monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
-    monkeypatch.setattr(_sky_summary, "mirror_values", values)
-    title, _, *rows = mirror_lines(_calibration(wavelength=np.linspace(600, 800, n) * u.nm))
-    assert len(rows) == shown
-    assert title.endswith(f"one in {says} of {n} wavelengths" if says else "at 45 deg")
+        def values(calibration, name, n=n):
+            keys = ["diattenuation", "diattenuation_err"]
+            keys += [f"diattenuation_{metal}" for metal in _sky_summary.METALS]
+            return QTable({key: np.ones(n) * u.percent for key in keys}, meta={"name": name})
+
+        monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
+        monkeypatch.setattr(_sky_summary, "mirror_values", values)
+        title, _, *rows = mirror_lines(_calibration(wavelength=np.linspace(600, 800, n) * u.nm))
+        assert len(rows) == shown, (n, shown, says)
+        assert title.endswith(f"one in {says} of {n} wavelengths" if says else "at 45 deg"), n
 
 
 def test_a_mirror_unlike_any_metal_is_pointed_at(monkeypatch):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.calibration import Calibration, calibrate, four_accuracies
-from astropolcal.calibration.noise.scatter import GROUPS, groups_by, leave_out_groups
+from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
 from astropolcal.calibration.validation import paper_accuracies, target_accuracy
 from astropolcal.calibration.validation.cross_validation import (
     add_standard,
@@ -137,9 +137,7 @@ def test_other_accuracies_may_be_taken():
     np.testing.assert_allclose(percent(found["s_rel"]), [5, 10, 15])
     with pytest.raises(ParameterError, match="polarized: no column 's_rms'"):
         target_accuracy(1.0, 0 * u.deg, polarized=table, column="s_rms")
-
-
-def test_wavelengths_must_agree():
+    # wavelengths must agree
     star = accuracy(0.1, 0.1, 0.1, wavelength=LAM * 1.01)
     with pytest.raises(ParameterError, match="on_sky: 3 wavelengths from"):
         target_accuracy(1.0, 0 * u.deg, polarized=accuracy(1, 2, 3), on_sky=star)
@@ -174,8 +172,7 @@ def test_paper_range_for_a_target_of_1_percent(charis_data, shared_data):
     assert 2.3 < table["s_chi"].to_value(u.deg).max() < 3.8
 
 
-@pytest.mark.parametrize(("s_p", "s_chi"), [(0.02, 0.5), (0.12, 3.2)])
-def test_printed_ranges_of_the_paper_belong_together(shared_data, s_p, s_chi):
+def test_printed_ranges_of_the_paper_belong_together(shared_data):
     """
     Published: s_p from 0.02 to 0.12 % and s_chi from 0.5 to 3.2 deg, 1 % at 50 deg (Sec. 7.2).
 
@@ -188,19 +185,20 @@ def test_printed_ranges_of_the_paper_belong_together(shared_data, s_p, s_chi):
     def at(s_abs):
         return propagate_accuracy(1 * u.percent, 50 * u.deg, s_rel, s_abs * u.percent)
 
-    low, high = np.zeros(len(s_rel)), np.zeros(len(s_rel))
-    for edge, target in ((low, s_p - 0.005), (high, s_p + 0.005)):
-        inside = np.zeros(len(s_rel)), np.full(len(s_rel), 1.0)
-        for _ in range(40):
-            middle = (inside[0] + inside[1]) / 2
-            above = percent(at(middle)["s_p"]) > target
-            inside = np.where(above, inside[0], middle), np.where(above, middle, inside[1])
-        edge[:] = at(inside[0])["s_chi"].to_value(u.deg)
-    fits = (low < s_chi + 0.05) & (high > s_chi - 0.05)
-    assert fits.any()
-    # the largest errors are those of the J band, as the paper says
-    if s_p == 0.12:
-        assert (np.flatnonzero(fits) < 5).all()
+    for s_p, s_chi in [(0.02, 0.5), (0.12, 3.2)]:
+        low, high = np.zeros(len(s_rel)), np.zeros(len(s_rel))
+        for edge, target in ((low, s_p - 0.005), (high, s_p + 0.005)):
+            inside = np.zeros(len(s_rel)), np.full(len(s_rel), 1.0)
+            for _ in range(40):
+                middle = (inside[0] + inside[1]) / 2
+                above = percent(at(middle)["s_p"]) > target
+                inside = np.where(above, inside[0], middle), np.where(above, middle, inside[1])
+            edge[:] = at(inside[0])["s_chi"].to_value(u.deg)
+        fit = (low < s_chi + 0.05) & (high > s_chi - 0.05)
+        assert fit.any(), (s_p, s_chi)
+        # the largest errors are those of the J band, as the paper says
+        if s_p == 0.12:
+            assert (np.flatnonzero(fit) < 5).all(), (s_p, s_chi)
 
 
 # --- targets of a calibration ----------------------------------------------------------
@@ -297,37 +295,19 @@ def _scatter_of_star(observations):
 # --- groups -------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def chain(make):
-    return make.truth(make.chain(wavelength=LAM))
-
-
-@pytest.fixture(scope="module")
-def measurement(make, chain):
-    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
-
-
-def test_groups_by_derotator_are_those_of_the_accuracy(measurement):
-    np.testing.assert_array_equal(groups_by(measurement), leave_out_groups(measurement))
-
-
 def test_cycles_end_where_an_angle_comes_again(make, chain):
     data = make.observe(chain, make.frames([45, 45, 45, 80] * u.deg), LAM, seed=1)
     m = Measurement(chain, data)
     np.testing.assert_array_equal(groups_by(m, "cycle")[m.bins == 0], np.repeat(np.arange(4), 4))
     assert sorted(set(groups_by(m, "derotator"))) == [0, 1]
-
-
-def test_cycle_of_a_modulator_holds_both_states(make, chain):
+    # that of a modulator holds both states
     frames = make.frames([45, 45] * u.deg)
     frames = frames[np.repeat(np.arange(16), 2)]
     frames["flc_state"] = np.tile(["A", "B"], 16)
     m = Measurement(chain, make.observe(chain, frames, LAM, seed=1))
     groups = groups_by(m, "cycle")
     assert np.bincount(groups[m.bins == 0]).tolist() == [8, 8]
-
-
-def test_cycles_may_be_given(make, chain):
+    # cycles may be given
     frames = make.frames([45, 80, 110] * u.deg)
     frames["cycle"] = np.repeat([7, 7, 3], 8)
     m = Measurement(chain, make.observe(chain, frames, LAM, seed=1))
@@ -339,9 +319,11 @@ def test_datasets_are_groups(make, chain, measurement):
     both = Measurement(chain, [measurement.datasets[0].observations, other])
     np.testing.assert_array_equal(groups_by(both, "dataset"), np.repeat([0, 1], 96))
     assert len(set(groups_by(both, "derotator"))) == 16
+    # groups by derotator are those of the accuracy
+    np.testing.assert_array_equal(groups_by(measurement), leave_out_groups(measurement))
 
 
-def test_group_with_a_single_member_is_named(make, chain, measurement):
+def test_groups_with_a_single_member_are_named(make, chain, measurement):
     data = measurement.datasets[0].observations
     pairs = data.pairs()
     keep = np.concatenate([pairs[:9].ravel(), pairs[12:].ravel()])
@@ -351,9 +333,7 @@ def test_group_with_a_single_member_is_named(make, chain, measurement):
         groups_by(few, "derotator")
     with pytest.raises(FitError, match="group cycle number 2 of simulated has a single member"):
         groups_by(few, "cycle")
-
-
-def test_night_with_a_single_member_is_named(make, chain, measurement):
+    # a night
     night = measurement.datasets[0].observations
     pair = night.pairs()[0]
     short = night.select(pair)
@@ -362,17 +342,11 @@ def test_night_with_a_single_member_is_named(make, chain, measurement):
         groups_by(both, "dataset")
     with pytest.raises(FitError, match="all data are in one group"):
         groups_by(Measurement(chain, short), "dataset")
-
-
-def test_calibration_refuses_groups_with_a_single_member(make, chain, measurement):
-    for by in GROUPS:
-        night = measurement.datasets[0].observations
-        other = make.observe(chain, wavelength=LAM, seed=2)
-        cal = calibrate(chain, [night, other.select(other.pairs()[0])], cross_validate=False)
-        with pytest.raises(
-            FitError, match=f"cross-validation by {by}: group .* has a single member"
-        ):
-            cal.cross_validate(by)
+    # one group and unknown groups are refused
+    with pytest.raises(FitError, match="all data are in one group, dataset number 0"):
+        groups_by(measurement, "dataset")
+    with pytest.raises(FitError, match="groups = 'moon'; allowed are derotator, cycle, dataset"):
+        groups_by(measurement, "moon")
 
 
 def test_nights_predict_each_other(make, chain, measurement):
@@ -384,13 +358,6 @@ def test_nights_predict_each_other(make, chain, measurement):
         rms = [np.sqrt(np.mean(residuals[cal.measurement.bins[:96] == b] ** 2)) for b in range(3)]
         found = percent(cal.datasets[i].accuracy["s_cv"])
         np.testing.assert_allclose(found, 100 * np.array(rms), rtol=1e-4)
-
-
-def test_one_group_and_unknown_groups_are_refused(measurement):
-    with pytest.raises(FitError, match="all data are in one group, dataset number 0"):
-        groups_by(measurement, "dataset")
-    with pytest.raises(FitError, match="groups = 'moon'; allowed are derotator, cycle, dataset"):
-        groups_by(measurement, "moon")
 
 
 # --- four accuracies ----------------------------------------------------------------
@@ -412,14 +379,10 @@ def test_four_accuracies_side_by_side(make, chain, calibrated):
     # photon noise alone: an unseen dataset is as noisy as the fitted one
     np.testing.assert_allclose(table["s_standard"] / table["s_res"], 1, atol=0.5)
     assert table.meta["standard"] == "simulated"
-
-
-def test_standard_shows_what_the_fit_hides(make, chain, calibrated):
-    """Another derotator on the standard night: only s_standard tells."""
-    other = chain.copy()
-    other["derotator"].retardance = other["derotator"].retardance.quantity + 2 * u.deg
-    table = four_accuracies(calibrated, make.observe(other, wavelength=LAM, seed=8))
-    assert (table["s_standard"] > 10 * table["s_cv"]).all()
+    # no standard gives nan
+    table = four_accuracies(calibrated)
+    assert np.isnan(table["s_standard"]).all()
+    assert table.meta["groups"] == "as in the calibration"
 
 
 def test_standard_may_be_a_measurement_at_some_wavelengths(make, chain, calibrated):
@@ -465,12 +428,6 @@ def test_cross_validation_by_chosen_groups(make, chain):
     assert np.isfinite(given["s_cv"]).all()
 
 
-def test_no_standard_gives_nan(calibrated):
-    table = four_accuracies(calibrated)
-    assert np.isnan(table["s_standard"]).all()
-    assert table.meta["groups"] == "as in the calibration"
-
-
 def test_calibration_from_a_file_has_accuracies_but_no_data(tmp_path, make, chain, calibrated):
     calibrated.write(tmp_path / "cal.asdf")
     read = Calibration.read(tmp_path / "cal.asdf")
@@ -481,24 +438,3 @@ def test_calibration_from_a_file_has_accuracies_but_no_data(tmp_path, make, chai
     )
     with pytest.raises(CalibrationFileError, match="holds no observations"):
         four_accuracies(read, groups="cycle")
-
-
-@pytest.mark.slow
-def test_calibration_of_one_night_on_another_of_charis(charis_data):
-    """
-    Dataset 3 (October) predicts Dataset 1 (July, no beam switcher) far worse than itself.
-
-    A standard need not be a star; the optics have changed, which no s_cv can know.
-    """
-    from astropolcal import instruments
-
-    charis = instruments.get("charis")
-    october, july = (charis_data(f"dataset{n}_") for n in (3, 1))
-    cal = calibrate(charis.chains_for([october]), october)
-    (chain,) = charis.chains_for([july])
-    for name in ("calibration_polarizer", "hwp", "derotator", "wollaston"):
-        for key in chain[name].param_names:
-            value = getattr(cal.chain[name], key)
-            setattr(chain[name], key, value.quantity if value.unit else value.value)
-    table = four_accuracies(cal, Measurement(chain, july))
-    assert np.median(percent(table["s_standard"])) > 3 * np.median(percent(table["s_cv"]))

@@ -2,7 +2,6 @@
 """Whether a calibration is usable, why not, and that it is said in 24 lines of 80 columns."""
 
 import json
-import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +10,6 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-
-sys.path.append(str(Path(__file__).parents[1]))
-
 from star_data import observe_star, star_chain
 
 import astropolcal

@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import io
 import json
+import re
 
 import asdf
 import astropy.units as u
@@ -101,11 +102,7 @@ def test_all_of_it_comes_back(original, node):
     assert (tie.source, tie.factor, tie.offset.unit) == ("hwp.theta", -0.5, u.arcmin)
     assert again.datasets[0].n_masked == original.datasets[0].n_masked == 1
     assert again.measurement is None
-
-
-def test_a_node_of_a_node_is_the_same(node):
-    again = node_from_calibration(calibration_from_node(copy.deepcopy(node)))
-    assert again["checksum"] == node["checksum"]
+    assert node_from_calibration(again)["checksum"] == node["checksum"]
 
 
 @pytest.mark.slow
@@ -131,16 +128,9 @@ def test_offset_of_a_tie_without_a_unit(original):
     assert again == 0.25
 
 
-def test_the_node_tells_for_what_it_holds(node):
-    held = node["validity"]
-    assert held["dates"] == ["2025-05-01"]
-    assert held["optics_in_beam"] == [["polarizer", "hwp", "derotator", "wollaston"]]
-    assert set(node["written_with"]) == {"astropolcal", "asdf", "asdf-astropy", "astropy"}
-
-
-@pytest.mark.parametrize("key", ["validity", "written_with"])
-def test_what_is_for_readers_only_is_not_in_the_checksum(node, key):
-    calibration_from_node(node | {key: {"anything": 1}})
+def test_what_is_for_readers_only_is_not_in_the_checksum(node):
+    for key in ["validity", "written_with"]:
+        calibration_from_node(copy.deepcopy(node) | {key: {"anything": 1}})
 
 
 def test_everything_else_is(node):
@@ -169,13 +159,17 @@ def test_everything_else_is(node):
 
 def test_entries_of_one_name(node):
     for key, place, words in [
+        ("accuracy", None, "two columns of a table have the same name"),
         ("ties", 0, "'derotator.theta' is given twice"),
         ("stages", None, "is given twice in a list of parameters"),
         ("directions", None, "is given twice in a list of parameters"),
         ("priors", 0, "prior of 'derotator.retardance' is given twice"),
     ]:
         spoiled = copy.deepcopy(node)
-        if key == "directions":
+        if key == "accuracy":
+            table = spoiled["datasets"][0]["accuracy"]
+            table.append(table[0])
+        elif key == "directions":
             entry = {"words": "x", "parameters": [{"name": "a", "value": 1.0}] * 2}
             spoiled["identifiability"]["directions"].append(entry)
         elif key == "stages":
@@ -183,13 +177,6 @@ def test_entries_of_one_name(node):
         else:
             spoiled[key].append(spoiled[key][place])
         refused(spoiled, words)
-
-
-def test_two_columns_of_one_name(node):
-    node = copy.deepcopy(node)
-    table = node["datasets"][0]["accuracy"]
-    table.append(table[0])
-    refused(node, "two columns of a table have the same name")
 
 
 def test_a_value_with_something_else(node):
@@ -216,12 +203,13 @@ def test_wavelengths_that_are_none(node):
         refused(node | {"wavelength": wavelength}, words)
 
 
-@pytest.mark.parametrize("reshape", [np.transpose, np.ravel, lambda x: x[..., None]])
-def test_a_factor_of_another_shape(node, reshape):
+def test_a_factor_of_another_shape(node):
     """Of as many numbers: it must not be laid out as it fits."""
-    node = copy.deepcopy(node)
-    node["covariance"]["factor"] = reshape(node["covariance"]["factor"][:2])
-    refused(node, r"factor of the covariance has shape \(.*\); \(rank, \d+\) is needed")
+    factor = node["covariance"]["factor"][:2]
+    for other in (factor.T, factor.ravel(), factor[..., None]):
+        spoiled = copy.deepcopy(node)
+        spoiled["covariance"]["factor"] = other
+        refused(spoiled, r"factor of the covariance has shape \(.*\); \(rank, \d+\) is needed")
 
 
 # ---- values -----------------------------------------------------------------------------
@@ -326,19 +314,18 @@ def test_parts_that_do_not_belong_together(cal):
             check_calibration(spoiled)
 
 
-@pytest.mark.parametrize("part", ["covariance", "identifiability"])
-def test_parameters_in_another_order(cal, part):
-    names = getattr(cal, part).names
-    swapped = [names[1], names[0], *names[2:]]
-    setattr(cal, part, copy.copy(getattr(cal, part)))
-    if part == "covariance":
-        c = cal.covariance
-        cal.covariance = Covariance(swapped, [c.units[1], c.units[0], *c.units[2:]], c.matrix)
-    else:
-        cal.identifiability = dataclasses.replace(cal.identifiability, names=swapped)
-    words = f"{part} of '{names[1]}', where '{names[0]}' is free in the chains"
-    with pytest.raises(CalibrationFileError, match=words.replace("[", r"\[").replace("]", r"\]")):
-        check_calibration(cal)
+def test_parameters_in_another_order(cal):
+    c, finding = cal.covariance, cal.identifiability
+    names = [c.names[1], c.names[0], *c.names[2:]]
+    units = [c.units[1], c.units[0], *c.units[2:]]
+    assert finding.names == c.names
+    for part, other in (
+        ("covariance", Covariance(names, units, c.matrix)),
+        ("identifiability", dataclasses.replace(finding, names=names)),
+    ):
+        words = re.escape(f"{part} of '{names[0]}', where '{names[1]}' is free in the chains")
+        with pytest.raises(CalibrationFileError, match=words):
+            check_calibration(dataclasses.replace(cal, **{part: other}))
 
 
 def test_a_covariance_in_other_units(cal):
@@ -392,9 +379,7 @@ def test_a_node_of_the_first_version(original, node):
     assert again.to_dict() == original.to_dict()
     with pytest.raises(CalibrationFileError):
         calibration_from_node(sealed(old), CALIBRATION_TAG)
-
-
-def test_migrations_do_not_change_what_they_are_given(node):
+    # migrations do not change what they are given
     before = dict(node["settings"])
     MIGRATIONS[CALIBRATION_TAGS[0]](node)
     assert node["settings"] == before

@@ -70,7 +70,7 @@ def test_manifest_lists_the_tags_of_all_converters():
     assert manifest()["id"] == MANIFEST_URI
 
 
-def test_schema_has_the_parameters_and_units_of_the_class():
+def test_schema_has_the_parameters_units_and_settings_of_the_class():
     for name in sorted(OPTICS):
         cls = OPTICS[name]
         parameters = schema_of(name)["properties"]["parameters"]
@@ -83,9 +83,6 @@ def test_schema_has_the_parameters_and_units_of_the_class():
             unit = cls()._declared(key).unit
             kind = reference["$ref"].rpartition("/")[2]
             assert KINDS[kind] == (unit and unit.to_string()), f"{name}.{key}: {message}"
-
-
-def test_schema_has_the_settings_of_the_class():
     for name in sorted(OPTICS):
         schema = schema_of(name)
         assert set(schema["properties"]) == set(OPTICS[name]()._settings()) | {"parameters"}

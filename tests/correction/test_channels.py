@@ -21,9 +21,7 @@ EXPECTED = {
 }
 
 
-@pytest.fixture(params=CHANNELS)
-def channels(request):
-    return Channels(request.param, 4, PAIRS)
+EVERY = [Channels(observable, 4, PAIRS) for observable in CHANNELS]
 
 
 def matrix(channels):
@@ -32,35 +30,40 @@ def matrix(channels):
     return np.stack([channels.combine(one).ravel() for one in unit], axis=1)
 
 
-def test_numbers(channels):
-    np.testing.assert_array_equal(channels.combine(FLUX), EXPECTED[channels.observable])
+def test_numbers():
+    for channels in EVERY:
+        np.testing.assert_array_equal(channels.combine(FLUX), EXPECTED[channels.observable])
 
 
-def test_frames_of_the_units(channels):
-    expected = [[0], [1], [2], [3]] if channels.observable != "double" else PAIRS
-    np.testing.assert_array_equal(channels.units, expected)
+def test_frames_of_the_units():
+    for channels in EVERY:
+        expected = [[0], [1], [2], [3]] if channels.observable != "double" else PAIRS
+        np.testing.assert_array_equal(channels.units, expected)
 
 
-def test_images_are_combined_pixel_by_pixel(channels):
-    images = np.random.default_rng(1).normal(size=(2, 4, 3, 5, 6))
-    found = channels.combine(images)
-    one = channels.combine(images[:, :, 1, 2, 3])
-    np.testing.assert_allclose(found[:, :, 1, 2, 3], one, rtol=1e-14, atol=1e-15)
-    assert found.shape == (2, len(channels.units), 3, 5, 6)
+def test_images_are_combined_pixel_by_pixel():
+    for channels in EVERY:
+        images = np.random.default_rng(1).normal(size=(2, 4, 3, 5, 6))
+        found = channels.combine(images)
+        one = channels.combine(images[:, :, 1, 2, 3])
+        np.testing.assert_allclose(found[:, :, 1, 2, 3], one, rtol=1e-14, atol=1e-15)
+        assert found.shape == (2, len(channels.units), 3, 5, 6), channels.observable
 
 
-def test_variances_are_the_diagonal_of_the_propagated_covariance(channels):
+def test_variances_are_the_diagonal_of_the_propagated_covariance():
     """For independent beams: diag(M V M^T)."""
-    m, variances = matrix(channels), np.array([[4.0, 1.0, 9.0, 2.0], [3.0, 5.0, 7.0, 6.0]])
-    expected = np.diag(m @ np.diag(variances.ravel()) @ m.T)
-    np.testing.assert_allclose(channels.combine(variances, 2).ravel(), expected, rtol=1e-14)
+    for channels in EVERY:
+        m, variances = matrix(channels), np.array([[4.0, 1.0, 9.0, 2.0], [3.0, 5.0, 7.0, 6.0]])
+        expected = np.diag(m @ np.diag(variances.ravel()) @ m.T)
+        np.testing.assert_allclose(channels.combine(variances, 2).ravel(), expected, rtol=1e-14)
 
 
-def test_gains_of_beams_are_the_transposed_matrix(channels):
-    gain = np.random.default_rng(2).normal(size=(7, 2, len(channels.units)))
-    found = channels.to_beams(gain)
-    expected = gain.reshape(7, -1) @ matrix(channels)
-    np.testing.assert_allclose(found.reshape(7, -1), expected, rtol=1e-13, atol=1e-15)
+def test_gains_of_beams_are_the_transposed_matrix():
+    for channels in EVERY:
+        gain = np.random.default_rng(2).normal(size=(7, 2, len(channels.units)))
+        found = channels.to_beams(gain)
+        expected = gain.reshape(7, -1) @ matrix(channels)
+        np.testing.assert_allclose(found.reshape(7, -1), expected, rtol=1e-13, atol=1e-15)
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4))

@@ -50,13 +50,6 @@ def test_disk_comes_back_exactly(disk_frames, sky, charis):
         assert np.isnan(found.fractional_errors()["q"]).all(), observable
 
 
-def test_star_comes_back_exactly(star, sky, charis):
-    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
-    found = correct(sky, frames)
-    np.testing.assert_allclose(found.q, star.stokes[1] / star.stokes[0], atol=1e-10)
-    np.testing.assert_allclose(found.u, star.stokes[2] / star.stokes[0], atol=1e-10)
-
-
 def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
     """A camera that turns between frames; the rows refer to the sky, the images do not."""
     hwp, positions = track(1)
@@ -381,105 +374,6 @@ def test_single_differences_as_input(star, sky, charis):
     assert found.covariance.shape == (6, 22)
 
 
-def test_spectra(calibration, star, charis, track):
-    pytest.importorskip("specutils", reason="specutils is not installed")
-    ones = np.ones(star.right.shape)
-    frames = ScienceFrames.from_arrays(
-        star.right,
-        star.left,
-        charis.wavelength,
-        track()[1],
-        hwp=star.hwp,
-        variance_right=ones,
-        variance_left=ones,
-    )
-    found = correct(calibration, frames)
-    spectra = found.spectra()
-    assert set(spectra) == {"I", "q", "u"}
-    np.testing.assert_array_equal(spectra["q"].flux.value, found.q)
-    assert spectra["q"].spectral_axis.unit == charis.wavelength.unit
-    errors = found.fractional_errors("systematic")["q"]
-    np.testing.assert_array_equal(spectra["q"].meta["systematic"], errors)
-
-
-def test_an_aperture_sums(disk_frames, sky, charis):
-    found = correct(sky, frames_of(disk_frames, charis)).aperture(6)
-    rows, columns = np.indices((21, 21)) - 10
-    true = disk_frames[0][..., np.hypot(rows, columns) <= 6].sum(axis=-1)
-    np.testing.assert_allclose(found.stokes, true, atol=1e-9)
-    with pytest.raises(ParameterError, match="no pixel"):
-        correct(sky, frames_of(disk_frames, charis)).aperture(0)
-
-
-def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, seen):
-    """Weights by equal variances are equal weights, and so must be the covariances."""
-    positions = track(2)[1]
-    stokes = np.array([1e5, 2e4, -1e4])[:, None, None] * np.ones((22, 3))
-    beams = seen(sky, positions, charis.wavelength, stokes)
-    unequal = {f"variance_{beam}": np.full(beams[0].shape, v) for beam, v in zip(
-        ("right", "left"), (100.0, 900.0), strict=True)}  # fmt: skip
-    twice = [[0, 1], [2, 3], [4, 5], [6, 7]] * 2
-    shared = [[0, 1], [0, 5], [4, 1], [4, 5], [2, 3], [2, 7], [6, 3], [6, 7]]
-    for observable, pairs in (("single", None), ("double", shared), ("double", twice)):
-        frames = ScienceFrames.from_arrays(
-            *beams, charis.wavelength, positions, pairs=pairs, **unequal
-        )
-        equal, by_variance = (
-            correct(sky, frames, observable=observable, brightness="given", weights=weights)
-            for weights in (None, "variance")
-        )
-        scale = np.sqrt(equal.covariance[0])
-        np.testing.assert_allclose(by_variance.stokes, equal.stokes, rtol=1e-9)
-        np.testing.assert_allclose(
-            by_variance.covariance / scale**2, equal.covariance / scale**2, atol=1e-9
-        )
-    # what is masked is no weight
-    weights = np.ma.array([1e9] + 7 * [1.0], mask=[True] + 7 * [False])
-    with pytest.raises(ParameterError, match="weights = nan"):
-        correct(sky, frames, observable="single", weights=weights)
-
-
-def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
-    """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
-    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    chain, hwp = chain | optics.WollastonPrism(name="wollaston"), [0, 45, 22.5, 67.5] * u.deg
-    # the wavelengths are draws of the noise
-    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 1500, 25, 25))
-    known = {"variance_right": np.full(noise[0].shape, 900.0)}
-    known["variance_left"] = known["variance_right"]
-    for camera in ([0, 0, 0, 0], [90, 17, 30, 45], [20, 20, 20, 20]):
-        frames = ScienceFrames.from_arrays(
-            *noise, np.linspace(1, 2, 1500) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
-            **known,
-        )  # fmt: skip
-        star = correct(chain, frames, brightness="given").aperture(9)
-        claimed = star.error("Q").mean()
-        assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera
-
-
-def test_v_and_its_fraction(sky, charis, track, seen):
-    _, positions = track()
-    stokes = np.array([1e4, 100, 50, 30])[:, None] * np.ones(22)
-    right, left = seen(sky, positions, charis.wavelength, stokes)
-    frames = ScienceFrames.from_arrays(right, left, charis.wavelength, positions)
-    found = correct(sky, frames, components="IQUV")
-    np.testing.assert_allclose(found.v, 0.003, atol=1e-12)
-    assert list(found.stokes_axis.symbol) == ["I", "Q", "U", "V"]
-
-
-@pytest.mark.slow
-def test_too_few_angles(star, sky, charis):
-    keep = [0, 1]
-    positions = {k: v[keep] for k, v in star.positions.items()}
-    positions["hwp"] = positions["hwp"][[0, 0]]
-    positions = {k: v[[0, 0]] for k, v in positions.items()}
-    frames = ScienceFrames.from_arrays(
-        star.right[keep], star.left[keep], charis.wavelength, positions, names=["a", "b"]
-    )
-    with pytest.raises(ObservationError, match=r"Q and U are not determined .* 2 frames \(a, b\)"):
-        correct(sky, frames)
-
-
 def test_a_poor_wavelength_is_flagged(calibration, star, charis, track):
     from astropolcal import optics
     from astropolcal.chain import join, leaves
@@ -517,7 +411,7 @@ def test_open_calibrations_warn(open_calibration, star, charis):
     assert (known.polarization()["s_p_systematic"] < 1e-3).all()
 
 
-def test_bad_choices(star, sky, charis):
+def test_bad_choices(star, sky, charis, calibration):
     for settings, words in [
         ({"mode": "mueller"}, "mode = 'mueller'"),
         ({"weights": "photon"}, "weights = 'photon'"),
@@ -528,9 +422,7 @@ def test_bad_choices(star, sky, charis):
         frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
         with pytest.raises(ParameterError, match=words):
             correct(sky, frames, **settings)
-
-
-def test_frames_that_do_not_fit(star, charis, calibration):
+    # frames that do not fit
     with pytest.raises(ObservationError, match="22 wavelengths"):
         ScienceFrames.from_arrays(star.right, star.left, charis.wavelength[:5], star.positions)
     with pytest.raises(ObservationError, match="one shape"):
@@ -665,3 +557,49 @@ def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
             stated = np.hypot(errors[key], catalogue)
             assert np.sqrt(np.mean((getattr(found, key) / stated) ** 2)) < 1.7
             assert errors[key].max() < 2.5e-3
+
+
+def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, seen):
+    """Weights by equal variances are equal weights, and so must be the covariances."""
+    positions = track(2)[1]
+    stokes = np.array([1e5, 2e4, -1e4])[:, None, None] * np.ones((22, 3))
+    beams = seen(sky, positions, charis.wavelength, stokes)
+    unequal = {f"variance_{beam}": np.full(beams[0].shape, v) for beam, v in zip(
+        ("right", "left"), (100.0, 900.0), strict=True)}  # fmt: skip
+    twice = [[0, 1], [2, 3], [4, 5], [6, 7]] * 2
+    shared = [[0, 1], [0, 5], [4, 1], [4, 5], [2, 3], [2, 7], [6, 3], [6, 7]]
+    for observable, pairs in (("single", None), ("double", shared), ("double", twice)):
+        frames = ScienceFrames.from_arrays(
+            *beams, charis.wavelength, positions, pairs=pairs, **unequal
+        )
+        equal, by_variance = (
+            correct(sky, frames, observable=observable, brightness="given", weights=weights)
+            for weights in (None, "variance")
+        )
+        scale = np.sqrt(equal.covariance[0])
+        np.testing.assert_allclose(by_variance.stokes, equal.stokes, rtol=1e-9)
+        np.testing.assert_allclose(
+            by_variance.covariance / scale**2, equal.covariance / scale**2, atol=1e-9
+        )
+    # what is masked is no weight
+    weights = np.ma.array([1e9] + 7 * [1.0], mask=[True] + 7 * [False])
+    with pytest.raises(ParameterError, match="weights = nan"):
+        correct(sky, frames, observable="single", weights=weights)
+
+
+def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
+    """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    chain, hwp = chain | optics.WollastonPrism(name="wollaston"), [0, 45, 22.5, 67.5] * u.deg
+    # the wavelengths are draws of the noise
+    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 1500, 25, 25))
+    known = {"variance_right": np.full(noise[0].shape, 900.0)}
+    known["variance_left"] = known["variance_right"]
+    for camera in ([0, 0, 0, 0], [90, 17, 30, 45], [20, 20, 20, 20]):
+        frames = ScienceFrames.from_arrays(
+            *noise, np.linspace(1, 2, 1500) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
+            **known,
+        )  # fmt: skip
+        star = correct(chain, frames, brightness="given").aperture(9)
+        claimed = star.error("Q").mean()
+        assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera

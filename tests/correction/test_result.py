@@ -45,13 +45,16 @@ def images():
 # ---- Stokes parameters ---------------------------------------------------------------------
 
 
-def test_components_by_name(spectrum):
+def test_components_by_name(spectrum, images):
     for i, name in enumerate("IQU"):
         np.testing.assert_array_equal(spectrum[name], spectrum.stokes[i])
     assert spectrum.stokes_axis.symbol.tolist() == ["I", "Q", "U"]
     for name in ("V", "IQ", "", "q"):
         with pytest.raises(ParameterError, match=rf"component = '{name}'; allowed are I, Q, U"):
             spectrum[name]
+    # the repr tells the shape
+    assert repr(spectrum) == "<Corrected IQU of 2, mode stokes>"
+    assert repr(images) == "<Corrected IQU of 2 x 7 x 9, mode stokes>"
 
 
 def test_fractions_are_of_the_light():
@@ -63,11 +66,6 @@ def test_fractions_are_of_the_light():
     assert np.isnan(dark.q).tolist() == [False, True]
     dark.stokes[0, 1] = -5.0
     assert np.isnan(dark.u).tolist() == [False, True]
-
-
-def test_the_repr_tells_the_shape(spectrum, images):
-    assert repr(spectrum) == "<Corrected IQU of 2, mode stokes>"
-    assert repr(images) == "<Corrected IQU of 2 x 7 x 9, mode stokes>"
 
 
 # ---- errors --------------------------------------------------------------------------------
@@ -123,7 +121,7 @@ def test_q_phi_is_about_the_star():
             np.testing.assert_allclose(both, c[1, 1] + c[2, 2], rtol=1e-9)
 
 
-def test_an_aperture_is_a_sum_over_pixels():
+def test_an_aperture_is_a_sum_over_pixels(images):
     found = make((7, 9), centre=(5.0, 3.0))
     one = found.aperture(0.5)
     np.testing.assert_array_equal(one.stokes, found.stokes[:, :, 3, 5])
@@ -137,10 +135,11 @@ def test_an_aperture_is_a_sum_over_pixels():
     np.testing.assert_array_equal(elsewhere.stokes, found.stokes[:, :, 6, 0])
     assert cross.systematic is found.systematic
     assert cross.unit == u.electron
-
-
-def test_an_aperture_without_a_centre_is_in_the_middle(images):
+    # an aperture without a centre is in the middle
     np.testing.assert_array_equal(images.aperture(0.5).stokes, images.stokes[:, :, 3, 4])
+    # an aperture without errors
+    images.covariance = None
+    assert images.aperture(2).covariance is None
 
 
 def test_apertures_of_no_size(images):
@@ -149,19 +148,12 @@ def test_apertures_of_no_size(images):
             images.aperture(radius)
         with pytest.raises(ParameterError, match="no pixel is inside"):
             images.aperture(0.1, centre=(2.5, 2.5))
-
-
-def test_an_aperture_does_not_leave_the_images():
+    # an aperture does not leave the images
     found = make((7, 9), centre=(5.0, 3.0))
     found.aperture(3.5)
     words = r"radius = 3.6 leaves the images of 9 x 7 pixels; allowed around \(5, 3\) are up to 3.5"
     with pytest.raises(ParameterError, match=words):
         found.aperture(3.6)
-
-
-def test_an_aperture_without_errors(images):
-    images.covariance = None
-    assert images.aperture(2).covariance is None
 
 
 def test_what_is_asked_of_the_wrong_kind(spectrum, images):
@@ -216,10 +208,7 @@ def test_spectra_have_both_errors(spectrum):
         np.testing.assert_array_equal(one.meta["systematic"], expected)
         np.testing.assert_array_equal(one.spectral_axis.value, LAM.value)
         assert not one.mask.any()
-
-
-def test_what_is_not_known_is_masked(spectrum):
-    pytest.importorskip("specutils")
+    # what is not known is masked
     spectrum.stokes[1, 0] = np.nan
     found = spectrum.spectra()
     assert found["q"].mask.tolist() == [True, False]

@@ -70,14 +70,15 @@ def test_a_planted_cell_is_found_first_and_alone(name, cell, sizes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "size"), [("nonlinearity", 0.003), ("background_of_one_beam", 0.003)]
-)
-def test_an_error_of_the_detector_is_found(kind, size):
-    setup = SETUPS["charis"]()
-    found = chosen(setup, setup.with_detector(kind, size, seed=3))
-    assert kind in [candidate.cell.kind for candidate, _ in found.groups[0].members]
-    assert found.groups[0].probability > 0.9
+def test_an_error_of_the_detector_is_found():
+    for kind, size in [("nonlinearity", 0.003), ("background_of_one_beam", 0.003)]:
+        setup = SETUPS["charis"]()
+        found = chosen(setup, setup.with_detector(kind, size, seed=3))
+        assert kind in [candidate.cell.kind for candidate, _ in found.groups[0].members], (
+            kind,
+            size,
+        )
+        assert found.groups[0].probability > 0.9, (kind, size)
 
 
 @pytest.mark.slow

@@ -1,18 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A small instrument whose parameters all matter, and frames to look through it."""
 
-import sys
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
 from astropolcal import optics
 from astropolcal.simulation import half_wave_plate_cycles, simulate
-
-# star_data.py, which several folders use
-sys.path.append(str(Path(__file__).parents[1]))
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
 

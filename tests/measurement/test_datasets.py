@@ -11,7 +11,6 @@ from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.measurement.datasets import as_pairs
 from astropolcal.measurement.parameters import FreeParameters, Uniform, bind_prior
-from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
@@ -122,15 +121,13 @@ def test_thinning_draws_the_same_frames_again_and_leaves_the_whole_alone(chain, 
     np.testing.assert_array_equal(whole.predict(whole.vector()), before)
 
 
-def test_a_short_table_keeps_all_of_its_frames(chain, observations):
+def test_a_table_is_thinned_by_itself(chain, observations, frames):
     for most in [20, 1000]:
         whole = Measurement(chain, observations)
         fewer, kept = whole.thinned(most)
         assert kept.all(), most
         assert fewer.datasets[0] is whole.datasets[0], most
-
-
-def test_long_and_short_tables_are_thinned_by_themselves(chain, observations, frames):
+    # long and short ones together
     short = simulate(chain, WAVELENGTH, half_wave_plate_cycles(derotator=[45] * u.deg), seed=2)
     whole = Measurement(chain, [observations, short])
     fewer, kept = whole.thinned(4)
@@ -301,9 +298,3 @@ def test_priors_that_are_none():
         with pytest.raises(ParameterError, match=words) as caught:
             bind_prior(prior, "hwp.theta", u.deg, (-5, 5))
         assert "hwp.theta" in str(caught.value), (prior, words)
-
-
-def test_a_table_from_memory_is_a_dataset_too(chain, observations):
-    again = Observations.from_table(observations.to_table())
-    one, other = (Measurement(chain, table) for table in (observations, again))
-    np.testing.assert_allclose(one.observed, other.observed, rtol=1e-12)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic, join
-from astropolcal.exceptions import AstropolcalError, ChainError, ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
 from astropolcal.observations.observables import NormalizedSingleDifference
@@ -23,7 +23,6 @@ FITTERS = [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter]
 
 # frames without a modulator
 PLAIN = sorted(name for name, one in OBSERVABLES.items() if one.frames_per_datum < 4)
-DOUBLE = [name for name, observable in OBSERVABLES.items() if observable.frames_per_datum == 2]
 
 
 def numerical(measurement, vector, step=1e-6):
@@ -249,11 +248,6 @@ def test_fixed_arrays_follow_the_grid_too(make_chain, frames):
     np.testing.assert_allclose(measurement.residuals(), 0, atol=1e-12)
 
 
-def test_wavelength_off_the_grid_is_an_error(chain, observations):
-    with pytest.raises(ObservationError, match=r"such as 1600.000 nm, are none of the 3"):
-        Measurement(chain, observations, wavelength=[1.2, 1.65, 2.2] * u.um)
-
-
 def test_frames_shared_by_pairs():
     """Positions 0, 45, 90 and 135 deg: a frame may serve two pairs, and still differentiates."""
     chain = optics.LinearPolarizer(theta=10 * u.deg, name="polarizer", fixed={"theta": False})
@@ -300,31 +294,11 @@ def test_given_positions_replace_the_columns(chain, observations):
     )
 
 
-def test_missing_stage_is_an_error(chain, observations):
-    with pytest.raises(ChainError, match="stage 'derotator'"):
-        Measurement(chain, observations, positions=[{"hwp": observations.position("hwp")}])
-
-
 def test_observable_may_be_an_object(chain, observations):
     measurement = Measurement(chain, observations, observable=NormalizedSingleDifference())
     assert measurement.n_data == observations.n_frames * 3
-
-
-def test_unknown_observable_is_an_error(chain, observations):
     with pytest.raises(ObservationError, match="observable = "):
         Measurement(chain, observations, observable="triple difference")
-
-
-def test_numbers_that_do_not_go_together(chain, observations):
-    for n_chains, n_positions in [(2, None), (1, 2), (0, None)]:
-        positions = None if n_positions is None else [{}] * n_positions
-        with pytest.raises(ObservationError, match="do not go together"):
-            Measurement([chain] * n_chains, [observations], positions=positions)
-
-
-def test_no_dataset_is_an_error(chain):
-    with pytest.raises(ObservationError, match="0 datasets"):
-        Measurement(chain, [])
 
 
 # --- evaluation on an index -------------------------------------------------------------------
@@ -532,13 +506,11 @@ def test_fitters_agree(solutions):
         assert (difference < tolerance).all()
 
 
-@pytest.mark.parametrize("fitter", FITTERS)
-def test_fit_uses_the_analytic_jacobian(frames, fitter, monkeypatch):
+def test_fit_uses_the_analytic_jacobian(frames, monkeypatch):
     """Finite differences would call ``evaluate`` once a parameter for every step."""
     chain, data = _full_rank([1.2, 1.6, 2.0, 2.2] * u.um, frames)
-    measurement = Measurement(chain, data)
-    counts = {"evaluate": 0, "fit_deriv": 0}
-    for name in counts:
+    counts = {}
+    for name in ("evaluate", "fit_deriv"):
         method = getattr(Measurement, name)
 
         def counted(self, *args, _method=method, _name=name):
@@ -546,10 +518,13 @@ def test_fit_uses_the_analytic_jacobian(frames, fitter, monkeypatch):
             return _method(self, *args)
 
         monkeypatch.setattr(Measurement, name, counted)
-    fitter()(measurement, measurement.index, measurement.observed)
-    assert counts["fit_deriv"] > 0
-    assert counts["evaluate"] < measurement.free.size + 2 * counts["fit_deriv"] + 5
-    assert counts["evaluate"] <= 40
+    for fitter in FITTERS:
+        measurement = Measurement(chain, data)
+        counts |= {"evaluate": 0, "fit_deriv": 0}
+        fitter()(measurement, measurement.index, measurement.observed)
+        assert counts["fit_deriv"] > 0, fitter
+        assert counts["evaluate"] < measurement.free.size + 2 * counts["fit_deriv"] + 5, fitter
+        assert counts["evaluate"] <= 40, fitter
 
 
 def test_bounds_hold_in_a_fit(frames):
@@ -582,19 +557,12 @@ def test_chains_of_a_fit_have_its_values_and_errors(frames):
     )
 
 
-def test_data_of_a_fit_are_plain_numbers(chain, observations):
+def test_what_a_fit_does_not_take_is_refused(chain, observations):
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="the data are in %; observables are plain numbers"):
         TRFLSQFitter()(measurement, measurement.index, measurement.observed * u.percent)
-
-
-def test_a_callable_tie_is_refused_when_it_is_set(chain, observations):
+    # a callable tie, when it is set
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="hwp_w_sio2: a measurement takes no callable tie"):
         measurement.hwp_w_sio2.tied = lambda model: 2 * model.hwp_w_mgf2
     measurement.hwp_w_sio2.tied = False
-
-
-def test_errors_have_one_root(chain, observations):
-    with pytest.raises(AstropolcalError):
-        Measurement(chain, [observations] * 2, positions=[None])

@@ -68,9 +68,7 @@ def uneven_table():
 def test_without_time_the_order_of_the_frames_counts():
     found = make().position("sequence")
     np.testing.assert_allclose(found, [0, 1 / 3, 2 / 3, 1], rtol=1e-15)
-
-
-def test_gaps_in_the_numbers_of_the_frames_do_not_count():
+    # gaps in the numbers of the frames do not count
     table = example_table()
     table["frame"] = np.array([2, 3, 50, 90])[table["frame"]]
     found = Observations.from_table(table).position("sequence")
@@ -89,15 +87,8 @@ def test_time_that_does_not_tell_is_as_none():
         obs = make(time)
         assert clock(obs.frames) is None, time
         np.testing.assert_allclose(obs.position("sequence"), [0, 1 / 3, 2 / 3, 1], rtol=1e-15)
-
-
-def test_duration_is_no_time_of_its_own():
+    # duration is no time of its own
     assert clock(QTable({"time": TimeDelta([0, 1] * u.s)})) is None
-
-
-def test_all_frames_at_one_time_are_at_the_start():
-    found = make(np.full(4, 3.0)).position("sequence")
-    np.testing.assert_array_equal(found, np.zeros(4))
 
 
 def test_single_frame():
@@ -106,6 +97,9 @@ def test_single_frame():
     assert obs.position("sequence").tolist() == [0]
     np.testing.assert_array_equal(obs.position("previous_flux"), np.ones((2, obs.n_bins, 1)))
     assert obs.position("flux").shape == (2, obs.n_bins, 1)
+    # all frames at one time are at the start
+    found = make(np.full(4, 3.0)).position("sequence")
+    np.testing.assert_array_equal(found, np.zeros(4))
 
 
 @pytest.mark.slow
@@ -133,9 +127,7 @@ def test_rate_of_an_angle_is_its_change_from_frame_to_frame():
         table["parallactic"] = (170.0 + 20.0 * when - 360.0 * (when > 0)) * u.deg
         found = np.rad2deg(Observations.from_table(table).position("parallactic_rate"))
         np.testing.assert_allclose(found, 20.0, atol=1e-12)
-
-
-def test_rate_wants_the_angle():
+    # rate wants the angle
     with pytest.raises(ObservationError, match="no column 'parallactic'"):
         Observations.from_table(example_table()).position("parallactic_rate")
 
@@ -149,9 +141,7 @@ def test_fluxes_of_both_beams_right_first():
     assert found.shape == (2, 3, 4)
     np.testing.assert_array_equal(found[0], obs.flux_right.T)
     np.testing.assert_array_equal(found[1], obs.flux_left.T)
-
-
-def test_fluxes_are_in_the_unit_of_the_table():
+    # fluxes are in the unit of the table
     for unit in [u.adu, u.electron, u.one]:
         table = uneven_table()
         for name in ("flux_right", "flux_left", "flux_right_err", "flux_left_err"):
@@ -177,9 +167,7 @@ def test_frame_before_is_the_one_before_in_time():
     for now, before in ((1, 2), (3, 1), (0, 3)):
         np.testing.assert_allclose(found[..., now], flux[..., now] / flux[..., before], rtol=1e-15)
     np.testing.assert_array_equal(found[..., 2], np.ones((2, 3)))
-
-
-def test_simultaneous_frames_follow_each_other_in_their_order():
+    # simultaneous frames follow each other in their order
     obs = make(np.array([1.0, 0.0, 0.0, 1.0]), table=uneven_table())
     found, flux = obs.position("previous_flux"), obs.position("flux")
     for now, before in ((2, 1), (0, 2), (3, 0)):
@@ -194,9 +182,7 @@ def test_bad_flux_has_no_coordinate():
         with pytest.warns(AstropolcalWarning, match="1 cell masked"):
             obs = make(table=table)
         assert_neutral(obs, frame=1, bin_=2)
-
-
-def test_masked_cell_has_no_coordinate():
+    # masked cell has no coordinate
     mask = np.zeros((4, 3), dtype=bool)
     mask[2, 0] = True
     assert_neutral(make(table=uneven_table()).with_mask(mask, "cosmic ray"), frame=2, bin_=0)
@@ -219,16 +205,6 @@ def assert_neutral(obs, frame, bin_):
     for power in (1, -1):
         gain = FluxGain(right=0.3, left=0.3, power=power, mount="flux")
         assert gain.mueller(position=flux[0, bin_, frame])[0, 0] == 1
-
-
-def test_reciprocal_weighs_what_the_frame_before_leaves_behind():
-    obs = make(MINUTES * u.min, table=uneven_table())
-    share, flux = 0.02, obs.position("flux")
-    order = np.argsort(MINUTES)
-    lag = FluxGain(right=share, left=share, power=-1, mount="previous_flux")
-    found = flux * lag.mueller(position=obs.position("previous_flux"))[..., 0, 0]
-    expected = flux[..., order[1:]] + share * flux[..., order[:-1]]
-    np.testing.assert_allclose(found[..., order[1:]], expected, rtol=1e-14)
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -268,9 +244,7 @@ def test_state_that_is_neither_names_the_frame():
         words = f"night: flc_state = '{bad}' in frame 2; allowed are A and B, or 0 and 1"
         with pytest.raises(ObservationError, match=words):
             frame_coordinate(obs, "flc_state")
-
-
-def test_state_needs_its_column():
+    # state needs its column
     obs = Observations.from_table(example_table(), name="night")
     with pytest.raises(ObservationError, match="night: no column flc_state; it is needed, with A"):
         frame_coordinate(obs, "flc_state")

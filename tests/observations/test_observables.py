@@ -201,40 +201,38 @@ def test_covariance_without_shared_frames_is_the_variance():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "observable", [o for o in OBSERVABLES.values() if o.frames_per_datum == 2], ids=lambda o: o.name
-)
-def test_covariance_of_shared_frames_agrees_with_monte_carlo(observable):
-    rng = np.random.default_rng(7)
-    # data 0 and 1 share their minus frame, datum 2 has frame 1 as its plus frame
-    frames = np.array([[0, 1], [2, 1], [1, 3], [4, 5]])
-    right, left = rng.uniform(80.0, 160.0, (2, 6, 2))
-    var_right, var_left = 0.01 * right, 0.02 * left
-    cov = -0.4 * np.sqrt(var_right * var_left)
-    n = 20000
-    noise_right, noise_left = correlated_noise(var_right, var_left, cov, rng, n)
+def test_covariance_of_shared_frames_agrees_with_monte_carlo():
+    for observable in [o for o in OBSERVABLES.values() if o.frames_per_datum == 2]:
+        rng = np.random.default_rng(7)
+        # data 0 and 1 share their minus frame, datum 2 has frame 1 as its plus frame
+        frames = np.array([[0, 1], [2, 1], [1, 3], [4, 5]])
+        right, left = rng.uniform(80.0, 160.0, (2, 6, 2))
+        var_right, var_left = 0.01 * right, 0.02 * left
+        cov = -0.4 * np.sqrt(var_right * var_left)
+        n = 20000
+        noise_right, noise_left = correlated_noise(var_right, var_left, cov, rng, n)
 
-    def of_frames(values):
-        return np.moveaxis(values[..., frames.T, :], -1, -2)
+        def of_frames(values, frames=frames):
+            return np.moveaxis(values[..., frames.T, :], -1, -2)
 
-    draws = np.array(
-        [
-            observable.evaluate(of_frames(right + a), of_frames(left + b))
-            for a, b in zip(noise_right, noise_left, strict=True)
-        ]
-    )
-    found = observable.frame_covariance(
-        *(of_frames(values) for values in (right, left, var_right, var_left, cov)), frames
-    )
-    for b in range(2):
-        expected = np.cov(draws[:, b].T)
-        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        # in units of correlation, whose scatter is 1 / sqrt(n) = 0.007
-        np.testing.assert_allclose(found[b] / scale, expected / scale, atol=0.04)
-        assert abs(found[b, 0, 1] / scale[0, 1]) > 0.2
-        assert found[b, 0, 3] == 0
-        np.testing.assert_allclose(found[b], found[b].T, rtol=1e-12)
-        assert np.linalg.eigvalsh(found[b]).min() > 0
+        draws = np.array(
+            [
+                observable.evaluate(of_frames(right + a), of_frames(left + b))
+                for a, b in zip(noise_right, noise_left, strict=True)
+            ]
+        )
+        found = observable.frame_covariance(
+            *(of_frames(values) for values in (right, left, var_right, var_left, cov)), frames
+        )
+        for b in range(2):
+            expected = np.cov(draws[:, b].T)
+            scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+            # in units of correlation, whose scatter is 1 / sqrt(n) = 0.007
+            np.testing.assert_allclose(found[b] / scale, expected / scale, atol=0.04)
+            assert abs(found[b, 0, 1] / scale[0, 1]) > 0.2, observable
+            assert found[b, 0, 3] == 0, observable
+            np.testing.assert_allclose(found[b], found[b].T, rtol=1e-12)
+            assert np.linalg.eigvalsh(found[b]).min() > 0, observable
 
 
 def test_covariance_refuses_frames_of_the_wrong_shape():

@@ -21,8 +21,22 @@ def pair(hwp, derotator=None, **kwargs):
     return pair_frames(np.array(hwp, dtype=float) * u.deg, derotator, **kwargs).tolist()
 
 
-def test_one_cycle():
+def test_angles_45_degrees_apart_are_a_pair():
     assert pair(CYCLE) == [[0, 1], [2, 3]]
+    # 45 deg comes first, yet 0 deg is the plus frame
+    assert pair([45.0, 0.0]) == [[1, 0]]
+    # up to 180 degrees
+    hwp = np.arange(0.0, 180.0, 11.25)  # the 16 angles of the VAMPIRES calibration
+    found = {(hwp[p], hwp[m]) for p, m in pair(hwp)}
+    assert found == {(a, a + 45) for a in (0, 11.25, 22.5, 33.75, 90, 101.25, 112.5, 123.75)}
+    # modulo 180 degrees
+    assert pair([180.0, 45.0]) == [[0, 1]]
+    assert pair([0.0, 225.0]) == [[0, 1]]
+    assert pair([-180.0, -135.0]) == [[0, 1]]
+    # an unused partner 45 degrees behind will do
+    assert pair([90.0, 45.0]) == [[0, 1]]
+    # one ahead is preferred to a nearer one behind
+    assert pair([45.0, 90.0, 0.0, 135.0]) == [[1, 3], [2, 0]]
 
 
 def test_the_order_of_frames_does_not_matter():
@@ -32,38 +46,11 @@ def test_the_order_of_frames_does_not_matter():
         assert found == {(0.0, 45.0), (22.5, 67.5)}, order
 
 
-def test_the_plus_frame_has_an_angle_below_45_degrees():
-    # 45 deg comes first, yet 0 deg is the plus frame
-    assert pair([45.0, 0.0]) == [[1, 0]]
-
-
-def test_angles_up_to_180_degrees():
-    hwp = np.arange(0.0, 180.0, 11.25)  # the 16 angles of the VAMPIRES calibration
-    found = {(hwp[p], hwp[m]) for p, m in pair(hwp)}
-    assert found == {(a, a + 45) for a in (0, 11.25, 22.5, 33.75, 90, 101.25, 112.5, 123.75)}
-
-
-def test_angles_are_the_same_modulo_180_degrees():
-    assert pair([180.0, 45.0]) == [[0, 1]]
-    assert pair([0.0, 225.0]) == [[0, 1]]
-    assert pair([-180.0, -135.0]) == [[0, 1]]
-
-
-def test_an_unused_partner_45_degrees_behind_will_do():
-    assert pair([90.0, 45.0]) == [[0, 1]]
-
-
-def test_a_partner_ahead_is_preferred_to_a_nearer_one_behind():
-    assert pair([45.0, 90.0, 0.0, 135.0]) == [[1, 3], [2, 0]]
-
-
-def test_tolerance_at_the_edge_of_the_range():
+def test_tolerance_of_the_plate():
     for offset in [-0.2, 0.0, 0.2]:
         # 0 deg read back as 359.8 deg is still the plus frame
         assert pair([np.mod(offset, 360.0), 45.0]) == [[0, 1]], offset
-
-
-def test_beyond_the_tolerance_there_is_no_partner():
+    # beyond it there is no partner
     with pytest.raises(ObservationError, match="hwp = 0 deg has no partner"):
         pair([0.0, 45.4])
     assert pair([0.0, 45.4], tolerance=0.5 * u.deg) == [[0, 1]]
@@ -120,27 +107,20 @@ def test_the_modulator_must_be_in_the_same_state():
     assert pair([0.0, 0.0, 45.0, 45.0], flc_state=["A", "B", "B", "A"]) == [[0, 3], [1, 2]]
 
 
-def test_left_over_frames_are_named():
+def test_left_over_frames_are_named_and_counted():
     with pytest.warns(
         AstropolcalWarning, match=r"night: 1 of 3 frames left out.* frame 17 \(hwp 90 deg\)"
     ):
         assert pair([0.0, 45.0, 90.0], labels=[5, 6, 17], name="night") == [[0, 1]]
-
-
-def test_many_left_over_frames_are_counted():
     with pytest.warns(AstropolcalWarning, match="19 of 21 frames left out.* and 9 more"):
         pair([0.0] * 20 + [45.0])
 
 
 def test_sharing_gives_every_frame_a_partner():
     assert pair([0.0, 45.0, 90.0], share=True) == [[0, 1], [2, 1]]
-
-
-def test_sharing_leaves_complete_cycles_alone():
+    # complete cycles are left alone
     assert pair(CYCLE * 3, share=True) == pair(CYCLE * 3)
-
-
-def test_sharing_does_not_bridge_derotator_angles():
+    # derotator angles are not bridged
     with pytest.warns(AstropolcalWarning, match=r"1 of 3.*frame 2 \(hwp 0 deg\)"):
         assert pair([0.0, 45.0, 0.0], [45.0, 45.0, 60.0], share=True) == [[0, 1]]
 
@@ -148,9 +128,7 @@ def test_sharing_does_not_bridge_derotator_angles():
 def test_an_angle_without_partner_is_an_error_that_names_the_row():
     with pytest.raises(ObservationError, match=r"night.ecsv, row 13: hwp = 10 deg has no partner"):
         pair([*CYCLE, 10.0], rows=[1, 4, 7, 10, 13], name="night.ecsv")
-
-
-def test_an_angle_without_partner_is_an_error_without_rows():
+    # without rows, the frame
     with pytest.raises(ObservationError, match="table, frame index 0: hwp = 10 deg"):
         pair([10.0])
 

@@ -59,6 +59,11 @@ def test_which_sources_are_stars():
 
 def test_cycles_are_numbered_by_returning_angles():
     assert cycle_numbers(cycles()).tolist() == np.repeat([0, 1, 2], 4).tolist()
+    # cycles may be given
+    observations = cycles()
+    table = observations.to_table()
+    table["cycle"] = np.asarray(table["frame"]) // 2
+    assert cycle_numbers(Observations.from_table(table)).max() == 5
 
 
 def test_run_whose_first_frame_is_lost_is_cut_at_the_right_place():
@@ -70,37 +75,14 @@ def test_run_whose_first_frame_is_lost_is_cut_at_the_right_place():
     assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == [0, 1, 2]
 
 
-def test_encoders_that_are_not_exact_change_no_cycle():
-    """Neither at angles of a plate that are odd multiples of 11.25 deg, nor at a whole turn."""
-    rng = np.random.default_rng(4)
-    for angles in (CRITICAL, [11.25, 56.25, 33.75, 78.75] * u.deg, [179.9, 45, 22.5, 67.5] * u.deg):
-        frames = half_wave_plate_cycles(angles, np.zeros(6) * u.deg)
-        for stage in ("hwp", "derotator"):
-            off = rng.normal(0, 0.01, len(frames)) * u.deg
-            frames[stage] = np.mod(frames[stage] + off, 180 * u.deg)
-        night = simulate(CHARIS.chain("unpolarized", wavelength=FEW), FEW, frames, seed=1)
-        expected = np.repeat(np.arange(6), 4).tolist()
-        for start in (None, angles[0]):
-            assert cycle_numbers(night, start).tolist() == expected, (angles, start)
-
-
-def test_cycles_may_be_given():
-    observations = cycles()
-    table = observations.to_table()
-    table["cycle"] = np.asarray(table["frame"]) // 2
-    assert cycle_numbers(Observations.from_table(table)).max() == 5
-
-
-def test_complete_cycles_stay_untouched():
-    observations = cycles()
-    assert mask_incomplete_cycles(observations) is observations
-
-
-def test_incomplete_cycle_is_masked_with_reason_and_reported():
+def test_only_incomplete_cycles_are_masked_with_reason_and_reported():
     with pytest.warns(AstropolcalWarning, match=r"3 of 11 frames masked, incomplete half-wave"):
         masked = mask_incomplete_cycles(cycles(drop=[6]))
     assert masked.mask_reasons == {"incomplete half-wave-plate cycle": 3 * len(FEW)}
     assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == [4, 5, 6]
+    # complete ones stay untouched
+    observations = cycles()
+    assert mask_incomplete_cycles(observations) is observations
 
 
 def test_cycle_whose_frame_is_masked_is_incomplete():
@@ -124,19 +106,9 @@ def test_saturated_frames_are_masked():
         with pytest.warns(AstropolcalWarning, match=r"1 of 12 frames masked, saturated: frame 4"):
             masked = mask_saturated(cycles(saturated=flag))
         assert masked.mask_reasons == {"saturated": len(FEW)}, flag
-
-
-def test_flag_that_is_no_flag_is_an_error():
+    # flag that is no flag is an error
     with pytest.raises(ObservationError, match="column saturated has type"):
         mask_saturated(cycles(saturated=np.full(12, "yes")))
-
-
-def test_negative_sums_after_background_are_masked_when_read():
-    table = cycles().to_table()
-    table["flux_right"][5] = -3 * u.adu
-    with pytest.warns(AstropolcalWarning, match="flux not positive"):
-        observations = Observations.from_table(table)
-    assert observations.mask_reasons == {"flux not positive": 1}
 
 
 # --- lamp ---------------------------------------------------------------------------------------
@@ -149,15 +121,13 @@ def test_brightness_is_relative_to_the_median_frame():
     np.testing.assert_allclose(found, lamp, rtol=0.03)
 
 
-def test_warming_lamp_is_masked():
+def test_warming_lamp_and_single_dim_frame_are_masked():
     lamp = np.ones(64)
     lamp[:8] = np.linspace(0.2, 0.9, 8)
     with pytest.warns(AstropolcalWarning, match=r"8 of 64 frames masked, unstable lamp"):
         masked = mask_unstable_lamp(internal(lamp))
     assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == list(range(8))
-
-
-def test_single_dim_frame_is_masked_alone():
+    # single dim frame is masked alone
     lamp = np.ones(64)
     lamp[20] = 0.7
     with pytest.warns(AstropolcalWarning, match=r"1 of 64 frames masked, unstable lamp: frame 20"):
@@ -211,3 +181,17 @@ def test_clusters():
         ([7.0], 1.0, [0]),
     ]:
         assert clusters(np.array(values), gap).tolist() == numbers, (values, gap, numbers)
+
+
+def test_encoders_that_are_not_exact_change_no_cycle():
+    """Neither at angles of a plate that are odd multiples of 11.25 deg, nor at a whole turn."""
+    rng = np.random.default_rng(4)
+    for angles in (CRITICAL, [11.25, 56.25, 33.75, 78.75] * u.deg, [179.9, 45, 22.5, 67.5] * u.deg):
+        frames = half_wave_plate_cycles(angles, np.zeros(6) * u.deg)
+        for stage in ("hwp", "derotator"):
+            off = rng.normal(0, 0.01, len(frames)) * u.deg
+            frames[stage] = np.mod(frames[stage] + off, 180 * u.deg)
+        night = simulate(CHARIS.chain("unpolarized", wavelength=FEW), FEW, frames, seed=1)
+        expected = np.repeat(np.arange(6), 4).tolist()
+        for start in (None, angles[0]):
+            assert cycle_numbers(night, start).tolist() == expected, (angles, start)

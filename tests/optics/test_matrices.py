@@ -15,9 +15,7 @@ from hypothesis.extra.numpy import arrays
 from astropolcal import mueller, optics, thinfilm
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import (
-    blank,
     diattenuator_retarder_slopes,
-    fill_phase_block,
     retardance_slope,
     rotation_generator,
     transverse_share,
@@ -65,11 +63,6 @@ def test_generators_act_on_the_last_axes():
                 np.testing.assert_array_equal(found[i], function(matrices[i]))
 
 
-def test_what_has_no_axis_does_not_move():
-    for matrix in (np.eye(4), np.diag([1.0, 0.5, 0.5, -0.2])):
-        np.testing.assert_array_equal(rotation_generator(matrix), 0)
-
-
 @given(x=ANGLE)
 def test_slope_of_a_retarder(x):
     expected = difference(lambda a: mueller.linear_retarder(a * u.rad), x)
@@ -96,19 +89,6 @@ def test_share_that_is_left_of_u_near_a_polarizer(decades):
     kept = 1 - epsilon
     assert transverse_share(epsilon) == pytest.approx(np.sqrt(kept * (2 - kept)), rel=1e-14)
     assert transverse_share(-epsilon) == transverse_share(epsilon)
-
-
-def test_phase_block_is_a_rotation_of_u_and_v():
-    matrix = np.zeros((2, 4, 4))
-    fill_phase_block(matrix, np.array([0.6, 1.0]), np.array([0.8, 0.0]))
-    np.testing.assert_array_equal(matrix[0, 2:, 2:], [[0.6, 0.8], [-0.8, 0.6]])
-    np.testing.assert_array_equal(matrix[1, 2:, 2:], np.eye(2))
-    assert not matrix[:, :2].any()
-
-
-def test_blank_has_the_shape_of_all_values():
-    assert blank(1.0, np.zeros(3), np.zeros((2, 1))).shape == (2, 3, 4, 4)
-    assert blank().shape == (4, 4)
 
 
 # --- copies and keywords ------------------------------------------------------------------------
@@ -179,15 +159,11 @@ def test_numbers_and_angles_of_stages():
             assert finite_position(180 * u.deg, "position", "hwp") == pytest.approx(np.pi), stage
             with pytest.raises(ParameterError, match=r"position = 0\.5 needs a unit such as rad"):
                 finite_position(0.5, "position", "hwp")
-
-
-def test_stage_is_the_name_where_there_is_no_other():
+    # stage is the name where there is no other
     assert finite_position(1.0, "sequence") == 1.0
     with pytest.raises(ParameterError, match=r"hwp = 1\.0 needs a unit"):
         finite_position(1.0, "hwp")
-
-
-def test_position_is_finite():
+    # position is finite
     for bad in [np.nan, np.inf, -np.inf]:
         with pytest.raises(ParameterError, match=r"flux = .* must be finite"):
             finite_position([1.0, bad], "flux")
@@ -198,14 +174,6 @@ def test_position_is_finite():
 def test_kinds_of_positions_do_not_overlap():
     assert not set(FLUXES) & set(RATES)
     assert {*FLUXES, *RATES, *MOVES, "sequence", "flc_state", "frame"} == set(COORDINATES)
-
-
-def test_positions_that_do_not_broadcast():
-    plate = optics.LinearRetarder(mount="hwp")
-    for lam, position in [((3,), (4,)), ((3,), (2, 4))]:
-        with pytest.raises(ParameterError, match=r"give the positions the shape \(n_frames, 1\)"):
-            plate.mueller(np.ones(lam) * u.um, np.ones(position) * u.rad)
-    assert plate.mueller(np.ones((3, 1, 5)) * u.um, np.ones((2, 5)) * u.rad).shape == (2, 5, 4, 4)
 
 
 # --- the matrices in the docstrings -------------------------------------------------------------

@@ -7,12 +7,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from hypothesis import given
-from hypothesis import strategies as st
 
-from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.materials import GOLD, SILVER, IsotropicMaterial, TabulatedLaw
+from astropolcal.materials import SILVER, IsotropicMaterial, TabulatedLaw
 from astropolcal.optics import (
     DiattenuatorRetarder,
     KMirror,
@@ -20,16 +17,13 @@ from astropolcal.optics import (
     MetalMirror,
     ParityFlip,
     PowerLawMirror,
-    Rotator,
 )
-from astropolcal.thinfilm import reflect
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 # Table of the M3 fit, paper Sec. 6.2
 PUBLISHED_M3 = {"b1": 15.56, "m1": 3.186, "b2": 9.69, "m2": 1.040}
 MIRRORS = (MetalMirror, PowerLawMirror, KMirror)
-each = pytest.mark.parametrize("cls", MIRRORS, ids=lambda cls: cls.__name__)
 
 
 def reference(name):
@@ -42,61 +36,47 @@ def reference(name):
 # --- sign and orientation -----------------------------------------------------------
 
 
-@each
-def test_a_good_conductor_is_the_ideal_mirror(cls):
-    values = {"b1": 22, "b2": 0, "m1": 0, "m2": 0} if cls is PowerLawMirror else {"k_scale": 1e7}
-    values |= {"film_thickness": 0 * u.nm} if cls is KMirror else {}
-    matrix = cls(**values).mueller(WAVELENGTH)
-    expected = np.broadcast_to(np.diag([1.0, 1, -1, -1]), matrix.shape)
-    np.testing.assert_allclose(matrix, expected, atol=1e-6)
-    # as the parity flip turned by 45 deg, and as a half-wave retarder
-    np.testing.assert_allclose(ParityFlip(theta=45 * u.deg).mueller(), expected[0], atol=1e-15)
-    retarder = LinearRetarder(retardance=180 * u.deg).mueller()
-    np.testing.assert_allclose(retarder, expected[0], atol=1e-15)
+def test_a_good_conductor_is_the_ideal_mirror():
+    for cls in MIRRORS:
+        values = (
+            {"b1": 22, "b2": 0, "m1": 0, "m2": 0} if cls is PowerLawMirror else {"k_scale": 1e7}
+        )
+        values |= {"film_thickness": 0 * u.nm} if cls is KMirror else {}
+        matrix = cls(**values).mueller(WAVELENGTH)
+        expected = np.broadcast_to(np.diag([1.0, 1, -1, -1]), matrix.shape)
+        np.testing.assert_allclose(matrix, expected, atol=1e-6)
+        # as the parity flip turned by 45 deg, and as a half-wave retarder
+        np.testing.assert_allclose(ParityFlip(theta=45 * u.deg).mueller(), expected[0], atol=1e-15)
+        retarder = LinearRetarder(retardance=180 * u.deg).mueller()
+        np.testing.assert_allclose(retarder, expected[0], atol=1e-15)
 
 
-@each
-def test_the_field_across_the_plane_of_incidence_is_along_plus_q(cls):
-    bare = {"film_thickness": 0 * u.nm} if cls is KMirror else {}
-    mirror = cls(**bare)
-    assert np.all(mirror.diattenuation(WAVELENGTH) > 0)
-    through = mirror.mueller(WAVELENGTH) @ [1, 0, 0, 0]
-    np.testing.assert_allclose(through[:, 1], mirror.diattenuation(WAVELENGTH), atol=1e-15)
-    turned = cls(**bare, theta=90 * u.deg).mueller(WAVELENGTH) @ [1, 0, 0, 0]
-    np.testing.assert_allclose(turned[:, 1], -through[:, 1], atol=1e-15)
+def test_the_field_across_the_plane_of_incidence_is_along_plus_q():
+    for cls in MIRRORS:
+        bare = {"film_thickness": 0 * u.nm} if cls is KMirror else {}
+        mirror = cls(**bare)
+        assert np.all(mirror.diattenuation(WAVELENGTH) > 0), cls
+        through = mirror.mueller(WAVELENGTH) @ [1, 0, 0, 0]
+        np.testing.assert_allclose(through[:, 1], mirror.diattenuation(WAVELENGTH), atol=1e-15)
+        turned = cls(**bare, theta=90 * u.deg).mueller(WAVELENGTH) @ [1, 0, 0, 0]
+        np.testing.assert_allclose(turned[:, 1], -through[:, 1], atol=1e-15)
 
 
-@each
-def test_it_is_the_diattenuator_retarder_of_its_own_numbers(cls):
-    mirror = cls(theta=20 * u.deg, mount="stage", name="it")
-    mirror.theta.fixed = False
-    free = mirror.loosened(WAVELENGTH)
-    assert isinstance(free, DiattenuatorRetarder)
-    assert (free.name, free.mount, free.theta.fixed) == ("it", "stage", False)
-    assert free.retardance.shape == free.diattenuation.shape == (3,)
-    np.testing.assert_allclose(free.mueller(WAVELENGTH), mirror.mueller(WAVELENGTH), atol=1e-14)
-    assert np.all(
-        (mirror.retardance(WAVELENGTH) >= 0) & (mirror.retardance(WAVELENGTH).value < 360)
-    )
+def test_it_is_the_diattenuator_retarder_of_its_own_numbers():
+    for cls in MIRRORS:
+        mirror = cls(theta=20 * u.deg, mount="stage", name="it")
+        mirror.theta.fixed = False
+        free = mirror.loosened(WAVELENGTH)
+        assert isinstance(free, DiattenuatorRetarder), cls
+        assert (free.name, free.mount, free.theta.fixed) == ("it", "stage", False), cls
+        assert free.retardance.shape == free.diattenuation.shape == (3,), cls
+        np.testing.assert_allclose(free.mueller(WAVELENGTH), mirror.mueller(WAVELENGTH), atol=1e-14)
+        assert np.all(
+            (mirror.retardance(WAVELENGTH) >= 0) & (mirror.retardance(WAVELENGTH).value < 360)
+        ), cls
 
 
 # --- metals -------------------------------------------------------------------------
-
-
-def test_a_bare_metal_is_fresnel():
-    for metal in [SILVER, GOLD]:
-        mirror = MetalMirror(material=metal.name, incidence=52 * u.deg)
-        bare = reflect(WAVELENGTH, 52 * u.deg, metal.index(WAVELENGTH).value)
-        r_s, r_p = bare.r_s, bare.r_p
-        product = abs(r_s) ** 2 + abs(r_p) ** 2
-        expected = (abs(r_s) ** 2 - abs(r_p) ** 2) / product
-        np.testing.assert_allclose(mirror.diattenuation(WAVELENGTH), expected, rtol=1e-10)
-        phase = np.angle(r_p) - np.angle(r_s)
-        np.testing.assert_allclose(
-            np.exp(1j * mirror.retardance(WAVELENGTH).to_value(u.rad)),
-            np.exp(1j * phase),
-            rtol=1e-12,
-        )
 
 
 def test_theory_at_45_degrees():
@@ -116,13 +96,6 @@ def test_theory_at_45_degrees():
     )
 
 
-def test_fold_mirror_is_of_the_size_of_gold():
-    table = reference("charis_fold_mirror.ecsv")
-    theory = MetalMirror(material="gold").diattenuation(table["wavelength"])
-    ratio = table["fold_mirror_diattenuation"] / theory
-    assert np.all((ratio > 0.9) & (ratio < 1.4))
-
-
 def test_fold_mirror_is_gold_with_one_factor():
     table = reference("charis_fold_mirror.ecsv")
     mirror = MetalMirror(material="gold", n_scale=1.19)
@@ -130,16 +103,6 @@ def test_fold_mirror_is_gold_with_one_factor():
     # their four fits differ by 7e-4 among each other
     assert np.sqrt(np.mean(residual**2)) < 8e-4
     assert abs(np.median(residual)) < 2e-4
-
-
-@given(st.floats(0.05, 5), st.floats(0.2, 5))
-def test_scales_multiply_the_index(n_scale, k_scale):
-    index = SILVER.index(WAVELENGTH).value
-    mirror = MetalMirror(n_scale=n_scale, k_scale=k_scale, film_thickness=90 * u.nm)
-    scaled = n_scale * index.real + 1j * k_scale * index.imag
-    film = [("fused silica", 90 * u.nm)]
-    expected = reflect(WAVELENGTH, 45 * u.deg, scaled, film).mueller()
-    np.testing.assert_allclose(mirror.mueller(WAVELENGTH), expected, atol=1e-12)
 
 
 def test_the_default_mirror_is_bare_and_known():
@@ -160,11 +123,6 @@ def test_materials_survive_copies():
     assert mirror.material == "silver"
 
 
-def test_a_film_stays_in_a_chain():
-    chain = MetalMirror(name="m3", film_thickness=80 * u.nm) | KMirror(name="derotator")
-    assert leaves(chain.copy())[0].film == "fused silica"
-
-
 def test_an_unknown_material_is_refused():
     for cls in [MetalMirror, KMirror]:
         for key in ["material", "film"]:
@@ -179,26 +137,27 @@ def test_an_unknown_material_is_refused():
                     cls(**{key: bad})
 
 
-def test_a_wavelength_out_of_range_is_refused():
+def test_values_that_make_no_mirror_are_refused():
     for cls in [MetalMirror, KMirror]:
         with pytest.raises(WavelengthRangeError, match="fused silica"):
             cls().mueller(5 * u.um)
-
-
-@each
-def test_an_impossible_incidence_is_refused(cls):
-    for degrees in [-90, 90, 120]:
-        mirror = cls(incidence=[50, degrees, 50] * u.deg, name="it")
-        for use in (mirror.mueller, mirror.mueller_derivatives, mirror.diattenuation):
-            with pytest.raises(ParameterError, match=rf"it\.incidence = {degrees} deg; allowed"):
-                use(WAVELENGTH)
-
-
-def test_a_negative_value_is_refused():
     for key in ["film_thickness", "n_scale", "k_scale"]:
         unit = u.nm if key == "film_thickness" else 1
         with pytest.raises(ParameterError, match=f"it.{key} = -.*not negative"):
             MetalMirror(**{key: -0.1 * unit}, name="it").mueller(WAVELENGTH)
+    with pytest.raises(ParameterError, match=r"it\.incidence = 40 deg; allowed are 45 deg"):
+        KMirror(incidence=40 * u.deg, name="it").mueller(WAVELENGTH)
+
+
+def test_an_impossible_incidence_is_refused():
+    for cls in MIRRORS:
+        for degrees in [-90, 90, 120]:
+            mirror = cls(incidence=[50, degrees, 50] * u.deg, name="it")
+            for use in (mirror.mueller, mirror.mueller_derivatives, mirror.diattenuation):
+                with pytest.raises(
+                    ParameterError, match=rf"it\.incidence = {degrees} deg; allowed"
+                ):
+                    use(WAVELENGTH)
 
 
 # --- the law of the paper -------------------------------------------------------------
@@ -245,30 +204,6 @@ def test_four_numbers_are_nearly_two():
 # --- the K-mirror -----------------------------------------------------------------------
 
 
-def test_k_mirror_is_three_mirrors_in_a_row():
-    film = {"film_thickness": 150 * u.nm, "material": "gold", "film": "Al2O3"}
-    one, two = MetalMirror(incidence=62 * u.deg, **film), MetalMirror(incidence=34 * u.deg, **film)
-    product = one.mueller(WAVELENGTH) @ two.mueller(WAVELENGTH) @ one.mueller(WAVELENGTH)
-    product /= product[:, :1, :1]
-    whole = KMirror(incidence=62 * u.deg, **film)
-    np.testing.assert_allclose(whole.mueller(WAVELENGTH), product, atol=1e-13)
-    np.testing.assert_allclose(
-        np.cos(whole.retardance(WAVELENGTH)),
-        np.cos(2 * one.retardance(WAVELENGTH) + two.retardance(WAVELENGTH)),
-        atol=1e-12,
-    )
-
-
-def test_an_ideal_k_mirror_turns_the_polarization_by_twice_its_angle():
-    ideal = KMirror(k_scale=1e8, film_thickness=0 * u.nm, mount="derotator")
-    light = ideal.mueller(WAVELENGTH, position=20 * u.deg) @ [1, 1, 0, 0]
-    q, v = np.cos(np.deg2rad(80)), np.sin(np.deg2rad(80))
-    np.testing.assert_allclose(light, np.broadcast_to([1, q, v, 0], (3, 4)), atol=1e-5)
-    # a parity flip between the turns of a frame does the same
-    other = Rotator(theta=-20 * u.deg).mueller() @ np.diag([1.0, 1, -1, -1])
-    np.testing.assert_allclose((other @ Rotator(theta=20 * u.deg).mueller())[1:3, 1], [q, v])
-
-
 def test_k_mirror_of_subaru_by_its_film_alone():
     # 't Hart et al. 2021 fit 262.56 nm of silica on silver; per-wavelength values of 2026
     # are stored with the opposite sign of V
@@ -280,8 +215,3 @@ def test_k_mirror_of_subaru_by_its_film_alone():
     assert np.median(np.abs(difference)) < 4
     # from 1.4 um on, where the published values are smooth
     assert np.abs(difference[table["wavelength"] > 1400 * u.nm]).max() < 7
-
-
-def test_k_mirror_needs_room_for_its_middle_mirror():
-    with pytest.raises(ParameterError, match=r"it\.incidence = 40 deg; allowed are 45 deg"):
-        KMirror(incidence=40 * u.deg, name="it").mueller(WAVELENGTH)

@@ -88,11 +88,6 @@ def test_position_does_not_outlive_its_kind_of_mount():
     assert optic.position == 0
 
 
-def test_fluxes_have_no_other_unit():
-    with pytest.raises(ParameterError, match="position has unit adu, which is not convertible"):
-        FluxGain(mount="flux").position = 5 * u.adu
-
-
 def test_without_mount_there_is_no_effect():
     for optic in (FluxGain(right=0.1), DriftRotator(rate=9 * u.deg)):
         np.testing.assert_array_equal(optic.mueller(), np.eye(4))
@@ -202,48 +197,6 @@ def test_rotators_around_a_plate_are_the_error_of_its_encoder(
     expected = mueller.rotate(mueller.linear_retarder(retardance), x + off)
     found = system_mueller(chain, positions={"hwp": position})
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-
-
-def test_drift_in_front_turns_the_source():
-    chain = optics.LinearPolarizer(name="polarizer") | DriftRotator(
-        rate=-20 * u.deg, mount="sequence", name="drift"
-    )
-    light = system_mueller(chain, positions={"sequence": [0, 0.5, 1]}) @ [1, 0, 0, 0]
-    # T(-20 deg) turns the light by +20 deg
-    angle = np.degrees(np.arctan2(light[:, 2], light[:, 1])) / 2
-    np.testing.assert_allclose(angle, [0, 10, 20], atol=1e-12)
-
-
-def test_persistence_adds_a_share_of_the_frame_before():
-    flux = np.array([5.0, 20.0, 8.0, 40.0])
-    share = 0.03
-    gain = FluxGain(right=share, power=-1, mount="previous_flux")
-    found = flux[1:] * gain.mueller(position=flux[1:] / flux[:-1])[:, 0, 0]
-    np.testing.assert_allclose(found, flux[1:] + share * flux[:-1], rtol=1e-14)
-
-
-def test_background_adds_a_constant():
-    flux = np.array([5.0, 20.0, 8e4])
-    gain = FluxGain(left=0.02, beam="left", power=-1, reference=100.0, mount="flux")
-    found = flux * gain.mueller(position=flux)[:, 0, 0]
-    np.testing.assert_allclose(found, flux + 2.0, rtol=1e-14)
-    assert gain.mueller(position=0.0)[0, 0] == 1
-
-
-def test_gain_does_not_polarize():
-    light = HarmonicGain(cosine=0.3)(1.6 * u.um, 2, 1, -0.5, 0.25)[1:]
-    np.testing.assert_allclose(light, 1.3 * np.array([2, 1, -0.5, 0.25]), rtol=1e-15)
-
-
-def test_differential_gain_keeps_the_sum_of_equal_beams():
-    both = [
-        HarmonicGain(sine=0.1, differential=True, beam=beam, mount="hwp").mueller(
-            position=[10, 50, 200] * u.deg
-        )
-        for beam in ("right", "left")
-    ]
-    np.testing.assert_allclose(sum(both), np.broadcast_to(2 * np.eye(4), (3, 4, 4)), atol=1e-15)
-    assert np.abs(both[0] - both[1]).max() > 0.1
 
 
 def test_wavelength_that_is_none_is_refused():

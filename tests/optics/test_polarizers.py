@@ -7,13 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics import (
     Diattenuator,
     DiattenuatorRetarder,
     LinearPolarizer,
-    LinearRetarder,
     StateAnalyser,
     VectorDiattenuator,
     WollastonPrism,
@@ -23,49 +21,10 @@ EPSILON = st.floats(-1, 1)
 DEGREES = st.floats(-360, 360)
 
 
-def test_polarizer_is_half_a_full_diattenuator():
-    for theta in (0, 20, 90) * u.deg:
-        np.testing.assert_allclose(
-            LinearPolarizer(theta=theta).mueller(),
-            Diattenuator(diattenuation=1, theta=theta).mueller() / 2,
-            rtol=0,
-            atol=1e-15,
-        )
-
-
-@given(angle=st.floats(-180, 180))
-def test_law_of_malus(angle):
-    _, intensity, *_ = LinearPolarizer(theta=angle * u.deg)(1.6 * u.um, 1, 1, 0, 0)
-    assert intensity == pytest.approx(np.cos(np.radians(angle)) ** 2, abs=1e-14)
-
-
 def test_calibration_polarizer_at_90_deg_gives_minus_q():
     # CHARIS paper, Sec. 4.1: the polarized calibration source is -Q
     light = LinearPolarizer(theta=90 * u.deg)(1.6 * u.um, 1, 0, 0, 0)[1:]
     np.testing.assert_allclose(light, [0.5, -0.5, 0, 0], atol=1e-15)
-
-
-def test_crossed_polarizers_extinguish():
-    chain = LinearPolarizer() | LinearPolarizer(theta=90 * u.deg)
-    np.testing.assert_allclose(chain(1.6 * u.um, 1, 0.2, 0.3, 0.4)[1:], np.zeros(4), atol=1e-16)
-
-
-@given(epsilon=EPSILON)
-def test_diattenuator_has_its_diattenuation(epsilon):
-    matrix = Diattenuator(diattenuation=epsilon).mueller()
-    np.testing.assert_array_equal(mueller.diattenuation_vector(matrix), [epsilon, 0, 0])
-    assert matrix[0, 0] == 1
-    assert mueller.is_physical(matrix)
-
-
-@given(epsilon=EPSILON)
-def test_negative_diattenuation_is_a_turn_by_90_deg(epsilon):
-    np.testing.assert_allclose(
-        Diattenuator(diattenuation=-epsilon).mueller(),
-        Diattenuator(diattenuation=epsilon, theta=90 * u.deg).mueller(),
-        rtol=0,
-        atol=1e-14,
-    )
 
 
 @given(epsilon=EPSILON, retardance=DEGREES)
@@ -82,29 +41,12 @@ def test_diattenuator_retarder_of_the_paper(epsilon, retardance):
     np.testing.assert_allclose(optic.mueller(), expected, rtol=0, atol=2e-8)
 
 
-@given(epsilon=EPSILON, retardance=DEGREES, theta=st.floats(-90, 90))
-def test_diattenuator_retarder_is_both_in_either_order(epsilon, retardance, theta):
-    theta = theta * u.deg
-    both = DiattenuatorRetarder(
-        diattenuation=epsilon, retardance=retardance * u.deg, theta=theta
-    ).mueller()
-    attenuate = Diattenuator(diattenuation=epsilon, theta=theta).mueller()
-    retard = LinearRetarder(retardance=retardance * u.deg, theta=theta).mueller()
-    np.testing.assert_allclose(both, attenuate @ retard, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(both, retard @ attenuate, rtol=0, atol=1e-13)
-
-
 def test_derivatives_are_finite_at_full_diattenuation():
     for epsilon in [-1.0, 1.0]:
         optic = DiattenuatorRetarder(diattenuation=epsilon, retardance=30 * u.deg)
         for derivative in optic.mueller_derivatives().values():
             assert np.all(np.isfinite(derivative.value)), epsilon
         assert optic.mueller_derivatives()["diattenuation"][0, 1] == 1, epsilon
-
-
-def test_mirror_is_a_half_wave_diattenuator_retarder():
-    mirror = DiattenuatorRetarder(diattenuation=0, retardance=180 * u.deg).mueller()
-    np.testing.assert_allclose(mirror, np.diag([1, 1, -1, -1]), atol=1e-15)
 
 
 def test_a_diattenuation_of_more_than_one_is_refused():

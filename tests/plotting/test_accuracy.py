@@ -20,7 +20,7 @@ def lines(axes):
     return {line.get_label().split(" ")[0].rstrip(":"): line for line in axes.lines}
 
 
-def test_curves_are_the_accuracy_table(elliptical):
+def test_curves_are_the_accuracy_table_with_units(elliptical):
     (axes,) = plot_accuracy(elliptical).axes
     drawn = lines(axes)
     assert list(drawn) == ["s_res", "s_mean", "s_cv"]
@@ -29,9 +29,15 @@ def test_curves_are_the_accuracy_table(elliptical):
         np.testing.assert_allclose(line.get_xdata(), [1200, 1400, 1600, 1900, 2200])
     assert len({line.get_marker() for line in drawn.values()}) == 3
     assert len({line.get_color() for line in drawn.values()}) == 3
+    assert axes.get_xlabel() == "wavelength (nm)"
+    assert axes.get_ylabel() == "accuracy (% of polarization)"
+    assert "n = 20" in axes.get_title()
+    assert "k = 6" in axes.get_title()
+    # calibration without data will do
+    assert len(plot_accuracy(replace(elliptical, measurement=None)).axes) == 1
 
 
-def test_legend_defines_every_curve_outside_the_axes(elliptical):
+def test_legend_defines_every_curve_outside_the_axes(elliptical, single_angle):
     figure = plot_accuracy(elliptical)
     figure.draw_without_rendering()
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -41,20 +47,12 @@ def test_legend_defines_every_curve_outside_the_axes(elliptical):
     assert "left out of the fit" in texts[2]
     box = figure.legends[0].get_window_extent()
     assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
-
-
-def test_labels_have_units(elliptical):
-    (axes,) = plot_accuracy(elliptical).axes
-    assert axes.get_xlabel() == "wavelength (nm)"
-    assert axes.get_ylabel() == "accuracy (% of polarization)"
-    assert "n = 20" in axes.get_title()
-    assert "k = 6" in axes.get_title()
-
-
-def test_unknown_cross_validation_is_said(single_angle):
     figure = plot_accuracy(single_angle)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[2].startswith("s_cv: not known")
+    cycles = replace(elliptical, fit=elliptical.fit | {"groups": "cycle"})
+    texts = [text.get_text() for text in plot_accuracy(cycles).legends[0].get_texts()]
+    assert "half-wave-plate cycles left out" in texts[2]
 
 
 def test_reference_curves_and_logarithmic_axis(elliptical):
@@ -67,25 +65,10 @@ def test_reference_curves_and_logarithmic_axis(elliptical):
     assert high > elliptical.accuracy["s_res"].value.max()
 
 
-def test_similar_values_are_drawn_on_a_linear_axis_from_zero(single_angle):
-    (axes,) = plot_accuracy(single_angle).axes
-    assert axes.get_yscale() == "linear"
-    assert axes.get_ylim()[0] == 0
-
-
 def test_one_panel_a_dataset(several):
     figure = plot_accuracy(several)
     assert [axes.get_title().split(":")[0] for axes in figure.axes] == ["polarized", "unpolarized"]
     assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
-
-
-def test_calibration_without_data_will_do(elliptical):
-    assert len(plot_accuracy(replace(elliptical, measurement=None)).axes) == 1
-
-
-def test_many_datasets_are_counted_in_the_title(elliptical):
-    many = replace(elliptical, datasets=elliptical.datasets * 3)
-    assert plot_accuracy(many).get_suptitle().endswith("bench: 3 datasets")
 
 
 def test_fit_that_did_not_converge_is_marked(elliptical):
@@ -141,13 +124,7 @@ def test_standard_of_another_source_has_its_own_panel(elliptical):
     np.testing.assert_allclose(drawn["s_cv"].get_ydata(), 0.1)
 
 
-def test_legend_says_what_was_left_out(elliptical):
-    cycles = replace(elliptical, fit=elliptical.fit | {"groups": "cycle"})
-    texts = [text.get_text() for text in plot_accuracy(cycles).legends[0].get_texts()]
-    assert "half-wave-plate cycles left out" in texts[2]
-
-
-def test_reference_without_units_is_refused(elliptical):
+def test_reference_without_units_or_of_other_length_is_refused(elliptical):
     for curve in [
         ([1200, 2200] * u.nm, [0.1, 0.2]),
         ([1200, 2200] * u.nm, [0.1, 0.2] * u.deg),
@@ -157,9 +134,6 @@ def test_reference_without_units_is_refused(elliptical):
     ]:
         with pytest.raises(ParameterError, match="reference 'mine' must be a pair"):
             plot_accuracy(elliptical, {"mine": curve})
-
-
-def test_reference_of_other_length_is_refused(elliptical):
     curve = ([1200, 1500, 2200] * u.nm, [0.1, 0.2] * u.percent)
     with pytest.raises(ParameterError, match="3 wavelengths but 2 accuracies"):
         plot_accuracy(elliptical, {"mine": curve})
@@ -231,10 +205,6 @@ def test_parts_are_named_and_unknown_ones_said(targets):
     one, *_, two = figure.axes[2].lines
     assert one.get_markersize() > two.get_markersize()
     assert one.get_linewidth() > two.get_linewidth()
-
-
-def test_labels_of_targets(targets):
-    figure, _, _ = targets
     assert [axes.get_ylabel() for axes in figure.axes] == ["accuracy (%)", "s_p (%)", "s_chi (°)"]
     assert figure.axes[-1].get_xlabel() == "wavelength (nm)"
     assert "target of 1 % at its worst angle" in legend(figure)
@@ -303,7 +273,7 @@ def checked(entry):
     return entry
 
 
-def test_star_is_drawn_with_its_errors(elliptical, entry):
+def test_star_and_catalogue_are_drawn_with_their_errors(elliptical, entry):
     figure = plot_star_check(elliptical, checked(entry))
     top, angle, bottom, off = figure.axes
     x, y, bars = points(top)
@@ -315,20 +285,14 @@ def test_star_is_drawn_with_its_errors(elliptical, entry):
     np.testing.assert_allclose(points(angle)[2], [2, 1, 3])
     np.testing.assert_allclose(points(bottom)[1], [-0.1, -0.1, -0.1])
     np.testing.assert_allclose(points(off)[1], [0.5, -0.5, -1.5])
-
-
-def test_catalogue_is_a_line_with_its_band(elliptical, entry):
-    top = plot_star_check(elliptical, checked(entry)).axes[0]
+    # catalogue is a line with its band
     line = curves(top)["catalogue, with the published errors"]
     assert line.get_ydata().tolist() == [3.1, 2.1, 1.1]
     (band,) = [c for c in top.collections if c.get_alpha() == 0.2]
     edges = band.get_paths()[0].vertices[:, 1]
     assert edges.max() == pytest.approx(3.12)
     assert edges.min() == pytest.approx(1.07)
-
-
-def test_dashes_are_the_errors_of_single_cycles(elliptical, entry):
-    figure = plot_star_check(elliptical, checked(entry))
+    # dashes are the errors of single cycles
     dashed = [line for line in figure.axes[2].lines if line.get_linestyle() == "--"]
     np.testing.assert_allclose([line.get_ydata() for line in dashed],
                                [[0.6, 0.5, 0.7], [-0.6, -0.5, -0.7]])  # fmt: skip

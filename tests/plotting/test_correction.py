@@ -85,10 +85,7 @@ def test_fractions_are_drawn_in_percent_with_photon_noise(star):
         # two of the four frames tell q, with the photons of both beams
         expected = 100 / np.sqrt(2 * np.array([1e6, 2e6, 0.5e6]))
         np.testing.assert_allclose(error, expected, rtol=0.01)
-
-
-def test_looks_of_q_and_u_differ_by_more_than_colour(star):
-    top = plot_spectrum(star).axes[0]
+    # looks of q and u differ by more than colour
     looks = {(c.lines[0].get_marker(), c.lines[0].get_color()) for c in top.containers}
     assert len({marker for marker, _ in looks}) == len({color for _, color in looks}) == 2
 
@@ -107,14 +104,11 @@ def test_the_error_of_the_degree_is_drawn_on_a_logarithmic_axis(star):
     assert legend(figure) == ["q, statistical error", "u, statistical error", "$s_p$, statistical"]
 
 
-def test_condition_of_an_ideal_instrument(star):
+def test_condition_is_drawn_by_its_logarithm_beyond_a_thousand(star, monkeypatch):
     bottom = plot_spectrum(star).axes[2]
     np.testing.assert_allclose(bottom.lines[0].get_ydata(), star.condition)
     assert bottom.get_yscale() == "linear"
     assert bottom.get_ylim()[0] == 1
-
-
-def test_a_condition_beyond_a_thousand_is_drawn_by_its_logarithm(star, monkeypatch):
     monkeypatch.setattr(star, "condition", np.array([2.0, 5.0, 1e6]))
     assert plot_spectrum(star).axes[2].get_yscale() == "log"
 
@@ -174,15 +168,13 @@ def test_error_of_a_mean_is_less_by_the_root_of_its_number(images):
     assert "mean of 3 wavelengths, 1200 to 2200 nm" in plot_images(images).get_suptitle()
 
 
-def test_polarization_has_one_symmetric_scale(images):
+def test_scales_of_intensity_and_polarization(images):
+    """Polarization has one symmetric scale; intensity is logarithmic, dark pixels are darkest."""
     found = panels(plot_images(images))
     limits = {found[name].images[0].get_clim() for name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$")}
     ((low, high),) = limits
     assert low == -high < 0
     assert found["statistical error of Q"].images[0].get_clim()[0] == 0
-
-
-def test_intensity_is_logarithmic_and_dark_pixels_are_darkest(images):
     image = panels(plot_images(images, wavelength=0))["I"].images[0]
     assert type(image.norm).__name__ == "LogNorm"
     assert image.get_array().min() >= image.norm.vmin

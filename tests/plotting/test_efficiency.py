@@ -42,9 +42,7 @@ def test_lines_are_the_wavelengths_asked_for(figure):
     )
     np.testing.assert_allclose(lines[1].get_ydata(), expected[:, 9])
     assert lines[1].get_ydata().min() < 0.4
-
-
-def test_axes_are_labelled_with_units(figure):
+    # axes are labelled with units
     labels = [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes[:3]]
     assert labels == [
         ("derotator angle (deg)", "measured share of the polarization"),
@@ -130,7 +128,7 @@ def seen():
 
 
 @pytest.mark.slow
-def test_curves_are_the_tables(seen):
+def test_curves_are_the_tables_and_thick_where_the_star_is_observable(seen):
     upper, lower = plot_observability(seen).axes
     dotted = [line for line in upper.lines if line.get_linestyle() == ":" and len(line.get_xdata())]
     for line, star in zip(dotted, seen, strict=True):
@@ -140,11 +138,6 @@ def test_curves_are_the_tables(seen):
     dotted = [line for line in lower.lines if line.get_linestyle() == ":"]
     for line, star in zip(dotted, seen, strict=True):
         np.testing.assert_allclose(line.get_ydata(), star.table["parallactic"].value)
-
-
-@pytest.mark.slow
-def test_thick_curves_are_only_where_the_star_is_observable(seen):
-    upper, _ = plot_observability(seen).axes
     thick = [line for line in upper.lines if line.get_linewidth() == 2]
     for line, star in zip(thick, seen, strict=True):
         drawn = np.isfinite(line.get_ydata())

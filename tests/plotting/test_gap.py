@@ -93,9 +93,6 @@ def test_maps_have_one_scale_and_grey_masks(gap):
     assert meshes[0].get_clim()[0] == -meshes[0].get_clim()[1]
     assert np.ma.getmaskarray(meshes[0].get_array()).sum() == 1
     assert "before" in figure.axes[0].get_title(loc="left")
-
-
-def test_map_of_the_sums(gap):
     assert "sum" in plot_gap_maps(gap, channel="sum").get_suptitle()
     with pytest.raises(ParameterError, match="product"):
         plot_gap_maps(gap, channel="product")

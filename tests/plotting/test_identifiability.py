@@ -223,14 +223,12 @@ def test_calibration_from_a_file(tmp_path, elliptical):
     assert panel(plot_identifiability(read, hwp=FULL), "(c)").patches
 
 
-def test_identifiability_alone(undetermined):
+def test_identifiability_alone(undetermined, elliptical):
     figure = plot_identifiability(undetermined.identifiability)
     rows = [text.get_text() for text in panel(figure, "(b)").get_yticklabels()]
     assert all(row.startswith("open") for row in rows)
     assert not panel(figure, "(a)").child_axes
-
-
-def test_full_rank_without_errors_has_nothing_to_load(elliptical):
+    # full rank without errors has nothing to load
     figure = plot_identifiability(elliptical.identifiability)
     (text,) = panel(figure, "(b)").texts
     assert text.get_text() == "no open direction; errors are not known"
@@ -287,7 +285,8 @@ def drawn(figure):
 
 
 def test_matrix_is_that_of_the_calibration(elliptical):
-    figure = plot_correlations(elliptical)
+    figure = Figure()
+    assert plot_correlations(elliptical, figure=figure) is figure
     np.testing.assert_allclose(drawn(figure), elliptical.covariance.correlation)
     (mesh,) = figure.axes[0].collections
     assert mesh.get_clim() == (-1, 1)
@@ -295,19 +294,17 @@ def test_matrix_is_that_of_the_calibration(elliptical):
     assert figure.axes[0].yaxis_inverted()
     assert not figure.legends
     assert "Correlations" in figure.get_suptitle()
-
-
-def test_groups_are_named_once(elliptical):
-    labels = [text.get_text() for text in plot_correlations(elliptical).axes[0].get_yticklabels()]
+    # groups are named once
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert labels[0] == "hwp.w_sio2"
     assert "derotator.horizontal (5)" in labels
     assert len(labels) == len({name.split("[")[0] for name in elliptical.covariance.names})
-
-
-def test_common_parameters_are_wider(elliptical):
-    (mesh,) = plot_correlations(elliptical).axes[0].collections
+    # common parameters are wider
     widths = np.diff(mesh.get_coordinates()[0, :, 0])
     assert widths[0] > 3 * widths[-1]
+    # large matrices have no numbers
+    assert len(elliptical.covariance) > 12
+    assert not figure.axes[0].texts
 
 
 def test_undetermined_parameters_are_listed_and_not_drawn(undetermined):
@@ -333,20 +330,10 @@ def test_small_matrices_have_numbers():
     assert texts == ["1.00", "\N{MINUS SIGN}0.50", "\N{MINUS SIGN}0.50", "1.00"]
 
 
-def test_large_matrices_have_none(elliptical):
-    assert len(elliptical.covariance) > 12
-    assert not plot_correlations(elliptical).axes[0].texts
-
-
 def test_resamples_are_drawn():
     samples = np.random.default_rng(0).normal(size=(50, 2))
     made = Resampled(["a.theta", "b.x"], [u.deg, None], samples, "pair", 8, 0)
     np.testing.assert_allclose(drawn(plot_correlations(made)), np.corrcoef(samples.T))
-
-
-def test_figure_may_be_given(elliptical):
-    figure = Figure()
-    assert plot_correlations(elliptical, figure=figure) is figure
 
 
 def test_nothing_to_draw_is_refused():

@@ -50,7 +50,7 @@ def hollow(axes):
 # ---- retardances -------------------------------------------------------------------
 
 
-def test_one_panel_a_retardance_with_units(elliptical):
+def test_one_panel_a_retardance_with_units(elliptical, two_step):
     figure = plot_retardances(elliptical)
     titles = [axes.get_title().split("\n")[0] for axes in figure.axes]
     assert titles == [
@@ -61,6 +61,12 @@ def test_one_panel_a_retardance_with_units(elliptical):
     ]
     assert all(axes.get_ylabel().endswith("(°)") for axes in figure.axes)
     assert {axes.get_xlabel() for axes in figure.axes} == {"", "wavelength (nm)"}
+    # a linear derotator has one
+    figure = plot_retardances(two_step)
+    assert [a.get_title().split("\n")[0] for a in figure.axes] == [
+        "hwp: law",
+        "derotator: retardance",
+    ]
 
 
 def test_points_and_errors_are_the_parameters(elliptical):
@@ -106,9 +112,7 @@ def test_law_is_a_fine_curve_with_its_band(elliptical):
     expected = np.sqrt(unit @ cov.matrix[np.ix_(index, index)] @ unit)
     assert width == pytest.approx(expected, rel=1e-5)
     assert f"{float(hwp.w_sio2.value):.4f}" in axes.get_title()
-
-
-def test_half_wave_line_is_drawn_only_near_it(elliptical):
+    # half wave line is drawn only near it
     figure = plot_retardances(elliptical)
     assert by_label(panel(figure, "hwp"), "half wave")
     assert not by_label(panel(figure, "derotator: circular"), "half wave")
@@ -124,9 +128,7 @@ def test_two_step_calibration_has_a_dot_a_wavelength(two_step, elliptical):
     law = two_step.chain["hwp"].retardance(LAMBDA * u.nm).to_value(u.deg)
     assert np.abs(dots.get_ydata() - law).max() < 5
     assert not by_label(panel(plot_retardances(elliptical), "hwp"), "fitted per wavelength")
-
-
-def test_dots_a_turn_away_are_drawn_beside_the_law(two_step):
+    # dots a turn away are drawn beside the law
     stage = two_step.stages[0]
     turned = stage["parameters"]["hwp.retardance"] + [360, 0, -360, 0, 720] * u.deg
     stages = [stage | {"parameters": stage["parameters"] | {"hwp.retardance": turned}}]
@@ -134,14 +136,6 @@ def test_dots_a_turn_away_are_drawn_beside_the_law(two_step):
     (dots,) = by_label(axes, "fitted per wavelength")
     law = two_step.chain["hwp"].retardance(LAMBDA * u.nm).to_value(u.deg)
     assert np.abs(dots.get_ydata() - law).max() < 5
-
-
-def test_linear_derotator_has_one_panel(two_step):
-    figure = plot_retardances(two_step)
-    assert [a.get_title().split("\n")[0] for a in figure.axes] == [
-        "hwp: law",
-        "derotator: retardance",
-    ]
 
 
 def test_fixed_retardance_is_a_dotted_line(single_angle):
@@ -189,12 +183,6 @@ def test_tied_parameter_says_what_it_follows():
     )
 
 
-def test_chain_without_retarder_is_refused(scalar):
-    bare = replace(scalar, chains=[optics.WollastonPrism(name="wollaston")])
-    with pytest.raises(ChainError, match="no retarder"):
-        plot_retardances(bare)
-
-
 @pytest.mark.slow
 def test_legend_lies_outside_the_axes(undetermined):
     for draw in [plot_retardances, plot_efficiency, plot_parameters]:
@@ -209,7 +197,7 @@ def test_legend_lies_outside_the_axes(undetermined):
 # ---- efficiency --------------------------------------------------------------------
 
 
-def test_efficiency_has_errors_and_marks_points_at_the_bound(at_bound):
+def test_efficiency_has_errors_and_marks_points_at_the_bound(at_bound, elliptical):
     figure = plot_efficiency(at_bound)
     (axes,) = figure.axes
     entry = at_bound.parameter_values()["wollaston.efficiency"]
@@ -222,34 +210,22 @@ def test_efficiency_has_errors_and_marks_points_at_the_bound(at_bound):
     np.testing.assert_allclose(half_lengths(container), entry["std"][~bound], rtol=1e-6)
     assert legend_texts(figure)[:2] == ["fitted, with 1\N{GREEK SMALL LETTER SIGMA} error",
                                         "boxed: at a bound, so no error"]  # fmt: skip
-
-
-def test_efficiency_shows_the_perfect_value(elliptical):
     (axes,) = plot_efficiency(elliptical).axes
     assert by_label(axes, "perfect")[0].get_ydata()[0] == 1
     assert not by_label(axes, "boxed")
     assert axes.get_title() == "wollaston.efficiency"
 
 
-def test_chain_without_efficiency_is_refused(elliptical):
-    bare = replace(elliptical, chains=[optics.ParityFlip(name="nbs")])
-    with pytest.raises(ChainError, match="efficiency"):
-        plot_efficiency(bare)
-
-
 # ---- any parameter -----------------------------------------------------------------
 
 
-def test_all_free_parameters_given_per_wavelength(several):
+def test_free_and_chosen_parameters_with_their_units(several):
     figure = plot_parameters(several)
     assert {axes.get_title() for axes in figure.axes} == {
         "derotator.retardance",
         "wollaston.efficiency",
         "fold_mirror.diattenuation",
     }
-
-
-def test_chosen_parameters_with_their_units(several):
     first, second = plot_parameters(several, ["hwp.w_sio2", "fold_mirror.diattenuation"]).axes
     labels = [axes.get_ylabel().replace("\n", " ") for axes in (first, second)]
     assert labels == [
@@ -260,14 +236,17 @@ def test_chosen_parameters_with_their_units(several):
     np.testing.assert_allclose(second.containers[0][0].get_ydata(), entry["value"])
 
 
-def test_unknown_parameter_is_refused_with_a_hint(several):
-    with pytest.raises(ParameterError, match=r"did you mean 'hwp\.w_sio2'"):
-        plot_parameters(several, ["hwp.w_sio"])
-
-
-def test_nothing_to_draw_is_said(scalar):
+def test_nothing_to_draw_is_said(scalar, elliptical, several):
     with pytest.raises(ChainError, match="nothing to draw"):
         plot_parameters(scalar)
+    bare = replace(scalar, chains=[optics.WollastonPrism(name="wollaston")])
+    with pytest.raises(ChainError, match="no retarder"):
+        plot_retardances(bare)
+    bare = replace(elliptical, chains=[optics.ParityFlip(name="nbs")])
+    with pytest.raises(ChainError, match="efficiency"):
+        plot_efficiency(bare)
+    with pytest.raises(ParameterError, match=r"did you mean 'hwp\.w_sio2'"):
+        plot_parameters(several, ["hwp.w_sio"])
 
 
 NM = np.array([1600.0, 1200.0, 2200.0])
@@ -303,7 +282,7 @@ def labels(axes):
 # ---- values per wavelength -----------------------------------------------------------------
 
 
-def test_kinds_ofparameters_are_told_by_their_shape():
+def test_kinds_of_parameters_are_told_by_their_shape():
     axes = drawn(entry([1.0, 2.0, 3.0], [0.1, np.nan, 0.3], [False, False, True]))
     hollow = [one for one in axes.lines if one.get_markerfacecolor() == "white"]
     boxes = [one for one in axes.lines if one.get_marker() == "s"]
@@ -312,9 +291,7 @@ def test_kinds_ofparameters_are_told_by_their_shape():
     assert hollow[0].get_xdata().tolist() == [1200, 2200]
     assert boxes[0].get_xdata().tolist() == [2200]
     assert set(labels(axes)) == {parameters._DETERMINED, parameters._ALONE, parameters._BOUND}
-
-
-def test_at_a_bound_alone_is_not_called_open():
+    # at a bound alone is not called open
     axes = drawn(entry([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [True, False, False]))
     assert set(labels(axes)) == {parameters._DETERMINED, parameters._BOUND}
 
@@ -540,13 +517,10 @@ def test_panels_labels_and_changes(years):
     ]  # fmt: skip
 
 
-def test_values_are_those_of_the_calibrations(years):
+def test_values_of_a_history_and_its_wavelengths(years):
     (ax,) = plot_history(years, ["hwp.w_sio2"]).axes
     drawn = ax.lines[0].get_ydata()
     assert drawn == pytest.approx([c.chain["hwp"].w_sio2.value for c in years])
-
-
-def test_wavelengths_shown(years):
     figure = plot_history(years, ["derotator.retardance"], shown=2)
     legend = figure.axes[0].get_legend()
     assert [t.get_text() for t in legend.get_texts()] == ["1200 nm", "2200 nm"]

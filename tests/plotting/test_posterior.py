@@ -47,15 +47,11 @@ def rendered(figure, tmp_path):
 
 
 @pytest.mark.slow
-def test_corner_shows_every_pair(corner_plot):
+def test_corner_shows_every_pair_with_units_and_what_is_taken_off(corner_plot):
     assert len(corner_plot.axes) == 9
     panels = np.array(corner_plot.axes).reshape(3, 3)
     assert texts(panels[1, 0]) == ["r = 0.9999"] or texts(panels[1, 0]) == ["r = 1.0000"]
     assert [axes.get_title() for axes in panels.diagonal()] == ["τ = 1 steps"] * 3
-
-
-@pytest.mark.slow
-def test_corner_labels_have_units_and_what_is_taken_off(corner_plot):
     bottom = corner_plot.axes[6:]
     assert [axes.get_xlabel().split("\n")[0] for axes in bottom] == [
         "hwp",
@@ -109,10 +105,7 @@ def test_corner_of_some_parameters(posterior):
     pytest.importorskip("corner")
     figure = plot_corner(posterior, NAMES[:1])
     assert len(figure.axes) == 1
-
-
-def test_corner_of_a_chain_that_is_too_short_says_so():
-    pytest.importorskip("corner")
+    # corner of a chain that is too short says so
     assert "CHAIN TOO SHORT" in plot_corner(make_posterior(40)).get_suptitle()
 
 
@@ -169,15 +162,13 @@ def test_traces_show_all_walkers(posterior, tmp_path):
     assert correlations[0].lines[0].get_ydata()[0] == 1.0
 
 
-def test_long_traces_are_thinned_and_steps_are_those_of_the_sampler():
+def test_long_traces_are_thinned():
     thin = Posterior.from_dict(make_posterior(9000).to_dict() | {"thin": 3})
     (axes, _) = plot_traces(thin, NAMES[:1]).axes
     steps = axes.lines[0].get_xdata()
     assert len(steps) <= 4500
     assert steps[-1] > 26000
-
-
-def test_traces_of_many_walkers_do_not_draw_every_step():
+    # of many walkers too
     chain = np.random.default_rng(1).normal(size=(900, 186, 1))
     (axes, _) = plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes
     assert len(axes.lines) == 187

@@ -219,18 +219,12 @@ def test_draws_into_a_given_figure(elliptical):
     assert len(mine.axes) == 2
 
 
-def test_unknown_dataset_is_refused(elliptical):
+def test_unknown_datasets_and_wavelengths_are_refused(elliptical):
     for dataset in [1, -1, True, "polarized", 0.5]:
         with pytest.raises(ParameterError, match="allowed are whole numbers 0 to 0"):
             plot_double_differences(elliptical, dataset=dataset)
-
-
-def test_wavelength_out_of_range_is_refused(elliptical):
     with pytest.raises(WavelengthRangeError, match=r"3000 nm; simulated has 1200\.0 to 2200\.0"):
         plot_double_differences(elliptical, [1600, 3000] * u.nm)
-
-
-def test_wavelength_without_unit_of_length_is_refused(elliptical):
     for wavelengths in [1600, [1600, 1700] * u.deg]:
         with pytest.raises(ParameterError, match="needs a unit such as nm"):
             plot_double_differences(elliptical, wavelengths)
@@ -385,14 +379,10 @@ def test_wavelengths_are_spread_over_the_range():
     # away from the ends, where the data are poor
     assert found[0] > 0
     assert found[-1] < 21
-
-
-def test_few_wavelengths_are_all_drawn_in_order():
+    # few wavelengths are all drawn in order
     assert lambdas([1600, 1200, 2200]).spread_bins(4).tolist() == [1, 0, 2]
     assert lambdas([1600, 1200, 2200, 1900, 1400]).spread_bins(4).tolist() == [1, 4, 3, 2]
-
-
-def test_a_wavelength_without_data_is_not_drawn():
+    # a wavelength without data is not drawn
     known = np.arange(5) != 2
     assert 2 not in lambdas(np.arange(5) + 1200.0, known).spread_bins(5)
 
@@ -447,6 +437,9 @@ def test_margins_are_the_root_mean_squares(drawn):
     np.testing.assert_allclose(line.get_ydata(), np.sort(grid.wavelength))
     assert right.get_xlim()[0] == 0
     assert right.get_xlim()[1] > line.get_xdata().max()
+    # tallest bar has room above
+    tallest = np.nanmax(above.patches[0].get_data().values)
+    assert above.get_ylim()[1] == pytest.approx(1.05 * tallest)
 
 
 def test_colours_are_symmetric_and_the_same_in_all_maps(several):
@@ -527,9 +520,3 @@ def test_maps_of_other_size_have_a_scale_of_their_own():
     scales, shared = _scales([large, alike])
     assert shared
     assert scales[0] == scales[1]
-
-
-def test_tallest_bar_has_room_above(drawn):
-    above = parts(drawn[0])[1]
-    tallest = np.nanmax(above.patches[0].get_data().values)
-    assert above.get_ylim()[1] == pytest.approx(1.05 * tallest)

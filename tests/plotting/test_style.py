@@ -32,14 +32,11 @@ def lightness(color):
     return 116 * np.cbrt(y) - 16 if y > 0.008856 else 903.3 * y
 
 
-def test_pairs_of_colour_and_marker_do_not_repeat_soon():
+def test_looks_do_not_repeat_soon_and_differ_from_the_paper():
     pairs = _style.looks(72)
     assert len(set(pairs)) == 72
     assert _style.looks(73)[72] == pairs[0]
     assert _style.looks(0) == []
-
-
-def test_neighbouring_colours_and_all_lines_differ_from_the_paper():
     assert len(set(_style.COLORS)) == len(_style.COLORS)
     # on white a line needs some darkness
     assert max(map(lightness, _style.COLORS)) < 75
@@ -64,9 +61,7 @@ def test_a_figure_keeps_legends_out_of_its_panels():
         assert own.get_size_inches().tolist() == [9, 9]
     for figure in (new, own):
         assert type(figure.get_layout_engine()).__name__ == "ConstrainedLayoutEngine"
-
-
-def test_a_layout_that_was_chosen_is_kept():
+    # a layout that was chosen is kept
     own = Figure(layout="tight")
     with _style.canvas(own, 1, 1) as kept:
         assert type(kept.get_layout_engine()).__name__ == "TightLayoutEngine"
@@ -116,9 +111,7 @@ def test_a_line_is_drawn_in_the_order_of_the_wavelengths():
 def test_wavelengths_in_any_unit_are_nanometres():
     np.testing.assert_allclose(_style.nanometres(1.6 * u.um), [1600.0])
     np.testing.assert_allclose(_style.nanometres([12000, 16000] * u.AA), [1200.0, 1600.0])
-
-
-def test_wavelengths_need_a_unit():
+    # wavelengths need a unit
     for wavelength in [1600.0, [1.2, 1.6], 3 * u.deg, None]:
         with pytest.raises(ParameterError, match="needs a unit such as nm"):
             _style.nanometres(wavelength)

@@ -69,7 +69,7 @@ def write_cube(path, cube, *, drop=(), extra_hdus=(), **changes):
     cards = [(key, value) for key, value in header.items() if key not in drop]
     hdus = [fits.PrimaryHDU(header=fits.Header(cards))]
     hdus += [] if cube is None else [fits.ImageHDU(np.asarray(cube, dtype="f4"))]
-    fits.HDUList([*hdus, *extra_hdus]).writeto(path)
+    fits.HDUList([*hdus, *extra_hdus]).writeto(path, overwrite=True)
     return path
 
 

@@ -52,23 +52,21 @@ def test_numbers_that_nobody_could_read_back_are_refused(tmp_path):
         assert not (tmp_path / "run").exists(), options
 
 
-@pytest.mark.parametrize(
-    ("layout", "there"),
-    [
+def test_one_file_that_exists_stops_the_run(tmp_path):
+    for i, (layout, there) in enumerate([
         (CHARIS, "CRSA00000002_cube.fits"),
         (CHARIS, "raw/CRSA00000001.fits"),
         (TWO, "v_00000002_cam1.fits"),
         # the file of the left beam, which has no place in the list
         (TWO, "v_00000001_cam2.fits"),
-    ],
-)
-def test_one_file_that_exists_stops_the_run(tmp_path, layout, there):
-    (tmp_path / "raw").mkdir()
-    (tmp_path / there).write_text("old")
-    words = rf"{Path(there).name}: exists already; overwrite=True replaces it"
-    with pytest.raises(ObservationError, match=words):
-        names(tmp_path, layout)
-    assert len(names(tmp_path, layout, overwrite=True)) == 2
+    ]):  # fmt: skip
+        folder = tmp_path / str(i)
+        (folder / "raw").mkdir(parents=True)
+        (folder / there).write_text("old")
+        words = rf"{Path(there).name}: exists already; overwrite=True replaces it"
+        with pytest.raises(ObservationError, match=words):
+            names(folder, layout)
+        assert len(names(folder, layout, overwrite=True)) == 2, there
 
 
 def test_impossible_folders(tmp_path):

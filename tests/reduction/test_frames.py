@@ -90,26 +90,13 @@ def test_extension_of_another_size_is_no_weight(small, tmp_path, flat_cube):
     assert good.all()
 
 
-def test_weights_and_errors_that_are_no_numbers_mark_pixels_without_a_value(
-    small, tmp_path, flat_cube
-):
-    weight = np.ones_like(flat_cube)
-    weight[0, 0, :4] = 0.0, -1.0, np.nan, np.inf
-    for kind in ("inverse variance", "error"):
-        path = tmp_path / f"{kind}.fits"
-        write_cube(path, flat_cube, extra_hdus=[fits.ImageHDU(weight)])
-        _, good = opened(path, replace(small.files, weights=kind))
-        assert not good[0, 0, :4].any(), kind
-        assert good.sum() == good.size - 4, kind
-
-
-@pytest.mark.parametrize(("kind", "dtype"), [("f8", "f8"), (">f4", "f4"), ("i2", "f8")])
-def test_pixels_become_native_floats(small, tmp_path, flat_cube, kind, dtype):
-    hdus = [fits.PrimaryHDU(), fits.ImageHDU(flat_cube.astype(kind))]
-    fits.HDUList(hdus).writeto(tmp_path / "a.fits")
-    cube, _ = opened(tmp_path / "a.fits", small.files)
-    assert cube.dtype == np.dtype(dtype)
-    np.testing.assert_allclose(cube, flat_cube.astype(kind).astype(float), rtol=1e-6)
+def test_pixels_become_native_floats(small, tmp_path, flat_cube):
+    for kind, dtype in [("f8", "f8"), (">f4", "f4"), ("i2", "f8")]:
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(flat_cube.astype(kind))]
+        fits.HDUList(hdus).writeto(tmp_path / "a.fits", overwrite=True)
+        cube, _ = opened(tmp_path / "a.fits", small.files)
+        assert cube.dtype == np.dtype(dtype), (kind, dtype)
+        np.testing.assert_allclose(cube, flat_cube.astype(kind).astype(float), rtol=1e-6)
 
 
 def test_complex_shapes_are_refused(small, tmp_path):
@@ -152,21 +139,22 @@ def test_checksums_that_do_not_match_are_found_wherever_files_are_read(small, tm
 # ---- headers ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("changes", "drop", "words"),
-    [
+def test_errors_of_a_header_are_listed_once(small, tmp_path, flat_cube):
+    for changes, drop, words in [
         ({}, ["RET-ANG1"], ["no keyword RET-ANG1 in its header"]),
         ({}, ["RET-ANG1", "D_IMRANG"], ["no keyword RET-ANG1", "no keyword D_IMRANG"]),
         # a keyword that is wrong is not missing as well
         ({"RET__ANG1": "x"}, [], ["RET-ANG1 = 'x', a number is needed"]),
         ({"INSTRUME": "HICIAO"}, [], ["INSTRUME = 'HICIAO', allowed are CHARIS"]),
-    ],
-)
-def test_errors_of_a_header_are_listed_once(small, tmp_path, flat_cube, changes, drop, words):
-    path = write_cube(tmp_path / "CRSA00000001.fits", flat_cube, drop=drop, **changes)
-    errors = reduce_frame(path, small.files).errors
-    assert len(errors) == len(words)
-    assert all(error.startswith(word) for error, word in zip(errors, words, strict=True))
+    ]:
+        path = write_cube(tmp_path / "CRSA00000001.fits", flat_cube, drop=drop, **changes)
+        errors = reduce_frame(path, small.files).errors
+        assert len(errors) == len(words), (changes, drop, words)
+        assert all(error.startswith(word) for error, word in zip(errors, words, strict=True)), (
+            changes,
+            drop,
+            words,
+        )
 
 
 def test_time_is_completed_from_date_or_mjd(small, tmp_path, flat_cube):
@@ -299,3 +287,16 @@ def test_pointing_follows_from_place_and_time_but_what_is_known_stays():
 def test_star_without_pointing_is_an_error_that_says_both():
     (error,) = starred(without=["parallactic", "hwp_true"]).errors
     assert error.startswith("no keyword PARANG in its header, and no ")
+
+
+def test_weights_and_errors_that_are_no_numbers_mark_pixels_without_a_value(
+    small, tmp_path, flat_cube
+):
+    weight = np.ones_like(flat_cube)
+    weight[0, 0, :4] = 0.0, -1.0, np.nan, np.inf
+    for kind in ("inverse variance", "error"):
+        path = tmp_path / f"{kind}.fits"
+        write_cube(path, flat_cube, extra_hdus=[fits.ImageHDU(weight)])
+        _, good = opened(path, replace(small.files, weights=kind))
+        assert not good[0, 0, :4].any(), kind
+        assert good.sum() == good.size - 4, kind

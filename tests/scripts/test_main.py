@@ -44,23 +44,15 @@ def fail(error):
     raise error
 
 
-def test_good_work_is_status_zero(running, capsys):
+def test_exit_status_and_one_line(running, capsys, monkeypatch):
     assert running(lambda: print("done")) == 0
     assert capsys.readouterr().out == "done\n"
-
-
-def test_bad_input_is_one_line_and_status_two(running, capsys):
     assert running(lambda: fail(ObservationError("run.ecsv:\n  row 3\tis bad"))) == 2
     out, err = capsys.readouterr()
     assert (out, err) == ("", "astropolcal: error: run.ecsv: row 3 is bad\n")
-
-
-def test_interruption_is_status_130(running, capsys):
     assert running(lambda: fail(KeyboardInterrupt())) == 130
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
-
-
-def test_interruption_while_the_commands_are_loaded(monkeypatch, capsys):
+    # interruption while the commands are loaded
     monkeypatch.setattr(module, "build_parser", lambda: fail(KeyboardInterrupt()))
     assert main([]) == 130
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
@@ -101,6 +93,10 @@ def test_warnings_go_to_standard_error_in_one_line(running, capsys):
 
     assert running(warn) == 0
     assert capsys.readouterr() == ("", "astropolcal: warning: two lines\n")
+    # how warnings are shown is put back
+    before = warnings.showwarning
+    running(lambda: None)
+    assert warnings.showwarning is before
 
 
 _COMPLETED = """
@@ -144,12 +140,6 @@ def test_completion_says_what_it_needs(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main(["--print-completion", "zsh"])
     assert 'pip install "astropolcal[completion]"' in capsys.readouterr().err
-
-
-def test_how_warnings_are_shown_is_put_back(running):
-    before = warnings.showwarning
-    running(lambda: None)
-    assert warnings.showwarning is before
 
 
 def test_a_reader_that_has_gone_is_no_error(running, tmp_path, monkeypatch):
@@ -342,15 +332,12 @@ def test_every_help_has_examples():
     assert "examples:\n  astropolcal " in build_parser().format_help()
 
 
-def test_commands_that_do_something_can_be_quiet():
-    assert set(QUIET) == set(COMMANDS)
-
-
 def test_quiet_means_the_same_everywhere():
     for command in QUIET:
         action = COMMANDS[command]._option_string_actions["--quiet"]
         assert action is COMMANDS[command]._option_string_actions["-q"], command
         assert action.help == "print only warnings and errors", command
+    assert set(QUIET) == set(COMMANDS)
 
 
 @pytest.fixture(scope="module")

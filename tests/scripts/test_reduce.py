@@ -73,15 +73,12 @@ def test_words_that_cannot_be_read(cubes, tmp_path, capsys):
         assert words[1].split(",")[0] in capsys.readouterr().err, words
 
 
-def test_what_is_written_and_who_took_it_are_known_before_the_work(cubes, tmp_path):
+def test_what_is_written_and_read_is_known_before_the_work(cubes, tmp_path):
     with pytest.raises(AstropolcalError, match=r"-o obs\.fits: the name must end with \.ecsv"):
         command(cubes, "-o", "obs.fits")
     with pytest.raises(InstrumentError, match=r"did you mean 'charis'\?") as caught:
         command(cubes, "-o", tmp_path / "obs.ecsv", "--instrument", "charsi")
     assert all(name in str(caught.value) for name in instruments.names())
-
-
-def test_missing_places(cubes, tmp_path):
     with pytest.raises(AstropolcalError, match="no folder"):
         command(cubes, "-o", tmp_path / "a" / "obs.ecsv")
     empty = tmp_path / "empty"
@@ -129,7 +126,7 @@ def said(capsys, reduction, figures=(), **options):
     return capsys.readouterr()
 
 
-def test_run_without_fault_is_the_summary(capsys):
+def test_report_of_a_run(capsys):
     out, err = said(capsys, Reduced())
     assert out.splitlines() == [
         "Usable",
@@ -140,17 +137,13 @@ def test_run_without_fault_is_the_summary(capsys):
     ]
     assert err == ""
     assert "\nDetermined  1 frame, 0 of 4 c" in said(capsys, Reduced(n_frames=1)).out
-
-
-def test_what_is_lost_is_in_the_verdict(capsys):
+    # what is lost is in the verdict
     for reduction, words in [
         (Reduced(2, doubts={"a": [DOUBT]}), "Usable: 2 files left out, 1 file doubtful"),
         (Reduced(flags={"edge": 8}), "NOT USABLE AS IT IS: all cells are masked"),
     ]:
         assert words in said(capsys, reduction).out.splitlines(), words
-
-
-def test_masked_cells_and_figures_are_counted(capsys):
+    # masked cells and figures are counted
     out = said(capsys, Reduced(flags={"saturated": 3, "edge": 1}), ["a.png"]).out
     lines = out.splitlines()
     assert lines[:2] == ["  masked, saturated: 3 cells", "  masked, edge: 1 cell"]

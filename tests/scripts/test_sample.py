@@ -326,15 +326,6 @@ def test_tables_of_something_else(calibration, table, capsys, tmp_path):
     assert "same frames" in fails(capsys, calibration, table, table)
 
 
-@pytest.mark.slow
-def test_table_that_is_missing(capsys, tmp_path):
-    tables = [make_table(tmp_path / f"{i}.ecsv", i) for i in (1, 2)]
-    assert main(["calibrate", *tables, "-q", "-o", str(tmp_path / "both.asdf")]) == 0
-    complaint = fails(capsys, tmp_path / "both.asdf", tables[0])
-    assert "also made from 2 (content hash" in complaint
-    assert "give that table" in complaint
-
-
 def test_bad_options_get_one_line_and_status_two(calibration, table, capsys, tmp_path, monkeypatch):
     for options, complaint in [
         (["--parameters", "hwp.tilt"], "no free parameter 'hwp.tilt'"),

@@ -101,6 +101,10 @@ def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys):
         (["--cubes", "cubes", *TWO, "--halo", "2"], "halo = 2"),
         (["--cubes", "cubes", *TWO, "--fwhm", "0"], "fwhm = 0"),
         (["--cubes", "cubes", *STAR, "--flux", "-1"], "flux"),
+        (["-o", "x.ecsv", "--flux", "-1"], "flux"),
+        (["-o", "x.ecsv", "--gain", "0"], "gain"),
+        (["-o", "x.ecsv", "--read-noise", "nan"], "read_noise"),
+        (["-o", "x.ecsv", "--calibration", "missing.asdf"], "missing.asdf"),
     ]:
         monkeypatch.chdir(tmp_path)
         assert simulated(*argv) == 2, (argv, words)

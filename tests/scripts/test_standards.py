@@ -49,6 +49,9 @@ def test_a_night_adds_angles_and_the_score(capsys):
     scores = [float(line.split()[-1]) for line in lines[1:3]]
     assert scores == sorted(scores)
     assert lines[1].startswith("HD 14069")
+    # a site may be a place
+    text = printed(capsys, "HD 293396", "--site=-155.476,19.8255,4139", "--night", "2025-11-03")
+    assert "above 30 deg" in text
 
 
 def test_one_star_with_all_that_is_known(capsys):
@@ -56,9 +59,7 @@ def test_one_star_with_all_that_is_known(capsys):
     assert max(map(len, text.splitlines())) <= 80
     for words in ("3.9 +- 0.03 %", "0.52 +- 0.01 um", "Whittet et al. 1992", "highest", "M3 error"):
         assert words in text
-
-
-def test_numbers_from_memory_are_marked(capsys):
+    # numbers from memory are marked
     assert "partly from memory" in printed(capsys, "HD 212311")
     assert "memory" not in printed(capsys, "HD 293396")
 
@@ -92,11 +93,6 @@ def test_plot_is_written(capsys, tmp_path):
     call("--kind", "unpolarized", "--magnitude", "9,10", *NIGHT, "--plot", str(path))
     assert path.read_bytes()[:4] == b"\x89PNG"
     assert "HD 14069" in capsys.readouterr().out
-
-
-def test_a_site_may_be_a_place(capsys):
-    text = printed(capsys, "HD 293396", "--site=-155.476,19.8255,4139", "--night", "2025-11-03")
-    assert "above 30 deg" in text
 
 
 def test_bad_input_is_refused_with_what_is_allowed(tmp_path, monkeypatch):
@@ -164,9 +160,7 @@ def test_limit_is_taken_by_lists_of_any_kind(capsys):
         "",
         f"{len(standards.names()) - 3} more stars; --limit {len(standards.names())} lists all",
     ]
-
-
-def test_one_more_is_one_star(capsys):
+    # one more is one star
     n = len(standards.search(kind="unpolarized", magnitude=(9, 10), band="H"))
     words = ["--kind", "unpolarized", "--magnitude", "9,10", "--band", "H", "--limit", str(n - 1)]
     assert printed(capsys, *words).splitlines()[-1] == f"1 more star; --limit {n} lists all"
@@ -225,9 +219,7 @@ def test_what_is_of_another_band_is_said(capsys):
     plain = printed(capsys, *words)
     assert "*" not in plain
     assert "no magnitude" not in plain
-
-
-def test_what_is_of_the_band_needs_no_note(capsys):
+    # what is of the band needs no note
     lines = printed(capsys, "--band", "H", "--near", "72.7,28.3", "--radius", "1").splitlines()
     assert lines[0].split()[-4:] == ["(%)", "in", "H", "deg"]
     assert len(lines) == 2

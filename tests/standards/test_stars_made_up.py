@@ -64,9 +64,7 @@ def test_a_law_ends_at_2_5_um():
 def test_magnitude_in_a_band_or_in_v():
     for band, expected in [("H", (5.0, "H")), ("K", (7.0, "V")), (None, (7.0, "V"))]:
         assert _star().brightness(band) == expected, (band, expected)
-
-
-def test_a_star_without_magnitudes_has_none():
+    # a star without magnitudes has none
     star = StandardStar("x", "polarized", _star().coord, 1 * u.arcsec, {}, _measured())
     magnitude, band = star.brightness("H")
     assert np.isnan(magnitude)
@@ -96,19 +94,16 @@ def test_a_law_takes_its_own_angle_or_that_of_the_measurements():
     assert errors["K"] == 0.05
 
 
-def test_one_error_that_is_missing_leaves_none():
+def test_a_law_needs_all_errors_and_p_max():
     _, errors = _law(_row(law_theta=np.nan * u.deg, width_err=np.nan), _measured(theta=[50] * 3))
     assert errors == {}
-
-
-def test_without_p_max_there_is_no_law():
     assert _law(_row(p_max=np.nan * u.percent), _measured()) == (None, {})
 
 
 # --- names -------------------------------------------------------------------------------
 
 
-def test_two_ways_to_write_a_name():
+def test_names_are_of_one_star_or_not():
     for written, other in [
         ("HD 030675", "hd30675"),
         ("HDE 30675", "HD 30675"),
@@ -119,9 +114,7 @@ def test_two_ways_to_write_a_name():
         ("Cyg OB2 No. 12", "cyg_ob2 #12"),
     ]:
         assert _normal(written) == _normal(other), (written, other)
-
-
-def test_two_names_of_different_stars():
+    # of different stars
     for one, other in [
         ("BD+59 389", "BD-59 389"),
         ("CPD-56 5793", "CPD+56 5793"),
@@ -133,15 +126,17 @@ def test_two_names_of_different_stars():
 # --- the degree that a search shows ---------------------------------------------------------
 
 
-def test_degree_in_the_band_measured():
+def test_degree_in_the_band_measured_or_nearest_to_v():
     assert _degree(_star(), "U") == pytest.approx((0.1, 0.01))
     found = _degree(_star(), "H")
     assert found[0] == pytest.approx(0.3)
     assert np.isnan(found[1])
-
-
-def test_degree_without_a_band_is_that_nearest_to_v():
+    # without a band, nearest to V
     assert _degree(_star(table=_measured("UH", p=(0.1, 0.3))), None)[0] == pytest.approx(0.1)
+    # without measurements the law speaks in V
+    law = SerkowskiLaw(p_max=0.04, lambda_max=0.55 * u.um)
+    star = _star("polarized", _measured("UVH")[:0], law=law)
+    assert _degree(star, None)[0] == pytest.approx(4)
 
 
 def test_degree_of_a_law_has_the_error_along_the_polarization():
@@ -154,12 +149,6 @@ def test_degree_of_a_law_has_the_error_along_the_polarization():
     assert _degree(star, "H") == pytest.approx((4 * shape, 0.2 * shape), rel=1e-9)
     star = _star("polarized", _measured("U"), law=law, law_errors=errors | {"p_max": 0 * u.percent})
     assert _degree(star, "H") == pytest.approx((4 * shape, 0), abs=1e-9)
-
-
-def test_without_measurements_the_law_speaks_in_v():
-    law = SerkowskiLaw(p_max=0.04, lambda_max=0.55 * u.um)
-    star = _star("polarized", _measured("UVH")[:0], law=law)
-    assert _degree(star, None)[0] == pytest.approx(4)
 
 
 def test_a_star_is_known_in_a_band():
@@ -210,9 +199,7 @@ def test_transit_by_day_is_the_end_of_the_night():
     for altitude, row in [([50, 40, 35], 0), ([35, 40, 50], 2)]:
         seen = _night(altitude, [0, 1, 2])
         assert seen.transit.mjd == seen.table["time"][row].mjd, (altitude, row)
-
-
-def test_a_night_of_one_row_has_no_length():
+    # a night of one row has no length
     seen = _night([50], [20])
     assert seen.hours == 0 * u.h
     assert seen.transit.mjd == 61000
@@ -259,22 +246,16 @@ def test_radius_ends_with_the_star_on_it():
     edge = others["separation"][-1]
     assert len(standards.search(center=star, radius=edge + 1e-6 * u.deg)) == len(others)
     assert len(standards.search(center=star, radius=edge - 1e-6 * u.deg)) == len(others) - 1
-
-
-def test_whole_sky_is_a_radius_of_180_deg():
-    star = standards.get("HD 30675").coord
+    # the whole sky is a radius of 180 deg
     assert len(standards.search(center=star, radius=180 * u.deg)) == len(standards.names())
     with pytest.raises(ParameterError, match="radius = 181 deg must be from 0 to 180 deg"):
         standards.search(center=star, radius=181 * u.deg)
 
 
-def test_several_centers_are_none():
+def test_a_search_that_cannot_be_is_refused():
     star = standards.get("HD 30675").coord
     with pytest.raises(ParameterError, match="one position"):
         standards.search(center=SkyCoord([star, star]), radius=1 * u.deg)
-
-
-def test_magnitudes_are_two_numbers_in_order():
     for magnitude in [("a", "b"), (1, 2, 3), (np.nan, 9)]:
         with pytest.raises(ParameterError, match=r"must be (two numbers|the brightest)"):
             standards.search(magnitude=magnitude)
