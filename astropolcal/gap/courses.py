@@ -4,7 +4,7 @@ One perturbation of any course through the run, in place of the causes that were
 
 The table of dependences is a list, and nature does not read it. So at each place and for each kind
 the perturbation gets another size in every frame: :math:`c_f l(\lambda)`, a course c and a smooth
-law l in wavelength, beside all that model and lamp take up. Each of the two is fitted while the
+law l in wavelength, beside all that model and lamp absorb. Each of the two is fitted while the
 other is held, in turn (alternating least squares). Where one such course explains the data as well
 as several causes do together, these may be one thing that no table has.
 """
@@ -45,7 +45,7 @@ class Course:
         The law in wavelength, (W,), which is 1 where it is largest; coefficients during the fit.
     wave, std : list of `~numpy.ndarray`
         The course in each dataset, (F,), radian or shares, and its errors, without what model and
-        lamp take up; zero and infinite in frames that do not tell it.
+        lamp absorb; zero and infinite in frames that do not tell it.
     lowered, freedom : float, int
         By how much it lowers chi-square, and by how many directions.
     behind : float

@@ -181,8 +181,8 @@ def test_tied_parameters_move_together(make):
 
 def test_function_of_several_chains(make):
     truth = make.truth(make.chain("linear", wavelength=LAM))
-    data = make.observe(truth, wavelength=LAM, seed=1)
-    cal = calibrate([truth, truth], [data, data], search=False, cross_validate=False)
+    data = [make.observe(truth, wavelength=LAM, seed=seed) for seed in (1, 2)]
+    cal = calibrate([truth, truth], data, search=False, cross_validate=False)
     made = propagate(cal, lambda a, b: a["hwp"].w_sio2.value + b["hwp"].w_sio2.value)
     assert made.std == pytest.approx(2 * cal.covariance.std("hwp.w_sio2").value, rel=1e-6)
 

@@ -759,7 +759,7 @@ class Product(Reader):
                 True,
                 centre,
                 16.2 if centre else None,
-                provenance,
+                provenance=provenance,
             )
 
         return {
