@@ -121,7 +121,8 @@ def plot_gap_frames(diagnosis, *, figure=None):
 
     Single differences, mean of that third of the wavelengths in which the causes do most. The
     line is what the model predicts with the causes in it, less what it predicts without. Where one
-    perturbation of any course may be in place of the causes, its size in the frames that tell it stands below.
+    perturbation of any course may be in place of the causes, its size stands below, in the frames
+    that tell it.
 
     Parameters
     ----------
