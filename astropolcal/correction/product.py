@@ -165,9 +165,11 @@ def _maps(corrected):
     order = ("aolp", "s_chi_statistical", "s_chi_systematic")
     hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order))
     hdus[-1].header["BUNIT"] = "deg"
-    if corrected.stokes.ndim == 4 and corrected.north_up:
+    if corrected.stokes.ndim == 4:
         found = corrected.azimuthal()
         hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
+        if not corrected.north_up:
+            hdus[-1].header["COMMENT"] = "as if north were up, which is not known (NORTHUP = F)"
     return hdus
 
 

@@ -189,7 +189,10 @@ class Corrected:
 
     def azimuthal(self):
         """
-        Return Q_phi and U_phi of images with north up, with their errors.
+        Return Q_phi and U_phi of images, with their errors.
+
+        The direction from the star is taken as if north were up and east left. Where
+        ``north_up`` is false this is not known, and it may be off by the angle of the field.
 
         Returns
         -------
@@ -198,11 +201,6 @@ class Corrected:
         """
         if self.stokes.ndim != 4:
             raise ParameterError("Q_phi and U_phi are of images; these are not")
-        if not self.north_up:
-            raise ParameterError(
-                "Q_phi and U_phi need images with north up: give position_angle (--rotation), or "
-                "north_up=True where they are so already"
-            )
         i, j = self._index("Q"), self._index("U")
         pair = azimuthal(self.stokes[i], self.stokes[j], self.centre)
         result = dict(zip(("q_phi", "u_phi"), pair, strict=True))

@@ -25,7 +25,9 @@ def plot_corrected(corrected, **options):
 
 def plot_images(corrected, *, wavelength=None, figure=None):
     """
-    Draw I, Q, U, Q_phi, U_phi (both where north is up) and the error of Q of images.
+    Draw I, Q, U, Q_phi, U_phi and the error of Q of images.
+
+    Q_phi and U_phi are made as if north were up; where that is not known, the heading says so.
 
     Parameters
     ----------
@@ -64,10 +66,10 @@ def plot_images(corrected, *, wavelength=None, figure=None):
         raise ParameterError("these are spectra; plot_spectrum draws them")
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
-    limit = _top(np.abs([panels[name] for name in _POLARIZED if name in panels]))
+    limit = _top(np.abs([panels[name] for name in _POLARIZED]))
     extent = _extent(corrected)
     with st.canvas(figure, 12.5, 8.2) as figure:
-        grid = figure.subplots(2, len(panels) // 2, sharex=True, sharey=True)
+        grid = figure.subplots(2, 3, sharex=True, sharey=True)
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             drawn, extend = _draw_image(axes, name, image, extent, limit)
             bar = figure.colorbar(drawn, ax=axes, shrink=0.85, extend=extend)
@@ -92,11 +94,10 @@ def _chosen(corrected, wavelength):
 
 def _panels(corrected, chosen):
     """Return the images by name, in the order of the panels."""
-    images = {name: corrected[name] for name in "IQU"}
-    if corrected.north_up:
-        found = corrected.azimuthal()
-        images |= dict(zip(_POLARIZED[2:], (found["q_phi"], found["u_phi"]), strict=True))
-    panels = {name: st.mean_known(image[chosen]) for name, image in images.items()}
+    found = corrected.azimuthal()
+    images = [corrected[name][chosen] for name in "IQU"]
+    images += [found[name][chosen] for name in ("q_phi", "u_phi")]
+    panels = dict(zip(("I", *_POLARIZED), map(st.mean_known, images), strict=True))
     error, kind = corrected.error("Q")[chosen], "statistical"
     if not np.isfinite(error).any():
         error, kind = corrected.error("Q", "systematic")[chosen], "systematic"
@@ -162,6 +163,7 @@ def _heading(corrected, wavelength):
     count = corrected.determined[:, :3].all(axis=1).sum()
     of = f"mean of {count} wavelengths, {nm.min():.0f} to {nm.max():.0f} nm"
     of = of if wavelength is None else f"{nm[wavelength]:.0f} nm"
+    of += "" if corrected.north_up else "; north is not known to be up"
     return f"Corrected Stokes parameters ({_MODES[corrected.mode]})\n{of}"
 
 

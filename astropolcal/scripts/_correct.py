@@ -400,6 +400,9 @@ def _words(summary, systematic, arguments):
     if held := summary.get("held"):
         line = f"  without error, as not free in the calibration: {', '.join(held)}"
         lines += common.wrapped(line, indent=4).split("\n")
+    if not summary.get("north_up", True):
+        line = "Q_phi and U_phi are made as if north were up, which --rotation none does not know"
+        lines += common.wrapped(f"  {line}", indent=4).split("\n")
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n = len(summary["wavelength_nm"])

@@ -39,8 +39,7 @@ def frames_of(disk_frames, charis, **settings):
 
 def test_disk_comes_back_exactly(disk_frames, sky, charis):
     for observable in ["intensity", "single", "double"]:
-        frames = frames_of(disk_frames, charis, north_up=True)
-        found = correct(sky, frames, observable=observable)
+        found = correct(sky, frames_of(disk_frames, charis), observable=observable)
         stokes = disk_frames[0]
         np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
         np.testing.assert_allclose(found.u, stokes[2] / stokes[0], atol=1e-10)

@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from astropolcal.correction import Corrected, ScienceFrames, correct
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,6 @@ def corrected(calibration, charis, track, scene, seen):
         hwp=hwp,
         names=names,
         centre=(4.0, 4.0),
-        north_up=True,
         variance_right=right,
         variance_left=left,
         pixel_scale=16.2,
@@ -72,6 +71,14 @@ def test_the_header_states_its_conventions(path, corrected):
         np.testing.assert_array_equal(hdus["QPHI"].data[0], corrected.azimuthal()["q_phi"])
 
 
+def test_q_phi_says_where_north_is_not_known_to_be_up(corrected, tmp_path):
+    for up in (True, False):
+        path = tmp_path / f"{up}.fits"
+        dataclasses.replace(corrected, north_up=up).write(path)
+        with fits.open(path) as hdus:
+            assert ("as if north were up" in str(hdus["QPHI"].header.get("COMMENT", ""))) != up
+
+
 def test_astropy_reads_the_stokes_axis(path):
     from astropy.wcs import WCS
 
@@ -98,17 +105,6 @@ def test_everything_comes_back(corrected, path, tmp_path):
     packed = tmp_path / "packed.fits.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     np.testing.assert_array_equal(Corrected.read(packed).stokes, corrected.stokes)
-
-
-def test_images_that_are_not_turned_have_no_azimuthal_components(corrected, tmp_path):
-    """Q and U refer to north, but where that is in the images is not known."""
-    seen = dataclasses.replace(corrected, north_up=False)
-    with pytest.raises(ParameterError, match="need images with north up"):
-        seen.azimuthal()
-    seen.write(tmp_path / "out.fits")
-    with fits.open(tmp_path / "out.fits") as hdus:
-        assert "QPHI" not in hdus
-    assert not Corrected.read(tmp_path / "out.fits").north_up
 
 
 def test_a_spectrum_without_errors(sky, charis, star, tmp_path):

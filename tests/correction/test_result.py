@@ -110,7 +110,7 @@ def test_where_nothing_was_measured_there_is_no_systematic_error(images):
 
 def test_q_phi_is_about_the_star():
     for centre in [None, (4.0, 2.0)]:
-        found = make((7, 9), centre=centre, north_up=True)
+        found = make((7, 9), centre=centre)
         told = found.azimuthal()
         expected = azimuthal(found["Q"], found["U"], (4.0, 3.0) if centre is None else centre)
         np.testing.assert_allclose([told["q_phi"], told["u_phi"]], expected)

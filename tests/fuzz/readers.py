@@ -801,7 +801,7 @@ def _check_product(found):
         assert values.shape == (n, n, *found.stokes.shape[1:])
         assert not (values[range(n), range(n)] < 0).any(), "negative variances"
     found.polarization()
-    if found.stokes.ndim == 4 and found.north_up:
+    if found.stokes.ndim == 4:
         found.azimuthal()
 
 

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Figures of corrected science: panels, errors, scales, labels."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -47,13 +46,7 @@ def images():
     intensity = 1e4 * np.exp(-np.hypot(x, y) / 4) * np.ones((3, 1, 1))
     right, left = beams(Q, U, intensity)
     frames = ScienceFrames.from_arrays(
-        right,
-        left,
-        WAVELENGTH,
-        {"hwp": HWP},
-        variance_right=right,
-        variance_left=left,
-        north_up=True,
+        right, left, WAVELENGTH, {"hwp": HWP}, variance_right=right, variance_left=left
     )
     return correct(chain(), frames)
 
@@ -194,9 +187,6 @@ def test_the_star_is_at_the_origin(images):
 
 def test_kind_of_the_product_decides_what_is_drawn(star, images):
     assert len(panels(plot_corrected(images))) == 6
-    # where north is not known, neither is the direction from the star
-    seen = panels(plot_corrected(dataclasses.replace(images, north_up=False)))
-    assert list(seen) == ["I", "Q", "U", "statistical error of Q"]
     assert not panels(plot_corrected(star))
     with pytest.raises(ParameterError, match="these are spectra; plot_spectrum draws them"):
         plot_images(star)
