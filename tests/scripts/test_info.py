@@ -84,7 +84,8 @@ def test_json_of_a_folder_and_what_is_wrong_in_it(folder, capsys):
 
 def test_folder_without_calibrations(tmp_path, capsys):
     assert main(["info", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.strip().endswith("0 calibrations")
+    # a long path is wrapped
+    assert " ".join(capsys.readouterr().out.split()).endswith("0 calibrations")
     # one of tables says how to look at one
     for name in ("a.ecsv", "b.ECSV", "c.fits", "notes.txt"):
         (tmp_path / name).write_text("")
