@@ -210,7 +210,7 @@ def correct(
         systematic=systematic,
         mode=mode,
         observable=observable,
-        resampling=float(frames.source.resampling) if len(found) > n else 1.0,
+        resampling=float(getattr(frames.source, "resampling", 1.0)) if len(found) > n else 1.0,
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )

@@ -328,7 +328,7 @@ class ScienceFrames:
             By what the left beam is multiplied, one number or one per frame.
         detectors : sequence of (object, object), optional
             Of the right and left beam in each frame, whose ``variance(pixels)`` gives the variances
-            where the files hold no errors; pixels from a ``saturation`` that they have on are bad.
+            where the files hold no errors.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 

@@ -298,13 +298,15 @@ def _native(values):
 def _systematic(hdus):
     if "SYSFACT" not in hdus:
         return None
-    held, before = [], ""
+    held, before, going = [], "", False
     for line in hdus[0].header.get("HISTORY", []):
         if line.startswith("not free"):
             held.append(line.rpartition(": ")[2])
-        elif held and len(before) == _CARD and not line.startswith("poorly determined"):
+            going = True
+        else:
             # a card holds no more, and the next one goes on
-            held[-1] += line
+            going = going and len(before) == _CARD and not line.startswith("poorly determined")
+            held[-1:] = [held[-1] + line] if going else held[-1:]
         before = line
     found = hdus["SYSFACT"]
     is_open = np.asarray(hdus["SYSOPEN"].data, dtype=bool)

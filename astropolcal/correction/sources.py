@@ -264,20 +264,12 @@ class _WholeCubes:
         if self._has_errors and power == 2:
             return self._squared(self._section(beam, i, wavelengths, 1))
         flux = self._section(beam, i, wavelengths, 0)
-        flux = np.where(flux < self._most(beam, i), flux, np.nan)
         return flux if power == 1 else self._detectors[i][beam].variance(flux)
-
-    def _most(self, beam, i):
-        """Return what pixels have to stay below: what is saturated has no value."""
-        detector = None if self._detectors is None else self._detectors[i][beam]
-        return getattr(detector, "saturation", np.inf)
 
     def _mean(self, beam, i):
         """Return the mean of the exposures that have a value and an error, and its variance."""
         flux, variance = self._section(beam, i, slice(None), 0), None
-        # one saturated exposure spoils the mean
-        full = (flux >= self._most(beam, i)).any(axis=0)
-        good = np.isfinite(flux) & ~full
+        good = np.isfinite(flux)
         if self._has_errors:
             variance = self._squared(self._section(beam, i, slice(None), 1))
             good &= np.isfinite(variance)

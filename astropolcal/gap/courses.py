@@ -100,22 +100,24 @@ class Course:
         solved = target + left @ (factor * (left.T @ target))
         wave, variance = np.zeros(len(gram)), np.full(len(gram), np.inf)
         wave[told] = solved / root
-        variance[told] = (1 + left**2 @ factor) / root**2
+        kept = 1 + left**2 @ factor
+        variance[told] = np.where(kept > _ABSORBED, kept, np.inf) / root**2
         edges = np.cumsum([len(g) for g in reduced.gram])[:-1]
         self.wave, self.std = np.split(wave, edges), np.split(np.sqrt(variance), edges)
         self.lowered = float(target @ solved)
         self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
 
 
-def courses(model, base):
+def courses(model, base, alike=1.0):
     """
     Return the courses in place of all causes of a fitted model, the best first.
 
-    ``base`` is the model without them. Derivatives are those at the one or at the other, where a
+    ``base`` is the model without them, and of ``alike`` neighbouring wavelengths the noise is the
+    same. Derivatives are those at the one or at the other, where a
     course does better: many causes that are not the true ones are far from where it is.
     """
     names = [name for name in model.added if name not in base.added]
-    temper, best = max(1.0, model.mean_square), {}
+    temper, best = alike * max(1.0, model.mean_square), {}
     for at, absent in ((model, names), (base, ())) if names else ((base, ()),):
         without = at.without(absent)
         # to first order, as the courses are
@@ -123,7 +125,10 @@ def courses(model, base):
         for one in _fitted(at, absent):
             freer = max(one.freedom - freedom, 1.0)
             one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
-            one.p_value = float(stats.chi2.sf(one.lowered / temper, one.freedom))
+            # the law is chosen: of k singular values the largest is more than a share of their sum
+            k = len(one.reduced.target[0][0])
+            gain = 2 * np.sqrt((k - 1) * max(one.freedom - k + 1, 0))
+            one.p_value = float(stats.chi2.sf(max(one.lowered / temper - gain, 0), one.freedom))
             one.std = [np.sqrt(temper) * std for std in one.std]
             known = best.setdefault((one.place, one.kind), one)
             best[one.place, one.kind] = min(known, one, key=lambda course: course.behind)

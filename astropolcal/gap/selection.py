@@ -179,7 +179,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = courses(base, base) if runs < 2 else []
+        seen = courses(base, base, _alike(base)) if runs < 2 else []
         seen = [one for one in seen if one.p_value * len(seen) < REMAINDER]
         return Selection([], base, first, 0.0, [_errors(base, groups)], _alike_courses(seen))
     if first.probes.has_more_steps:
@@ -196,7 +196,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = courses(best.model, base) if runs < 2 else []
+    rivals = courses(best.model, base, _alike(best.model)) if runs < 2 else []
     chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
@@ -677,7 +677,7 @@ def _unlisted(base, best, stable, instead):
 
 def _of_course(count, behind):
     """Return the probability that so many causes are one of a course that no table has."""
-    better = _BETTER_COURSE * expit(2 * (_BETTER - behind))
+    better = _BETTER_COURSE * expit(3 * (_BETTER - behind))
     return max(better, _ONE_COURSE * expit(_AS_WELL - behind) if count > 1 else 0.0)
 
 

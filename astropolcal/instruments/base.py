@@ -197,8 +197,9 @@ def add_nuisance(chains, datasets, nuisance):
     # names of optics must do as optic.parameter
     labels = [re.sub(r"\W+", "_", name) for name in names]
     # two tables may have one name, and a third the name that a number would make of it
-    if len(set(labels)) < len(labels):
-        labels = [f"{label}_{i + 1}" for i, label in enumerate(labels)]
+    numbered = [f"{label}_{i + 1}" for i, label in enumerate(labels)]
+    labels = [n if labels.count(t) > 1 else t for t, n in zip(labels, numbered, strict=True)]
+    labels = labels if len(set(labels)) == len(labels) else numbered
     size = len(common_wavelengths(datasets))
     for text in nuisance:
         kind, _, wanted = str(text).partition(":")

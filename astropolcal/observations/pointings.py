@@ -253,6 +253,10 @@ def _times(frames):
         return column
     texts = np.asarray(column)
     # a date alone is no moment
+    if texts.dtype.kind == "M":
+        if np.isnat(texts).any():
+            return None
+        texts = np.datetime_as_string(texts)
     if texts.dtype.kind not in "SU" or not all(":" in str(text) for text in texts.astype(str)):
         return None
     try:

@@ -460,6 +460,8 @@ def _null_design(observations, frames, null_model):
 _MOST_TURNING = 0.7
 # second differences of fewer wavelengths tell nothing
 _FEWEST_ROUGH = 5
+# what is so many times the median size is no noise, however uneven that is
+_FAR_OFF = 20.0
 _SINGLE = OBSERVABLES["normalized_single_difference"]
 # independent data that tell a spread as well as the median of second differences along wavelengths
 _TELLS = 0.19
@@ -579,12 +581,15 @@ def frame_noise(channel, residual, angles):
         if not stated.any():
             if not rough > 0:
                 raise FitError("no errors in the table, and the residuals tell no noise")
-            # nothing states which data are noisier: mean squares around each wavelength
-            total, count = (
-                np.convolve(np.sum(one, axis=1), np.ones(_FEWEST_ROUGH))[1:-1]
-                for one in (keep * second**2, keep)
-            )
-            level = np.sqrt(np.divide(total, count, out=total * 0, where=count > 0)) / shrunk
+            # nothing states which data are noisier: mean squares around each wavelength, without
+            # what is far off
+            level, half = np.zeros(len(valid)), _FEWEST_ROUGH // 2
+            for j in range(len(valid)):
+                # the first second difference is that of the second wavelength
+                near = slice(max(j - 1 - half, 0), j + half)
+                own = np.abs(second[near][keep[near]])
+                own = own[own <= _FAR_OFF * np.median(own)] if own.size else own
+                level[j] = np.sqrt(np.mean(own**2)) / shrunk if own.size else 0.0
             sigma[i] = np.where(level > 0, level, rough)[:, None]
             continue
         if np.isfinite(rough):
