@@ -39,8 +39,8 @@ class Course:
     ----------
     place, kind : str
         As in `Cell`.
-    reduced : Reduced
-        Sums over the wavelengths of its derivatives.
+    reduced : Reduced or None
+        Sums over the wavelengths of its derivatives, during the fit.
     law : `~numpy.ndarray`
         The law in wavelength, (W,), which is 1 where it is largest; coefficients during the fit.
     wave, std : list of `~numpy.ndarray`
@@ -57,7 +57,7 @@ class Course:
 
     place: str
     kind: str
-    reduced: Reduced
+    reduced: Reduced | None
     law: np.ndarray
     wave: list = field(default_factory=list)
     std: list = field(default_factory=list)
@@ -132,6 +132,9 @@ def courses(model, base, alike=1.0):
             one.std = [np.sqrt(temper) * std for std in one.std]
             known = best.setdefault((one.place, one.kind), one)
             best[one.place, one.kind] = min(known, one, key=lambda course: course.behind)
+    for one in best.values():
+        # large, and of no use once it is fitted
+        one.reduced = None
     return sorted(best.values(), key=lambda one: one.behind)
 
 
