@@ -175,12 +175,7 @@ def correct(
     by_variance = isinstance(weights, str)
     _check(frames, mode, weights)
     if hasattr(calibration, "datasets"):
-        when, moments = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}, frames.moments()
-        check_frames(calibration, moments, "the calibration", **when)
-        if chain is None:
-            # of a telescope that changed
-            dates = [date for _, date, _ in moments if date is not None]
-            chain = sky_chain(calibration, date=dates or None)
+        chain = _chain_at(calibration, frames, chain, max_age=max_age, dates=not any_date)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
@@ -232,6 +227,17 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     if n_samples:
         return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, **how)
     return linear_systematic(model, solution, **how)
+
+
+def _chain_at(calibration, frames, chain, **when):
+    """Check that a calibration holds for the frames; return the chain at their dates."""
+    moments = frames.moments()
+    check_frames(calibration, moments, "the calibration", ways=_WAYS, **when)
+    if chain is not None:
+        return chain
+    # of a telescope that changed
+    dates = [date for _, date, _ in moments if date is not None]
+    return sky_chain(calibration, date=dates or None)
 
 
 def _observable(calibration, frames, observable):

@@ -311,8 +311,8 @@ def _instead(content):
         return f"It may be one thing: {found[0]['detail']}.{more}"
     those = "this" if len(content["causes"]) == 1 else "these together"
     return (
-        f"It may be one thing instead: {found[0]['detail']}. That does about as well as {those} and "
-        f"explains {share(found[0]['share'])} of the gap.{more}"
+        f"It may be one thing instead: {found[0]['detail']}. That does about as well as {those} "
+        f"and explains {share(found[0]['share'])} of the gap.{more}"
     )
 
 

@@ -202,7 +202,6 @@ def calibrate(
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
         chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
-    refuse_repeated([dataset.observations for dataset in measurement.datasets])
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
@@ -260,6 +259,7 @@ def _fixed(chain, fix):
 
 
 def _check(measurement):
+    refuse_repeated([dataset.observations for dataset in measurement.datasets])
     if not measurement.free.size:
         raise FitError("nothing to fit: every parameter is fixed or tied")
     if measurement.free.size > measurement.n_data:
