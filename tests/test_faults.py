@@ -451,10 +451,12 @@ def test_standard_output_on_a_full_disk():
 # ---- killed processes --------------------------------------------------------------
 
 
-def killed(task, *arguments, after):
-    """Run a function in a process that is killed in the middle of it."""
+def killed(task, *arguments, after, written=None):
+    """Run an endless function in a process that is killed some time after a file has content."""
     process = FORK.Process(target=task, args=arguments)
     process.start()
+    while written and process.is_alive() and not (written.exists() and written.stat().st_size):
+        time.sleep(0.001)
     time.sleep(after)
     os.kill(process.pid, signal.SIGKILL)
     process.join()
@@ -530,12 +532,11 @@ def test_killed_challenges_go_on(tmp_path):
     path, before = tmp_path / "run.jsonl", 0
     rng = np.random.default_rng(6)
     for _ in range(8):
-        killed(append_challenges, path, after=rng.uniform(0.03, 0.15))
-        if path.exists():
-            records = _journal(path, {"seed": 1})
-            assert sorted(records) == list(range(len(records)))
-            assert len(records) >= before
-            before = len(records)
+        killed(append_challenges, path, after=rng.uniform(0.0, 0.15), written=path)
+        records = _journal(path, {"seed": 1})
+        assert sorted(records) == list(range(len(records)))
+        assert len(records) >= before
+        before = len(records)
     assert before > 0
 
 
@@ -543,6 +544,7 @@ def add_frames(path, folder):
     journal = Journal(path, {})
     for i in range(10**9):
         journal.add(Frame(str(folder / f"{i % 5}.fits"), number=i, errors=["x" * 300]))
+        (folder / "begun").write_text("yes")
 
 
 @pytest.mark.slow
@@ -551,7 +553,9 @@ def test_killed_reduction_goes_on(tmp_path):
         (tmp_path / f"{i}.fits").write_bytes(b"x")
     path, rng = tmp_path / "journal", np.random.default_rng(7)
     for _ in range(6):
-        killed(add_frames, path, tmp_path, after=rng.uniform(0.03, 0.15))
+        begun = tmp_path / "begun"
+        begun.unlink(missing_ok=True)
+        killed(add_frames, path, tmp_path, after=rng.uniform(0.0, 0.12), written=begun)
         assert Journal(path, {}).done(tmp_path / "0.fits").errors == ["x" * 300]
     # a line that was cut off in the middle costs one frame
     path.write_bytes(path.read_bytes()[:-100])
@@ -621,11 +625,23 @@ def test_several_processes_add_to_one_library(tmp_path):
         assert left - {".astropolcal-index.json"} == {".lock"}, same
 
 
+def add_for_ever(folder, first):
+    for year in range(first, 10000):
+        Library(folder).add(
+            calibration(), valid_from=f"{year}-01-01", valid_until=f"{year}-12-31T23:00:00"
+        )
+
+
 @pytest.mark.slow
 def test_killed_writer_does_not_lock_a_library(tmp_path):
-    killed(add_to_library, tmp_path, 0, False, FORK.Queue(), after=0.3)
-    Library(tmp_path).add(calibration(), valid_from="1999-01-01", valid_until="1999-06-01")
-    assert not Library(tmp_path).problems
+    calibration()
+    rng = np.random.default_rng(9)
+    for year in range(1991, 1997):
+        killed(add_for_ever, tmp_path, 100 * (year - 1970), after=rng.uniform(0.05, 0.3))
+        library = Library(tmp_path)
+        library.add(calibration(), valid_from=f"{year}-01-01", valid_until=f"{year}-06-01")
+        assert not library.problems, year
+    assert len(library) >= 6
 
 
 def write_tables(path, number):
