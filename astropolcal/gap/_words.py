@@ -355,13 +355,19 @@ def _how_large(content):
 
 def _what_is_left(content):
     if content["verdict"] == "none":
-        return "What is below the noise, or what the parameters absorb entirely, does not show."
+        return (
+            "What is below the noise, or what the parameters absorb entirely, does not show; the "
+            f"noise may hide {percent(content['hidden_percent'])} % (rms, 95 %)."
+        )
     if not content["causes"]:
         return "Nothing should be added to the model before its cause is known."
     where, part = content["where_left"], content["left_share"]
     text = f"What is left, {share(part)} of the gap, is more than" if part else "What is left is"
     text += f" noise ({p_words(content['remainder_p_value'])})"
-    if where and content["verdict"] != "unexplained":
+    if not part:
+        most = np.ceil(100 * content["left_share_limit"])
+        text += f", which may hide up to {most:.0f} % of the gap (95 %)"
+    elif where and content["verdict"] != "unexplained":
         text += f": {where_words(where[0], 'it')}"
     if content.get("nested_percent") is not None:
         text += (

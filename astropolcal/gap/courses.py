@@ -108,16 +108,15 @@ class Course:
         self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
 
 
-def courses(model, base, alike=1.0):
+def courses(model, base):
     """
     Return the courses in place of all causes of a fitted model, the best first.
 
-    ``base`` is the model without them, and of ``alike`` neighbouring wavelengths the noise is the
-    same. Derivatives are those at the one or at the other, where a
+    ``base`` is the model without them. Derivatives are those at the one or at the other, where a
     course does better: many causes that are not the true ones are far from where it is.
     """
     names = [name for name in model.added if name not in base.added]
-    temper, best = alike * max(1.0, model.mean_square), {}
+    temper, best = model.alike * max(1.0, model.mean_square), {}
     for at, absent in ((model, names), (base, ())) if names else ((base, ()),):
         without = at.without(absent)
         # to first order, as the courses are

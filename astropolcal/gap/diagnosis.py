@@ -171,6 +171,18 @@ class Diagnosis:
         return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     @property
+    def hidden_share(self):
+        """Share of the gap that what is left does not exclude (95 %), 1 where no cause is."""
+        most = self.improved.could_hide()
+        return most / (most + max(self.nominal.fit.chi2 - self.improved.fit.chi2, 0.0))
+
+    @property
+    def hidden_percent(self):
+        """Rms of what may be left of the gap in a single difference (95 %), in percent."""
+        told = sum(channel.valid.sum() for channel in self.improved.problem.channels)
+        return self.noise_floor_percent * float(np.sqrt(self.improved.could_hide() / told))
+
+    @property
     def gap_before_percent(self):
         """Gap of the nominal model on left-out frames (else of its fit), in percent."""
         # a chain of the wrong parity has no fit that could predict left-out frames

@@ -28,6 +28,10 @@ from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 __all__ = []
 
 _ROUNDS, _MORE = 3, 3
+# correlations of neighbours above so many standard errors are real
+_CORRELATED = 3.0
+# standard deviations below which 95 % are
+_ONE_SIDED = 1.645
 # a fit whose last round lowered chi-square by less than this share is used, and said not to have
 # converged
 _FLAT = 0.02
@@ -120,6 +124,30 @@ class Model:
     def p_value(self):
         """Probability of the residuals by noise alone."""
         return float(stats.chi2.sf(self.fit.chi2, self.linear.freedom))
+
+    @cached_property
+    def alike(self):
+        """
+        How many neighbouring wavelengths have the same residuals, 1 if they are independent.
+
+        Noise that is correlated from one wavelength to the next repeats itself so often (as an
+        autoregressive process of first order): evidence counts it as data each time.
+        """
+        both, each, count = 0.0, 0.0, 1
+        for channel, rows in zip(self.problem.channels, self.problem.segments, strict=True):
+            left = self.residual[rows].reshape(channel.shape)[channel.told]
+            both += np.sum(left[1:] * left[:-1])
+            each += np.sum(left**2)
+            count += left.size
+        same = float(both / max(each, 1e-300))
+        return (1 + same) / (1 - same) if same > _CORRELATED / np.sqrt(count) else 1.0
+
+    def could_hide(self):
+        """Return the excess of chi-square that the residuals do not exclude (95 %)."""
+        freedom, spread = self.linear.freedom, 2 * self.alike * _ONE_SIDED**2
+        excess = max(self.fit.chi2 - freedom, 0.0)
+        # noncentral chi-square, which is nearly normal: (x - excess)^2 = spread (freedom + 2 x)
+        return float(excess + spread + np.sqrt(spread * (2 * excess + spread + freedom)))
 
     @cached_property
     def linear(self):

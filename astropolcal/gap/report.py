@@ -117,6 +117,8 @@ def _worked_out(diagnosis):
         "where": [*_courses(diagnosis), *locate(nominal)],
         "where_left": [] if same or noisy else locate(improved),
         "left_share": 0.0 if noisy else left,
+        "left_share_limit": diagnosis.hidden_share,
+        "hidden_percent": diagnosis.hidden_percent,
         "causes": causes,
         "changes": runs.changes(diagnosis, causes),
         "scores": [

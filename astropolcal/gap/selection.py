@@ -69,7 +69,11 @@ _FAR = 3.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs: of two that differ 433 of 438 causes were right in 680 challenges, of three 12 of 54 in
 # another 934, of four 1 of 12, of more 2 of 69
-_UNLISTED = (0.0, 0.02, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
+_UNLISTED = (0.0, 0.01, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
+# the same of a single cause by the share of the gap that noise may hide, where another course
+# would look like that of the table: below both 58 of 60 answers to mechanisms were right, above 11
+# of 20, and a quarter of all gaps may be of this sort
+_MAY_HIDE, _UNSEEN = (0.25, 0.35), (0.0, 0.11)
 # the same where one course that no table has does as well as several causes do together, and below
 # how many standard deviations it does: within 3 were 10 of 118 answers to pairs, all right, and 40
 # of 63 to mechanisms, of whose 80 causes 6 were right
@@ -83,8 +87,6 @@ _MAY_BE = 0.3
 _SHAKY = 0.5
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
-# correlations of neighbours above so many standard errors are real
-_CORRELATED = 3.0
 # share of the gap that an answer may leave before it is doubtful
 _LEFT = 0.1
 
@@ -179,7 +181,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = courses(base, base, _alike(base)) if runs < 2 else []
+        seen = courses(base, base) if runs < 2 else []
         seen = [one for one in seen if one.p_value * len(seen) < REMAINDER]
         return Selection([], base, first, 0.0, [_errors(base, groups)], _alike_courses(seen))
     if first.probes.has_more_steps:
@@ -196,7 +198,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = courses(best.model, base, _alike(best.model)) if runs < 2 else []
+    rivals = courses(best.model, base) if runs < 2 else []
     chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
@@ -310,7 +312,7 @@ def _worse(best, steps, history, groups):
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
     if not impossible and steps[0].model.p_value > _NOISE:
         # the residuals are no larger than noise: a pattern in them may be that of the noise itself
-        enough = ENOUGH * _alike(best.model)
+        enough = ENOUGH * best.model.alike
         impossible = [i for i, o in enumerate(best.chosen) if o.evidence < enough > ENOUGH]
     if impossible or groups is None:
         return impossible[-1:]
@@ -327,23 +329,6 @@ def _worse(best, steps, history, groups):
         or _worsens(whole, foreseen(best.model.without([best.chosen[i].name]), groups), scatter)
     ]
     return found[-1:] if few else found
-
-
-def _alike(model):
-    """
-    Return how many neighbouring wavelengths have the same residuals, 1 if they are independent.
-
-    Noise that is correlated from one wavelength to the next repeats itself so often (as an
-    autoregressive process of first order): evidence counts it as data each time.
-    """
-    both, each, count = 0.0, 0.0, 1
-    for channel, rows in zip(model.problem.channels, model.problem.segments, strict=True):
-        left = model.residual[rows].reshape(channel.shape)[channel.told]
-        both += np.sum(left[1:] * left[:-1])
-        each += np.sum(left**2)
-        count += left.size
-    same = both / max(each, 1e-300)
-    return (1 + same) / (1 - same) if same > _CORRELATED / np.sqrt(count) else 1.0
 
 
 def _worsens(after, before, scatter):
@@ -666,6 +651,10 @@ def _unlisted(base, best, stable, instead):
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
         prior = max(prior, _SHAKY)
+    elif len(best.chosen) == 1:
+        hidden = best.model.could_hide()
+        hidden /= hidden + max(base.fit.chi2 - best.model.fit.chi2, 0.0)
+        prior = max(prior, float(np.interp(hidden, _MAY_HIDE, _UNSEEN)))
     prior = max(prior, instead)
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))
     after = prior / (prior - (1 - prior) * np.e * p * np.log(p))

@@ -35,8 +35,9 @@ def observed(true=None, *, seed=1, flux=1e6, table=None, **options):
 def with_effect(name, **values):
     """Return the chain with an effect of a certain size."""
     edit = get_effect(name).edit([chain()], Context(WAVELENGTH.to_value(u.um)))
-    for parameter in edit.parameters:
-        optic, key = parameter.name.split(".")
+    names = [parameter.name.split(".") for parameter in edit.parameters]
+    assert set(values) <= {key for _, key in names}, names
+    for optic, key in names:
         target = getattr(edit.chains[0][optic], key)
         target.value = np.full(np.shape(target.value), values.get(key, 0.0))
     return edit.chains[0]

@@ -22,20 +22,29 @@ def answered(seed, **how):
 
 
 def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
-    model = data.fitted(data.observed(data.with_effect("derotator_diattenuation", x_0=0.01)))
+    model = data.fitted(
+        data.observed(data.with_effect("derotator_diattenuation", diattenuation=0.01))
+    )
     probes = Probes(model)
     channel, rows = probes.problem.channels[0], probes.problem.segments[0]
     basis = law_basis(probes.problem.wavelength, 2)
     for one in courses(model, model)[::9]:
         slope = probes.slopes[one.place, one.kind][0]
         sizes = one.law[probes.problem.datasets[0].bins][:, None]
-        # a column of its own for each frame
-        table = np.zeros((len(probes.residual), slope.shape[2]))
-        for i, frame in enumerate(np.eye(slope.shape[2])):
-            table[rows, i] = channel.whiten(slope * sizes * frame).ravel()
+        each = np.eye(slope.shape[2])
+        length = [np.linalg.norm(channel.whiten_frames(slope * sizes * one)) for one in each]
+        # a column of its own for each frame that tells it, of unit length before what lamp and
+        # model absorb is taken out
+        frames = np.flatnonzero(np.square(length) > 1e-6 * np.max(length) ** 2)
+        table = np.zeros((len(probes.residual), len(frames)))
+        for i, frame in enumerate(frames):
+            column = slope * sizes * each[frame] / length[frame]
+            table[rows, i] = channel.whiten(column).ravel()
         table -= probes.tangent @ (probes.tangent.T @ table)
-        size, _, rank, _ = np.linalg.lstsq(table, probes.residual, rcond=1e-3)
-        assert one.lowered == pytest.approx(np.sum((table @ size) ** 2), rel=1e-4), one.words
+        left, strength, _ = np.linalg.svd(table, full_matrices=False)
+        told = left[:, strength > 1e-3].T @ probes.residual
+        rank = len(told)
+        assert one.lowered == pytest.approx(told @ told, rel=1e-6), one.words
         assert one.freedom == rank + basis.shape[1] - 1, one.words
 
 

@@ -147,3 +147,13 @@ def test_a_known_mounting_is_no_row_of_the_data():
     told = to_dict(diagnose(chains, observations))
     assert told["verdict"] in ("named", "located")
     assert told["causes"][0]["cell"]["dependence"] == "time"
+
+
+def test_what_noise_may_hide_holds_in_95_of_100():
+    true = data.with_effect(DIATTENUATOR, horizontal=0.001)
+    models = [data.fitted(data.observed(true, seed=seed)) for seed in range(20)]
+    clean = [data.fitted(data.observed(seed=seed)).fit.chi2 for seed in range(20)]
+    # the same noise with and without the effect
+    hidden = np.mean([model.fit.chi2 for model in models]) - np.mean(clean)
+    assert hidden > 80
+    assert sum(model.could_hide() >= hidden for model in models) >= 17
