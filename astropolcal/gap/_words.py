@@ -305,8 +305,9 @@ def _instead(content):
     found = [one for one in content["where"] if one["axis"] == "course"]
     if not found or content["verdict"] == "none":
         return ""
-    other = found[-1]["detail"].partition(",")[0]
-    more = f" These data do not tell it from the same of {other}." if len(found) > 1 else ""
+    more, others = "", [one["detail"].partition(",")[0] for one in found[1:]]
+    if others:
+        more = f" These data do not tell it from such a course of {listed(others, 'or', _NAMED)}."
     if not content["causes"]:
         return f"It may be one thing: {found[0]['detail']}.{more}"
     those = "this" if len(content["causes"]) == 1 else "these together"

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, eigh
 
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.problem import law_basis
@@ -21,7 +21,7 @@ from astropolcal.gap.problem import law_basis
 __all__ = []
 
 # degree of the law in wavelength
-_DEGREE = 2
+_DEGREE = 4
 # rounds for every place and kind, and for so many of the best
 _ROUNDS, _MORE, _BEST = 1, 5, 6
 # what lowers chi-square by less than this share more is the same
@@ -48,9 +48,9 @@ class Course:
         lamp absorb; zero and infinite in frames that do not tell it.
     lowered, freedom : float, int
         By how much it lowers chi-square, and by how many directions.
-    behind : float
-        By how much it does worse than the causes that were found, beyond what its larger freedom
-        gains from noise, in standard deviations of that.
+    gained, behind : float
+        By how much more than the causes that were found it lowers chi-square, beyond what its
+        larger freedom gains from noise; by how much less, in standard deviations of that.
     p_value : float
         Probability that noise alone lowers chi-square so much, for this place and kind alone.
     """
@@ -63,6 +63,7 @@ class Course:
     std: list = field(default_factory=list)
     lowered: float = 0.0
     freedom: int = 0
+    gained: float = -np.inf
     behind: float = np.inf
     p_value: float = 1.0
 
@@ -123,31 +124,30 @@ def courses(model, base):
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
         for one in _fitted(at, absent):
             freer = max(one.freedom - freedom, 1.0)
-            one.behind = float(((lost - one.lowered) / temper + freer) / np.sqrt(2 * freer))
+            one.gained = float((one.lowered - lost) / temper - freer)
+            one.behind = float(-one.gained / np.sqrt(2 * freer))
             # the law is chosen: of k singular values the largest is more than a share of their sum
             k = len(one.reduced.target[0][0])
             gain = 2 * np.sqrt((k - 1) * max(one.freedom - k + 1, 0))
             one.p_value = float(stats.chi2.sf(max(one.lowered / temper - gain, 0), one.freedom))
             one.std = [np.sqrt(temper) * std for std in one.std]
             known = best.setdefault((one.place, one.kind), one)
-            best[one.place, one.kind] = min(known, one, key=lambda course: course.behind)
+            best[one.place, one.kind] = max(known, one, key=lambda course: course.gained)
     for one in best.values():
         # large, and of no use once it is fitted
         one.reduced = None
-    return sorted(best.values(), key=lambda one: one.behind)
+    return sorted(best.values(), key=lambda one: -one.gained)
 
 
 def _fitted(model, absent):
     """Return the courses at a fitted model of which some effects are taken out."""
     probes = Probes(model, absent)
     basis = law_basis(probes.problem.wavelength, _DEGREE)
-    constant = np.linalg.lstsq(basis, np.ones(len(basis)))[0]
-    found = [
-        Course(place, kind, Reduced(probes, slopes, basis), constant / np.linalg.norm(constant))
-        for (place, kind), slopes in probes.slopes.items()
-    ]
-    for one in found:
-        one.fit(_ROUNDS)
+    found = []
+    for (place, kind), slopes in probes.slopes.items():
+        reduced = Reduced(probes, slopes, basis)
+        found.append(Course(place, kind, reduced, _first_law(reduced)))
+        found[-1].fit(_ROUNDS)
     found = [one for one in found if one.lowered > 0]
     found.sort(key=lambda one: one.freedom - one.lowered)
     for one in found[:_BEST]:
@@ -159,3 +159,11 @@ def _fitted(model, absent):
         one.wave = [wave * largest for wave in one.wave]
         one.std = [std * abs(largest) for std in one.std]
     return found
+
+
+def _first_law(reduced):
+    """Return the law along which most frames are off, against their noise."""
+    target, gram = np.concatenate(reduced.target), np.concatenate(reduced.gram).sum(axis=0)
+    noise = gram + _ABSORBED * (np.trace(gram) or 1.0) * np.eye(len(gram))
+    law = eigh(target.T @ target, noise)[1][:, -1]
+    return law / np.linalg.norm(law)

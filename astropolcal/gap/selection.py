@@ -75,12 +75,12 @@ _UNLISTED = (0.0, 0.01, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
 # of 20, and a quarter of all gaps may be of this sort
 _MAY_HIDE, _UNSEEN = (0.25, 0.35), (0.0, 0.11)
 # the same where one course that no table has does as well as several causes do together, and below
-# how many standard deviations it does: within 3 were 10 of 118 answers to pairs, all right, and 40
-# of 63 to mechanisms, of whose 80 causes 6 were right
-_ONE_COURSE, _AS_WELL = 0.65, 4.0
-# and where it does better than causes do, which were one or two: 22 more answers to mechanisms, of
-# whose 37 causes 4 were right, and none to pairs
-_BETTER_COURSE, _BETTER = 0.85, -3.0
+# how many standard deviations it does: within 2 were 7 of 52 answers to pairs, all right, and 34 of
+# 36 to mechanisms, of whose 68 causes 9 were right
+_ONE_COURSE, _AS_WELL = 0.65, 1.5
+# and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
+# right, and none of 53 to cells
+_BETTER_COURSE, _BETTER = 0.85, -2.5
 # from this probability on it is told
 _MAY_BE = 0.3
 # the same where one of several causes is not asked for in every part of the data: 23 of 52
@@ -208,7 +208,8 @@ def select(base, library, groups, say, *, cells=True, changes=False):
 
 def _alike_courses(found):
     """Return the best courses, which the data do not tell apart."""
-    return [one for one in found if one.behind < found[0].behind + 1]
+    near = [np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
+    return [o for o, noise in zip(found, near, strict=True) if o.gained > found[0].gained - noise]
 
 
 def _errors(model, groups):

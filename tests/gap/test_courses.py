@@ -27,7 +27,7 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
     )
     probes = Probes(model)
     channel, rows = probes.problem.channels[0], probes.problem.segments[0]
-    basis = law_basis(probes.problem.wavelength, 2)
+    basis = law_basis(probes.problem.wavelength, 4)
     for one in courses(model, model)[::9]:
         slope = probes.slopes[one.place, one.kind][0]
         sizes = one.law[probes.problem.datasets[0].bins][:, None]
