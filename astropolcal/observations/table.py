@@ -89,7 +89,6 @@ class Observations:
         # found when they are first asked for, and kept
         self._groups, self._hash = {}, None
         self._mask = grid.reason > 0
-        grid = self._grid
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
         # groups and hash are kept, so that what they were made of must not change
         for array in (*arrays, *self._variances, *self._measured().values()):
