@@ -70,12 +70,11 @@ class Frame(FrameHeader):
     @classmethod
     def from_dict(cls, content):
         """Return the frame that `to_dict` described."""
-        found = plain = content["photometry"]
-        if plain is not None:
+        if (plain := content["photometry"]) is not None:
             others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
             arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
-            found = Photometry(**arrays, **others)
-        return cls(**content | {"photometry": found})
+            content = content | {"photometry": Photometry(**arrays, **others)}
+        return cls(**content)
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -208,9 +207,8 @@ def _read_beams(path, hdus, layout, masters):
         # one saturated exposure spoils the mean, and is to be seen in it
         full = np.where(good, cube, -np.inf).max(axis=0) >= detector.saturation
         # a pixel that lacks an exposure must not have the brightness of the others
-        always = good.all(axis=0)
-        light = cube[:, always].sum(axis=1, dtype=float)
-        light = light / light.mean() if always.any() and light.min() > 0 else np.ones(len(cube))
+        light = cube[:, good.all(axis=0)].sum(axis=1, dtype=float)
+        light = light / light.mean() if light.min() > 0 else np.ones(len(cube))
         seen = np.tensordot(light, good, 1)[None]
         cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.where(seen > 0, seen, 1)
         # of few exposures a star may stand elsewhere than in the mean
@@ -311,8 +309,7 @@ class Masters:
         if self.dark is not None:
             dark, unit = _image(self.dark, layout.file_shape)
             if not detector.counts_in(unit):
-                words = f"the dark {self.dark} is in {unit}, the frame in {detector.unit}"
-                raise ObservationError(f"{words}; bring both to one unit")
+                raise ObservationError(f"{self.dark} is in {unit}, the frame in {detector.unit}")
             cube, good = cube - dark, good & np.isfinite(dark)
         if self.flat is not None:
             flat, _ = _image(self.flat, layout.file_shape)
@@ -497,12 +494,8 @@ def _brightness(files, frames, detectors):
                 "one unit"
             )
     exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in frames])
-    known = np.isfinite(exposure)
-    if not known.all():
+    if not np.isfinite(exposure).all():
         # what a header does not say is not guessed
-        if np.unique(exposure[known]).size > 1:
-            first = files[int(np.argmin(known))]
-            raise ObservationError(f"{first}: no exposure time, and those of other frames differ")
         exposure = np.ones(len(frames))
     # electrons grow with time; a unit of the data is so many of them, of all exposures of a mean
     number = np.array([frame.values.get("exposures", 1.0) for frame in frames])

@@ -155,8 +155,7 @@ def read_header(path, layout, *, header=None, raw=None):
             if len({layout.states.get(str(v), str(v).strip()) for _, v in told} - {""}) > 1:
                 words = ", but ".join(f"{keyword} = {value!r}" for keyword, value in told)
                 frame.errors.append(f"{words}: which state of the modulator?")
-    moment = "mjd" if "mjd" in frame.values else "date"
-    if look_up(headers, moment, layout)[0] in _STARTS:
+    if look_up(headers, "mjd" if "mjd" in frame.values else "date", layout)[0] in _STARTS:
         frame.values["starts"] = True
     return frame
 
@@ -164,16 +163,14 @@ def read_header(path, layout, *, header=None, raw=None):
 def _compare(frame, column, found, layout):
     """Say which other keywords give another angle than the first one."""
     (first, _), *others = found
+    most = layout.tracking_tolerance
     for keyword, value in ((k, v) for k, v in others if k != first):
-        try:
+        # what is no number says nothing
+        with suppress(TypeError, ValueError):
             angle = convert(column, value, layout, u.deg)
-        except (TypeError, ValueError):
-            continue
-        # half a turn is none for a half-wave plate, and a derotator
-        if not abs(_half_turn(angle - frame.values[column])) <= layout.tracking_tolerance:
-            frame.doubts.append(
-                f"{first} and {keyword} differ by more than {layout.tracking_tolerance:g} deg"
-            )
+            # half a turn is none for a half-wave plate, and a derotator
+            if not abs(_half_turn(angle - frame.values[column])) <= most:
+                frame.doubts.append(f"{first} and {keyword} differ by more than {most:g} deg")
 
 
 def _half_turn(angle):
@@ -237,8 +234,8 @@ def add_pointing(frames, layout, needed=True):
     found = []
     for frame in frames:
         # a telescope in space has neither
-        sky = [name for name in ("parallactic", "altitude") if name in layout.keywords]
-        missing = [name for name in sky if name not in frame.values]
+        asked = layout.keywords.keys() - frame.values.keys()
+        missing = [name for name in ("parallactic", "altitude") if name in asked]
         words = [layout.keywords[name] for name in missing]
         if not missing or any(error.startswith(tuple(words)) for error in frame.errors):
             continue

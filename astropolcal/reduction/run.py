@@ -316,7 +316,7 @@ def reduce_run(
     dark_time = masters.exposure_time(layout)
     for frame in frames:
         if dark_time and abs(frame.values.get("exposure_time", dark_time) / dark_time - 1) > 0.01:
-            frame.doubts.append(f"its dark was exposed for {dark_time:g} s, it was not")
+            frame.doubts.append(f"exposed for another time than its dark, {dark_time:g} s")
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:
@@ -549,8 +549,7 @@ def replace_angles(frames, sequence, lost=()):
     if sequence is None:
         return
     if lost:
-        words = "cannot be used, and the sequence lacks it; leave out all frames of its sequence"
-        raise ObservationError(f"{lost[0]}: {words}")
+        raise ObservationError(f"{lost[0]}: cannot be used; leave out all frames of its sequence")
     if not len(sequence) or len(frames) % len(sequence):
         raise ObservationError(
             f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
@@ -576,13 +575,12 @@ def without_repeats(frames, reduction):
     seen = []
 
     def why(frame):
+        words = f"half-wave plate at {frame.values['hwp']:g} deg repeats that of"
         for twin in seen:
             hwp, derotator = (abs(frame.values[k] - twin.values[k]) for k in ("hwp", "derotator"))
             # a half-wave plate at 90 deg has the Mueller matrix of one at 0
             if abs(hwp - 90.0) < 0.3 and derotator < 0.5:
-                return [
-                    f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
-                ]
+                return [f"{words} {twin.name}"]
         seen.append(frame)
         return []
 
@@ -592,19 +590,16 @@ def without_repeats(frames, reduction):
 # ---- journal -------------------------------------------------------------------------------------
 
 # what a line raises that was cut off, or is no frame
-_DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError)
-_DAMAGE += (RecursionError,)
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def _frame(content):
     """Return a frame that has what a frame has, or raise."""
     frame = Frame.from_dict(content)
-    if not isinstance(frame.path, str) or not isinstance(frame.values, dict):
-        raise TypeError("a frame has a path, and values by name")
-    for texts in (frame.errors, frame.doubts):
-        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
-            raise TypeError("errors and doubts are lists of texts")
-    frame.to_dict()
+    kinds = {"path": str, "values": dict, "errors": list, "doubts": list}
+    sane = all(isinstance(getattr(frame, name), kind) for name, kind in kinds.items())
+    if not (sane and all(isinstance(text, str) for text in frame.errors + frame.doubts)):
+        raise TypeError("a frame has a path, values by name, and texts of errors and doubts")
     return frame
 
 

@@ -103,9 +103,8 @@ def run(arguments):
         arguments.flux = EXAMPLE["flux"]
         if arguments.cubes:
             place = {"image": image, "background": arguments.background}
-            arguments.flux = _usual_flux(
-                chain, instrument, frames, EXAMPLE["flux"], **scene, **place
-            )
+            most = arguments.flux
+            arguments.flux = _usual_flux(chain, instrument, frames, most, **scene, **place)
     given = {name: getattr(arguments, name) for name in ("seed", "flux", "gain", "read_noise")}
     options = given | {
         # beside cubes the table is the truth that a reduction must find again

@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Beams on two cameras: what both headers must agree in, and electrons of both."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -148,22 +146,6 @@ def test_a_camera_that_lost_exposures_is_as_bright_and_noisier(files):
     np.testing.assert_allclose(cube, expected)
     ratio = detector.left.variance(cube) / whole.left.variance(expected)
     np.testing.assert_allclose(ratio, 3 / 2)
-
-
-def test_exposure_times_that_only_some_headers_know_are_not_taken_for_equal(tmp_path):
-    layout = replace(LAYOUT, beam_files=(), shape=(1, 8, 8))
-    for times, scale in [((1.0, 3.0), [0.5, 1.5]), ((1.0, None), None), ((None, 1.0, 3.0), "")]:
-        paths = [tmp_path / f"n_0000000{i}.fits" for i in range(len(times))]
-        for i, (path, time) in enumerate(zip(paths, times, strict=True)):
-            cards = {**HEADER, "MODE": None, "EXPTIME": time}
-            header = fits.Header([(k, v) for k, v in cards.items() if v is not None])
-            fits.PrimaryHDU(np.full((8, 8), 1.0 + i), header).writeto(path, overwrite=True)
-        if scale == "":
-            with pytest.raises(ObservationError, match=r"n_00000000.fits: no exposure time"):
-                survey_frames(paths, layout, centre=(4, 4))
-            continue
-        found = survey_frames(paths, layout, centre=(4, 4))[2]
-        assert (found if found is None else found.tolist()) == scale, times
 
 
 def test_beams_of_other_plate_angles_are_refused_where_no_star_is_looked_for(files):

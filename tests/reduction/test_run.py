@@ -353,7 +353,7 @@ def test_dark_in_another_unit_is_refused_and_of_another_exposure_told(tmp_path, 
     for unit, time, words in [
         ("adu", 10.0, ""),
         (None, 10.0, ""),
-        ("adu", 5.0, "its dark was exposed for 5 s"),
+        ("adu", 5.0, "exposed for another time than its dark, 5 s"),
         ("electron", 10.0, "dark.fits is in electron, the frame in adu"),
         ("adu/s", 10.0, "dark.fits is in adu/s, the frame in adu"),
     ]:
@@ -434,9 +434,7 @@ def test_corrupted_angles_are_left_out_or_replaced(tmp_path, small):
     # four frames are left, which are no sequence
     for path in paths[1:3] + paths[5:7]:
         write_cube(path, np.full((4, 201, 201), np.nan))
-    with pytest.raises(
-        ObservationError, match=f"{paths[1].name}: cannot be used, and the sequence"
-    ):
+    with pytest.raises(ObservationError, match=f"{paths[1].name}: cannot be used; leave out all"):
         reduce_run(paths, small, hwp_sequence=CYCLE)
 
 

@@ -76,11 +76,9 @@ def groups_by(measurement, by="derotator"):
         angle = np.rad2deg(angle_or_zero(part.observations, "derotator"))[part.frames[:, 0]]
         for k, label in enumerate(np.unique(groups[where])):
             rows = groups[where] == label
-            what = {
-                "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
-                "cycle": f"number {k}",
-                "dataset": f"number {i}",
-            }[by]
+            what = f"number {i if by == 'dataset' else k}"
+            if by == "derotator":
+                what = f"{angle[part.group_of_datum[rows][0]]:g} deg"
             most = int(np.bincount(measurement.bins[where][rows]).max())
             found.append((f"{by} {what} of {part.observations.name}", most))
     if len(found) < 2:
