@@ -56,7 +56,7 @@ def leave_out_groups(measurement, by="derotator"):
         elif by == "pair":
             number = np.arange(len(plus))
         elif by == "derotator" and turns:
-            number = clusters(table.position("derotator")[plus])
+            number = clusters(table.position("derotator")[plus], turn=np.pi)
         else:
             number = np.unique(cycle_numbers(table)[plus], return_inverse=True)[1]
             if by == "derotator":

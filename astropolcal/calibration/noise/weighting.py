@@ -138,9 +138,8 @@ def outlying_data(calibration, limit=_FAR):
             rows.append((part.observations.name, numbers, *found))
     rows.sort(key=lambda row: -row[3])
     names = ("dataset", "frames", "residual", "sigma", "brightness")
-    table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
-    table["residual"].unit = "percent"
-    return QTable(table)
+    kinds = (str, str, float, float, float)
+    return QTable(rows=rows or None, names=names, dtype=kinds, units={"residual": u.percent})
 
 
 # ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----
