@@ -549,6 +549,25 @@ def mask_saturated(observations):
     return _masked(observations, np.nan_to_num(flag.astype(float)) > 0, "saturated")
 
 
+def mean_of_exposures(stack, good):
+    """
+    Return the mean of the known exposures (N, Y, X) of each pixel, and how many all amount to.
+
+    A pixel that lacks some is scaled to the brightness of all, which is the median of the pixels
+    that lack none: a cosmic ray does not count. NaN where none is known.
+    """
+    pixels = stack[:, good.all(axis=0)]
+    # a part of them tells it as well
+    pixels = pixels[:, :: 1 + pixels.shape[1] // 20_000].astype(float)
+    level = np.median(pixels, axis=0)
+    ratio = pixels[:, level > 0] / level[level > 0]
+    light = np.median(ratio, axis=1) if ratio.size else np.ones(len(stack))
+    light = light / light.mean() if light.min() > 0 else np.ones(len(stack))
+    number = np.tensordot(light, good, 1)[None]
+    number = np.where(number > 0, number, np.nan)
+    return np.where(good, stack, 0.0).sum(axis=0, keepdims=True) / number, number
+
+
 def brightness(observations):
     """
     Return how bright each frame is, (F,).

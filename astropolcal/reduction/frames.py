@@ -23,6 +23,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.fitscheck import open_fits, primary_header, readable_fits
 from astropolcal.instruments.layout import ANGLES, card_value
+from astropolcal.observations.grid import mean_of_exposures
 from astropolcal.pipeline.headers import told_beam
 from astropolcal.reduction.headers import (
     FrameHeader,
@@ -206,13 +207,8 @@ def _read_beams(path, hdus, layout, masters):
             raise ObservationError(f"{path}: {count} have no pixel with a value; leave them out")
         # one saturated exposure spoils the mean, and is to be seen in it
         full = np.where(good, cube, -np.inf).max(axis=0) >= detector.saturation
-        # a pixel that lacks an exposure must not have the brightness of the others
-        light = cube[:, good.all(axis=0)].sum(axis=1, dtype=float)
-        light = light / light.mean() if light.min() > 0 else np.ones(len(cube))
-        seen = np.tensordot(light, good, 1)[None]
-        cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.where(seen > 0, seen, 1)
         # of few exposures a star may stand elsewhere than in the mean
-        cube = np.where(full, detector.saturation, cube)
+        cube = np.where(full, detector.saturation, mean_of_exposures(cube, good)[0])
         good = (full | (good.mean(axis=0) > 0.5))[None]
     return primary, header, cube, good
 
@@ -332,10 +328,8 @@ def _image(path, shape):
 def _read_image(path, shape, changed):
     with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=False) as hdus:
         shapes = []
-        for hdu in hdus:
-            data = hdu.data if hdu.is_image else None
-            if data is None:
-                continue
+        for hdu in (hdu for hdu in hdus if hdu.is_image and hdu.data is not None):
+            data = hdu.data
             if data.shape in (shape, shape[1:], (1, *shape[1:])) and data.dtype.kind in "fiu":
                 found = np.array(data, dtype=float)
                 if not np.isfinite(found).any():

@@ -45,7 +45,7 @@ _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 # in which the times and the places of targets are understood
-_SYSTEMS = {"TIMESYS": r"UTC?(\(.*)?", "EQUINOX": r"J?2000(\.0*)?"}
+_SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
 
 @dataclass
@@ -141,9 +141,8 @@ def read_header(path, layout, *, header=None, raw=None):
             except ObservationError as error:
                 frame.errors.append(f"raw frame: {error}")
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
-        value = card_value(header, keyword)
-        if value is not None and not re.fullmatch(usual, str(value).strip()):
-            frame.values["system"] = f"{keyword} = {value!r}"
+        if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
+            frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"
     for column in columns:
         keyword, value = look_up(headers, column, layout)
         if value is not None and column not in frame.values:

@@ -39,6 +39,7 @@ __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 _FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
+_OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
 
 
 @dataclass
@@ -305,9 +306,8 @@ def reduce_run(
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    reduction = Reduction(
-        instrument, photometry, problems=lost, options=options, masters=task["masters"]
-    )
+    kept = {"options": options, "masters": task["masters"]}
+    reduction = Reduction(instrument, photometry, problems=lost, **kept)
     frames = _usable(frames, reduction, layout, hwp_sequence, keep_repeats)
     if not frames:
         raise ObservationError(_nothing(len(files), task, reduction.problems))
@@ -320,9 +320,7 @@ def reduce_run(
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:
-            frame.doubts.append(
-                "taken more than a day from the middle of the run; the table states one date"
-            )
+            frame.doubts.append(_OTHER_DAY)
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
