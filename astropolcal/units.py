@@ -198,7 +198,8 @@ def plain_number(value, kind=float):
     What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
     TypeError.
     """
-    text = value if isinstance(value, str) else ""
+    # true is 1 for Python
+    text = value if isinstance(value, str) else "_" * isinstance(value, bool | np.bool_)
     if "_" in text or any(c.isdecimal() and not c.isascii() for c in text):
         raise ValueError(f"{value!r} is not written as a plain number")
     return kind(value)

@@ -319,7 +319,8 @@ class ScienceFrames:
             Place of the star in the right and the left beam, 0-based x and y, side by side also
             where each beam has files of its own, shape (2, 2) or (n_frames, 2, 2); or of the left
             beam only, shape (2,) or (n_frames, 2), with the right beam where the layout says; by
-            default in the middle of the field.
+            default in the middle of the field. Shape (2, 2) are always both beams; a distance of
+            theirs that is not about that of the layout is refused.
         size : int
             Rows and columns that are cut out about it.
         position_angle, mirrored
@@ -340,6 +341,8 @@ class ScienceFrames:
         ------
         ObservationError
             If a file cannot be read, or the table lacks an angle.
+        ParameterError
+            If ``centres`` are none, or not those of both beams.
         """
         layout = instrument.files
         positions = frame_positions(instrument, table, chain, names=files)
@@ -435,6 +438,13 @@ def _centres(centres, layout):
         raise ParameterError(f"centres of shape {centres.shape}; x and y of each are needed")
     if centres.shape == (2,) or (centres.ndim == 2 and centres.shape != (2, 2)):
         centres = np.stack([centres + layout.star_offset, centres], axis=-2)
+    apart = np.subtract(centres[..., 0, :] - centres[..., 1, :], layout.star_offset)
+    # two frames of one beam have the same shape, and so has the left beam before the right one
+    if (far := np.hypot(*layout.star_offset) / 2) and (np.hypot(*apart.T) > far).any():
+        raise ParameterError(
+            f"centres = {centres.tolist()}: the right beam comes first, about (x, y) = "
+            f"{layout.star_offset} from the left one; of 2 frames give both beams"
+        )
     if layout.beam_files:
         # their files are apart; side by side the left image comes first
         centres[..., 0, 0] -= layout.file_shape[2]

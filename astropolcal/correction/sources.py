@@ -12,6 +12,7 @@ from astropolcal.correction.geometry import derotate, derotate_gain, derotate_va
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line, understood
 from astropolcal.fitscheck import open_fits, readable_fits
+from astropolcal.observations.grid import mean_of_exposures
 from astropolcal.units import to_unit
 
 __all__ = []
@@ -273,9 +274,7 @@ class _WholeCubes:
         if self._has_errors:
             variance = self._squared(self._section(beam, i, slice(None), 1))
             good &= np.isfinite(variance)
-        number = good.sum(axis=0, keepdims=True)
-        number = np.where(number > 0, number, np.nan)
-        mean = np.where(good, flux, 0.0).sum(axis=0, keepdims=True) / number
+        mean, number = mean_of_exposures(flux, good)
         if self._has_errors:
             variance = np.where(good, variance, 0.0).sum(axis=0, keepdims=True) / number**2
         elif self._detectors is not None:

@@ -676,7 +676,8 @@ class Instrument(ABC):
         Returns
         -------
         dict of str to `~numpy.ndarray`
-            Shape (n_frames,) each, or (nodes, n_frames) for exposures of several nodes.
+            Shape (n_frames,) each, or (nodes, n_frames) for exposures of several nodes, and for one
+            if the angles do not hold in the middle.
 
         Raises
         ------

@@ -379,7 +379,8 @@ TEXTS = (
 )
 #: Beyond these, in degree, an angle in a header cannot be right.
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
-RANGES |= {"em_gain": (0.0, 1e5), "exposures": (1.0, 1e6)}
+# an exposure of zero seconds has no rate
+RANGES |= {"em_gain": (0.0, 1e5), "exposures": (1.0, 1e6), "exposure_time": (5e-324, math.inf)}
 # what a layout means that gives no unit, "" for a number; everything else is in degree
 _UNITS = {"camera": "", "em_gain": "", "exposures": "", "exposure_time": "s", "mjd": "d"}
 

@@ -450,12 +450,19 @@ def plain_source(source):
     return "star" if words == "standard star" else words
 
 
-def clusters(values, gap=SAME_ANGLE):
-    """Return the number of each value's cluster; clusters are more than ``gap`` apart."""
+def clusters(values, gap=SAME_ANGLE, turn=None):
+    """
+    Return the number of each value's cluster; clusters are more than ``gap`` apart.
+
+    Angles are the same again after a ``turn``.
+    """
+    values = values if turn is None else np.mod(values, turn)
     order = np.argsort(values, kind="stable")
     number = np.empty(len(values), dtype=int)
     number[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap)])
-    return number
+    # the last one may be the first one, on the other side of zero
+    joined = turn is not None and np.ptp(values) >= turn - gap
+    return number % max(number.max(), 1) if joined else number
 
 
 def runs_of_frames(count, number):
@@ -486,8 +493,7 @@ def cycle_numbers(observations, start=None):
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
     # with the first of a cycle, if it is known; 180 deg is 0 deg again, and so is a bit less
     known = [] if start is None else [float(angle_to_rad(start, "start"))]
-    plate = np.append(angle_or_zero(observations, "hwp"), known)
-    plate = clusters(np.mod(plate + _PLATE_STEPS, np.pi), _PLATE_STEPS)
+    plate = clusters(np.append(angle_or_zero(observations, "hwp"), known), _PLATE_STEPS, np.pi)
     plate, first = plate[: observations.n_frames], plate[observations.n_frames :]
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
     moved = np.diff(derotator_runs(observations), prepend=0) > 0
@@ -541,6 +547,25 @@ def mask_saturated(observations):
             "are needed"
         )
     return _masked(observations, np.nan_to_num(flag.astype(float)) > 0, "saturated")
+
+
+def mean_of_exposures(stack, good):
+    """
+    Return the mean of the known exposures (N, Y, X) of each pixel, and how many all amount to.
+
+    A pixel that lacks some is scaled to the brightness of all, which is the median of the pixels
+    that lack none: a cosmic ray does not count. NaN where none is known.
+    """
+    pixels = stack[:, good.all(axis=0)]
+    # a part of them tells it as well
+    pixels = pixels[:, :: 1 + pixels.shape[1] // 20_000].astype(float)
+    level = np.median(pixels, axis=0)
+    ratio = pixels[:, level > 0] / level[level > 0]
+    light = np.median(ratio, axis=1) if ratio.size else np.ones(len(stack))
+    light = light / light.mean() if light.min() > 0 else np.ones(len(stack))
+    number = np.tensordot(light, good, 1)[None]
+    number = np.where(number > 0, number, np.nan)
+    return np.where(good, stack, 0.0).sum(axis=0, keepdims=True) / number, number
 
 
 def brightness(observations):

@@ -342,7 +342,8 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     """
     Return altitude, parallactic, derotator and hwp, radian, (F,), or (nodes, F) for several nodes.
 
-    The plate stands at ``hwp_true`` where the table has it, else where the tracking law puts it.
+    One node, the middle, has shape (1, F) if the angles are of another moment. The plate stands at
+    ``hwp_true`` where the table has it, else where the tracking law puts it.
     The other arguments are those of `sky_angles`, `tracked`, `smeared` and `motion`.
     """
     altitude, parallactic = sky_angles(observations, location)
@@ -354,7 +355,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     if "hwp_true" in observations.frames.colnames:
         # what the plate really did differs from the law by a constant offset in each frame
         offset = observations.position("hwp_true") - follows
-    if nodes > 1:
+    if (nodes, when) != (1, "middle"):
         found = {
             stage: smeared(angle, motion(observations, angle, duty, turn), nodes, when)
             for stage, angle in found.items()

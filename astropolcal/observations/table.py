@@ -89,7 +89,6 @@ class Observations:
         # found when they are first asked for, and kept
         self._groups, self._hash = {}, None
         self._mask = grid.reason > 0
-        grid = self._grid
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
         # groups and hash are kept, so that what they were made of must not change
         for array in (*arrays, *self._variances, *self._measured().values()):
@@ -323,9 +322,8 @@ class Observations:
         low, high = self.wavelength.min(), self.wavelength.max()
         lines = [f"{self.name}: {self._headline()}"]
         lines.append(f"wavelength: {low.value:g} to {high.value:g} {high.unit}")
-        for column in self._grid.frames.colnames:
-            if _is_angle(self._grid.frames[column]):
-                lines.append(f"{column}: {_span(np.rad2deg(self.position(column)))} deg")
+        angles = (name for name, column in self._grid.frames.columns.items() if _is_angle(column))
+        lines += [f"{name}: {_span(np.rad2deg(self.position(name)))} deg" for name in angles]
         lines.append(f"errors: {' and '.join(self._grid.errors) or 'none'}")
         lines += [f"masked, {why}: {counted(n, 'cell')}" for why, n in self.mask_reasons.items()]
         return "\n".join(lines)

@@ -325,7 +325,7 @@ def simulate_cubes(
     light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
     if flux is None:
         looks = {"image": image, "background": detector.background}
-        flux = _usual_flux(chain, instrument, frames, **light, **looks)
+        flux = _usual_flux(chain, instrument, frames, 1e7, **light, **looks)
     beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
@@ -357,21 +357,12 @@ def simulate_cubes(
 
 
 def _usual_flux(
-    chain,
-    instrument,
-    frames,
-    most=1e7,
-    *,
-    wavelength=None,
-    source="internal",
-    image=None,
-    background=0.0,
-    **light,
+    chain, instrument, frames, most, *, image, background, source, wavelength=None, **light
 ):
     """Return the flux of cubes for which none is given, at most so much."""
     layout, wavelength, _ = _of_mode(instrument, wavelength)
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
-    share = (image or ImageModel())._scene(layout, source, len(wavelength)).peak()
+    share = image._scene(layout, source, len(wavelength)).peak()
     fluxes = _beam_fluxes(chain, frames, wavelength, source, **light)
     room = _FILLED * _read_out(frames, layout).saturation
     room = room - per_wavelength("background", background, len(wavelength))
@@ -618,12 +609,12 @@ def _cards(header):
 
 
 def _hdus(header, image, weight, layout):
-    header, second = _cards(header), ("IVAR", "adu-2")
+    header, name, unit = _cards(header), "IVAR", "adu-2"
     if layout.weights == "error":
         with np.errstate(divide="ignore"):
             # where nothing is known the weight is 0, and so is this
             weight = np.where(weight > 0, 1 / np.sqrt(weight), 0.0).astype(np.float32)
-        second = ("ERR", "adu")
+        name, unit = "ERR", "adu"
     if layout.cube_extension == 0:
         # without it the unit would have to be guessed
         header["BUNIT"] = "adu"
@@ -633,7 +624,6 @@ def _hdus(header, image, weight, layout):
         hdus = [fits.PrimaryHDU(header=header)]
         hdus += [fits.ImageHDU() for _ in range(layout.cube_extension - 1)]
         hdus.append(fits.ImageHDU(image, header=fits.Header({"BUNIT": "adu"}), name="IMAGE"))
-    name, unit = second
     hdus.append(fits.ImageHDU(weight, header=fits.Header({"BUNIT": unit}), name=name))
     return fits.HDUList(hdus)
 

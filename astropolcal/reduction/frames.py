@@ -22,10 +22,12 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.fitscheck import open_fits, primary_header, readable_fits
-from astropolcal.instruments.layout import card_value
+from astropolcal.instruments.layout import ANGLES, card_value
+from astropolcal.observations.grid import mean_of_exposures
 from astropolcal.pipeline.headers import told_beam
 from astropolcal.reduction.headers import (
     FrameHeader,
+    _half_turn,
     add_pointing,
     configured,
     not_of_instrument,
@@ -38,11 +40,6 @@ from astropolcal.reduction.photometry import Photometry, detector_of, evenly_lit
 from astropolcal.reduction.stars import measure_stars
 
 __all__ = []
-
-_ARRAYS = (
-    *("flux", "variance", "covariance", "scale", "scale_err"),
-    *("x", "y", "fwhm", "radius", "background"),
-)
 
 
 @dataclass
@@ -65,20 +62,19 @@ class Frame(FrameHeader):
 
     def to_dict(self):
         """Return plain numbers and texts, from which `from_dict` makes the same frame."""
-        content = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        if self.photometry is not None:
-            arrays = {name: getattr(self.photometry, name).tolist() for name in _ARRAYS}
-            content["photometry"] = arrays | {"reasons": self.photometry.reasons}
-        return content
+        plain = self.photometry and {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self.photometry).items()
+        }
+        return vars(self) | {"photometry": plain}
 
     @classmethod
     def from_dict(cls, content):
         """Return the frame that `to_dict` described."""
-        content = dict(content)
-        if content["photometry"] is not None:
-            plain = content["photometry"]
-            arrays = {name: np.array(plain[name], dtype=float) for name in _ARRAYS}
-            content["photometry"] = Photometry(**arrays, reasons=list(plain["reasons"]))
+        if (plain := content["photometry"]) is not None:
+            others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
+            arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
+            content = content | {"photometry": Photometry(**arrays, **others)}
         return cls(**content)
 
 
@@ -93,9 +89,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
     try:
         with open_cube(path, layout, masters) as (primary, header, cube, good):
             # the header that is open already
-            known = read_header(path, layout, header=primary, raw=raw)
-            frame.number, frame.values = known.number, known.values
-            frame.errors, frame.doubts = known.errors, known.doubts
+            vars(frame).update(vars(read_header(path, layout, header=primary, raw=raw)))
             _check_header(frame, layout, source)
             # per file: gain and exposure time may change within a night
             detector = detector_of(layout, _unit_of(header, primary), frame.values)
@@ -200,9 +194,9 @@ def _read_beams(path, hdus, layout, masters):
     several = cube.shape != wanted
     if several or masters is not None:
         values = read_header(path, layout, header=primary).values
-        saturation = detector_of(layout, _unit_of(header, primary), values).saturation
+        detector = detector_of(layout, _unit_of(header, primary), values)
     if masters is not None:
-        cube, good = masters.applied(cube, good, layout, saturation)
+        cube, good = masters.applied(cube, good, layout, detector)
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")
     if several:
@@ -212,10 +206,10 @@ def _read_beams(path, hdus, layout, masters):
             count = f"{empty.size} of its {len(good)} exposures, such as number {empty[0] + 1},"
             raise ObservationError(f"{path}: {count} have no pixel with a value; leave them out")
         # one saturated exposure spoils the mean, and is to be seen in it
-        full = np.where(good, cube, -np.inf).max(axis=0) >= saturation
-        seen = good.sum(axis=0, keepdims=True)
-        cube = np.where(good, cube, 0.0).sum(axis=0, keepdims=True) / np.maximum(seen, 1)
-        cube, good = np.where(full, saturation, cube), seen > 0
+        full = np.where(good, cube, -np.inf).max(axis=0) >= detector.saturation
+        # of few exposures a star may stand elsewhere than in the mean
+        cube = np.where(full, detector.saturation, mean_of_exposures(cube, good)[0])
+        good = (full | (good.mean(axis=0) > 0.5))[None]
     return primary, header, cube, good
 
 
@@ -300,15 +294,21 @@ class Masters:
         """Return the files of the left beam."""
         return Masters(*(p and str(layout.left_file(p)) for p in (self.dark, self.flat)))
 
-    def applied(self, cube, good, layout, saturation):
+    def exposure_time(self, layout):
+        """Return that of the dark, second; None without one, or if its header does not say."""
+        return self.dark and read_header(self.dark, layout).values.get("exposure_time")
+
+    def applied(self, cube, good, layout, detector):
         """Return a cube, or a stack of exposures, and its known pixels, less dark and over flat."""
-        saturated = cube >= saturation
+        saturated = cube >= detector.saturation
         raw, cube = cube, np.asarray(cube, dtype=float)
         if self.dark is not None:
-            dark = _image(self.dark, layout.file_shape)
+            dark, unit = _image(self.dark, layout.file_shape)
+            if not detector.counts_in(unit):
+                raise ObservationError(f"{self.dark} is in {unit}, the frame in {detector.unit}")
             cube, good = cube - dark, good & np.isfinite(dark)
         if self.flat is not None:
-            flat = _image(self.flat, layout.file_shape)
+            flat, _ = _image(self.flat, layout.file_shape)
             lit = np.isfinite(flat) & (flat > 0)
             level = np.median(flat[lit]) if lit.any() else 1.0
             cube, good = cube / np.where(lit, flat / level, 1.0), good & lit
@@ -317,7 +317,7 @@ class Masters:
 
 
 def _image(path, shape):
-    """Return the first image of a file that has a shape, or that of one slice; NaN where bad."""
+    """Return the first image of a file of a shape, or that of a slice, NaN where bad, and BUNIT."""
     if not Path(path).is_file():
         raise ParameterError(f"{path}: there is no such file")
     return _read_image(path, shape, Path(path).stat().st_mtime_ns)
@@ -328,15 +328,13 @@ def _image(path, shape):
 def _read_image(path, shape, changed):
     with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=False) as hdus:
         shapes = []
-        for hdu in hdus:
-            data = hdu.data if hdu.is_image else None
-            if data is None:
-                continue
+        for hdu in (hdu for hdu in hdus if hdu.is_image and hdu.data is not None):
+            data = hdu.data
             if data.shape in (shape, shape[1:], (1, *shape[1:])) and data.dtype.kind in "fiu":
                 found = np.array(data, dtype=float)
                 if not np.isfinite(found).any():
                     raise ObservationError(f"{path}: no pixel has a value")
-                return found
+                return found, _unit_of(hdu.header, hdus[0].header)
             shapes.append(str(data.shape))
     raise ObservationError(
         f"{path}: {', '.join(shapes) or 'no image'}; {shape} or {shape[1:]} is needed"
@@ -376,7 +374,9 @@ def _left_header(frame, layout):
         ours, theirs = frame.values.get(column), other.values.get(column)
         same = ours == theirs
         if tolerance is not None and None not in (ours, theirs):
-            same = abs(ours - theirs) <= tolerance
+            off = ours - theirs
+            # half a turn is none of a plate and a derotator
+            same = abs(_half_turn(off) if column in ANGLES else off) <= tolerance
         if not same:
             frame.errors.append(f"{column} = {ours}, but {theirs} in {path.name}")
     for one, mark in zip((frame, other), layout.beam_files, strict=True):
@@ -401,9 +401,6 @@ def beam_detectors(path, layout, values, unit=None):
 
 
 # ---- science frames, before their light is measured ---------------------------------------------
-
-# what a chain may ask of a frame
-_ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
 
 @dataclass
@@ -549,7 +546,7 @@ def _known(path, layout, raw):
 def _angles(frames):
     """Return a table of the angles and states that are known of all frames."""
     table = QTable()
-    for name in _ANGLES:
+    for name in ANGLES:
         # an angle that no header has is no column at all
         values = [frame.values.get(name, np.nan) for frame in frames]
         if np.isfinite(values).any():

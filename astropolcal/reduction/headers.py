@@ -12,6 +12,7 @@ import warnings
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 import astropy.units as u
@@ -41,6 +42,10 @@ from astropolcal.units import iso_date
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
+# these state the start of an exposure; others the middle, or it is not known
+_STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
+# in which the times and the places of targets are understood
+_SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
 
 @dataclass
@@ -135,6 +140,9 @@ def read_header(path, layout, *, header=None, raw=None):
                 headers.append(primary_header(raw[frame.number]))
             except ObservationError as error:
                 frame.errors.append(f"raw frame: {error}")
+    for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
+        if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
+            frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"
     for column in columns:
         keyword, value = look_up(headers, column, layout)
         if value is not None and column not in frame.values:
@@ -146,22 +154,22 @@ def read_header(path, layout, *, header=None, raw=None):
             if len({layout.states.get(str(v), str(v).strip()) for _, v in told} - {""}) > 1:
                 words = ", but ".join(f"{keyword} = {value!r}" for keyword, value in told)
                 frame.errors.append(f"{words}: which state of the modulator?")
+    if look_up(headers, "mjd" if "mjd" in frame.values else "date", layout)[0] in _STARTS:
+        frame.values["starts"] = True
     return frame
 
 
 def _compare(frame, column, found, layout):
     """Say which other keywords give another angle than the first one."""
     (first, _), *others = found
+    most = layout.tracking_tolerance
     for keyword, value in ((k, v) for k, v in others if k != first):
-        try:
+        # what is no number says nothing
+        with suppress(TypeError, ValueError):
             angle = convert(column, value, layout, u.deg)
-        except (TypeError, ValueError):
-            continue
-        # half a turn is none for a half-wave plate, and a derotator
-        if not abs(_half_turn(angle - frame.values[column])) <= layout.tracking_tolerance:
-            frame.doubts.append(
-                f"{first} and {keyword} differ by more than {layout.tracking_tolerance:g} deg"
-            )
+            # half a turn is none for a half-wave plate, and a derotator
+            if not abs(_half_turn(angle - frame.values[column])) <= most:
+                frame.doubts.append(f"{first} and {keyword} differ by more than {most:g} deg")
 
 
 def _half_turn(angle):
@@ -200,17 +208,14 @@ def _convert(frame, column, keyword, value, layout):
     if column in TEXTS or column in layout.texts:
         frame.values[column] = " ".join(str(value).split())
         return
-    unit = {"exposure_time": "s"}.get(column, unit_of(column, layout))
-    target = u.deg if column in ANGLES else u.Unit(unit)
+    target = {"exposure_time": u.s}.get(column, unit_of(column, layout))
+    target = u.deg if column in ANGLES else target
     try:
         number = convert(column, value, layout, target)
     except (TypeError, ValueError):
         frame.errors.append(f"{keyword} = {value!r}, a number is needed")
         return
     low, high = RANGES.get(column, (-np.inf, np.inf))
-    if column == "exposure_time":
-        # an exposure of zero seconds has no rate
-        low = np.nextafter(0, 1)
     if np.isfinite(number) and low <= number <= high:
         frame.values[column] = number
         return
@@ -228,8 +233,8 @@ def add_pointing(frames, layout, needed=True):
     found = []
     for frame in frames:
         # a telescope in space has neither
-        sky = [name for name in ("parallactic", "altitude") if name in layout.keywords]
-        missing = [name for name in sky if name not in frame.values]
+        asked = layout.keywords.keys() - frame.values.keys()
+        missing = [name for name in ("parallactic", "altitude") if name in asked]
         words = [layout.keywords[name] for name in missing]
         if not missing or any(error.startswith(tuple(words)) for error in frame.errors):
             continue
@@ -254,10 +259,15 @@ def add_pointing(frames, layout, needed=True):
 
 
 def _target(values, site):
-    """Return right ascension and declination (degree, J2000) and the time that a header states."""
+    """Return right ascension and declination (degree, J2000), and the middle of the exposure."""
     if not site:
         raise ObservationError("no site of the telescope to compute the pointing from")
+    if "system" in values:
+        raise ObservationError(f"{values['system']}: times in UTC and places of J2000 are needed")
     time = observation_time(values)
+    # the angles are those of the middle of the exposure
+    length = values.get("exposure_time", 0.0) * values.get("exposures", 1.0)
+    mjd = time.mjd + (length / 2 / 86400 if values.get("starts") else 0.0)
     try:
         ra, dec = (sky_angle(key, values[key]) for key in ("right_ascension", "declination"))
         SkyCoord(ra, dec, unit=u.deg)  # refuses what is beyond the poles
@@ -265,7 +275,7 @@ def _target(values, site):
         raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
     except (ValueError, TypeError, u.UnitsError) as error:
         raise ObservationError(f"right ascension and declination: {one_line(error)}") from None
-    return ra, dec, time.mjd
+    return ra, dec, mjd
 
 
 def observation_time(values):
@@ -321,9 +331,8 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     sequence = None if len(blocks) < 2 or not ranked or tied else ranked[0][0]
     found = {}
     for i, expected in (one for b in blocks for one in _misfits(b, steps, sequence, uneven)):
-        found[int(i)] = f"half-wave plate at {hwp[i]:g} deg"
-        multiple = f", no multiple of {layout.hwp_step:g} deg"
-        found[int(i)] += multiple if uneven[i] else " once too often"
+        why = f", no multiple of {layout.hwp_step:g} deg" if uneven[i] else " once too often"
+        found[int(i)] = f"half-wave plate at {hwp[i]:g} deg{why}"
         if expected is not None and expected < 1e6:
             found[int(i)] += f"; the sequence has {expected * layout.hwp_step:g} deg"
     return found
@@ -368,13 +377,11 @@ def sort_beams(files, layout):
     for state in dict.fromkeys(state for _, state in groups):
         lefts = groups.get((left, state), {})
         for path, (start, length) in groups.get((right, state), {}).items():
-            near = {other: abs(start - lefts[other][0]) for other in lefts}
-            near = {
-                other: apart for other, apart in near.items() if apart <= max(length / 2, _APART)
-            }
-            if near:
-                partners[path] = min(near, key=near.get)
-                del lefts[partners[path]]
+            apart = {other: abs(start - begin) for other, (begin, _) in lefts.items()}
+            near = min(apart, key=apart.get, default=None)
+            if near is not None and apart[near] <= max(length / 2, _APART):
+                partners[path] = near
+                del lefts[near]
     for (camera, state), group in groups.items():
         wanted = f"camera {left if camera == right else right:g}"
         wanted += f" in state {state}" if state else ""

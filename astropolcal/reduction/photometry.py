@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What photometry gives for one cube: both beams at all wavelengths, and why cells failed."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -98,6 +99,10 @@ class Detector:
         """Return the variance that the photons of a signal have, in squared units of the data."""
         return self.excess_noise**2 * signal / self.gain
 
+    def counts_in(self, unit):
+        """Return whether another BUNIT is that of the data, or does not say."""
+        return unit is None or pixel_unit(unit) == self.unit
+
     def of(self, beam):
         """Return the detector of the right (0) or left (1) beam."""
         return self.left if beam == 1 and self.left is not None else self
@@ -119,19 +124,10 @@ class Detector:
         )
 
 
-def detector_of(layout, unit=None, values=None):
-    """
-    Return the detector of a layout in the unit that BUNIT gives (adu if absent).
-
-    The ``values`` of the header say how it was read out. A rate needs their exposure time.
-    """
-    values = values or {}
-    exposure_time = values.get("exposure_time")
-    # counts and DN are adu
-    words = str(unit or "adu").strip()
+def pixel_unit(unit):
+    """Return the unit that BUNIT gives: adu if absent; counts and DN are adu."""
     # the longer name first: "count" would leave an s behind
-    for name in ("counts", "count", "Counts", "DN", "ADU", "dn"):
-        words = words.replace(name, "adu")
+    words = re.sub("counts|count|Counts|DN|ADU|dn", "adu", str(unit or "adu").strip())
     words = words.replace("e-", "electron").replace("electrons", "electron")
     try:
         own = u.Unit(words)
@@ -139,6 +135,17 @@ def detector_of(layout, unit=None, values=None):
         own = u.dimensionless_unscaled
     if not any(own.is_equivalent(kind / per) for kind in (u.adu, u.electron) for per in (1, u.s)):
         raise ObservationError(f"BUNIT = {unit!r}; allowed are adu, electron, and these per second")
+    return own
+
+
+def detector_of(layout, unit=None, values=None):
+    """
+    Return the detector of a layout in the unit that BUNIT gives (adu if absent).
+
+    The ``values`` of the header say how it was read out. A rate needs their exposure time.
+    """
+    values = values or {}
+    exposure_time, own = values.get("exposure_time"), pixel_unit(unit)
     # of a rate the photon noise depends on how long it was collected
     rate = own.is_equivalent(u.adu / u.s) or own.is_equivalent(u.electron / u.s)
     if rate and exposure_time is None:

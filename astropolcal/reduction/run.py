@@ -39,6 +39,7 @@ __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 _FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
+_OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
 
 
 @dataclass
@@ -221,7 +222,8 @@ def reduce_run(
         Folder of raw frames, whose headers are looked into by frame number.
     dark, flat : path-like, optional
         FITS files of a dark, which is subtracted from each exposure, and of a flat, by which it is
-        divided, of the shape of an image of a frame; for raw frames. Pixels without a value in
+        divided, of the shape of an image of a frame; for raw frames. The dark has to be in the unit
+        of the frames, as far as its header says. Pixels without a value in
         them, or where the flat is not above zero, are not used. Where each camera writes a file of
         its own, that of the right beam is named, and that of the left one stands beside it.
     meta : dict, optional
@@ -236,7 +238,8 @@ def reduce_run(
         Whether to show how far it is; on a terminal only.
     hwp_sequence : sequence of float, optional
         Commanded angles in degree, which replace those of the headers, in turn and
-        in the order of the frames; for headers that are known to be wrong.
+        in the order of the frames; for headers that are known to be wrong. Every file has to be
+        usable then.
     keep_repeats : bool
         Whether frames of an internal source are kept whose half-wave plate stands
         90 deg from that of another frame at the same derotator angle.
@@ -303,21 +306,21 @@ def reduce_run(
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    reduction = Reduction(
-        instrument, photometry, problems=lost, options=options, masters=task["masters"]
-    )
+    kept = {"options": options, "masters": task["masters"]}
+    reduction = Reduction(instrument, photometry, problems=lost, **kept)
     frames = _usable(frames, reduction, layout, hwp_sequence, keep_repeats)
     if not frames:
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
+    dark_time = masters.exposure_time(layout)
     for frame in frames:
+        if dark_time and abs(frame.values.get("exposure_time", dark_time) / dark_time - 1) > 0.01:
+            frame.doubts.append(f"exposed for another time than its dark, {dark_time:g} s")
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:
-            frame.doubts.append(
-                "taken more than a day from the middle of the run; the table states one date"
-            )
+            frame.doubts.append(_OTHER_DAY)
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
@@ -325,13 +328,14 @@ def reduce_run(
 
 def _usable(frames, reduction, layout, hwp_sequence, keep_repeats):
     """Return the frames that belong in a table together; note why the others do not."""
+    lost = [*reduction.problems, *(frame.path for frame in frames if not frame.usable)]
     # copies before sequences: a copy would look like an angle too often
     frames = set_aside(frames, reduction)
     if any(frame.values.get("flc_state") for frame in frames):
         keyword = layout.keywords.get("flc_state", "flc_state")
         why = f"no state of the modulator, A or B, in its header ({keyword}), which others have"
         frames = _kept(frames, reduction, lambda f: [] if "flc_state" in f.values else [why])
-    replace_angles(frames, hwp_sequence)
+    replace_angles(frames, hwp_sequence, lost)
     staged = {"hwp", "derotator"} <= {*layout.stages}
     if staged and hwp_sequence is None:
         frames = consistent(frames, reduction, layout)
@@ -391,8 +395,7 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     of_masters = (task["masters"] or Masters()).files(task["layout"])
     settings["changed"] = [os.stat(path).st_mtime_ns for path in of_masters]
     journal = Journal(resume, settings, task["layout"].left_file)
-    found = {path: journal.done(path) for path in files}
-    found = {path: frame for path, frame in found.items() if frame is not None}
+    found = {path: frame for path in files if (frame := journal.done(path)) is not None}
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
     if workers is None:
@@ -539,10 +542,12 @@ def _of_one_kind(frames, what, value, reduction):
     return _kept(frames, reduction, why)
 
 
-def replace_angles(frames, sequence):
-    """Give the frames the angles of a sequence that repeats, in place."""
+def replace_angles(frames, sequence, lost=()):
+    """Give the frames the angles of a sequence that repeats, in place; none may be ``lost``."""
     if sequence is None:
         return
+    if lost:
+        raise ObservationError(f"{lost[0]}: cannot be used; leave out all frames of its sequence")
     if not len(sequence) or len(frames) % len(sequence):
         raise ObservationError(
             f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
@@ -568,13 +573,12 @@ def without_repeats(frames, reduction):
     seen = []
 
     def why(frame):
+        words = f"half-wave plate at {frame.values['hwp']:g} deg repeats that of"
         for twin in seen:
             hwp, derotator = (abs(frame.values[k] - twin.values[k]) for k in ("hwp", "derotator"))
             # a half-wave plate at 90 deg has the Mueller matrix of one at 0
             if abs(hwp - 90.0) < 0.3 and derotator < 0.5:
-                return [
-                    f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
-                ]
+                return [f"{words} {twin.name}"]
         seen.append(frame)
         return []
 
@@ -584,19 +588,16 @@ def without_repeats(frames, reduction):
 # ---- journal -------------------------------------------------------------------------------------
 
 # what a line raises that was cut off, or is no frame
-_DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError)
-_DAMAGE += (RecursionError,)
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def _frame(content):
     """Return a frame that has what a frame has, or raise."""
     frame = Frame.from_dict(content)
-    if not isinstance(frame.path, str) or not isinstance(frame.values, dict):
-        raise TypeError("a frame has a path, and values by name")
-    for texts in (frame.errors, frame.doubts):
-        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
-            raise TypeError("errors and doubts are lists of texts")
-    frame.to_dict()
+    kinds = {"path": str, "values": dict, "errors": list, "doubts": list}
+    sane = all(isinstance(getattr(frame, name), kind) for name, kind in kinds.items())
+    if not (sane and all(isinstance(text, str) for text in frame.errors + frame.doubts)):
+        raise TypeError("a frame has a path, values by name, and texts of errors and doubts")
     return frame
 
 

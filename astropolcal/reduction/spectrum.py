@@ -232,7 +232,7 @@ def _checked(table):
             if old in table.colnames and old != new:
                 table.rename_column(old, new)
         if "determined" in table.colnames and "mask" not in table.colnames:
-            table["mask"] = ~np.asarray(table["determined"], dtype=bool)
+            table["mask"] = ~_flags(table, "determined", unknown=False)
     names = [_NAMES[key] for key in _REQUIRED] + ["v"] * ("v" in table.colnames)
     needed = ["wavelength", *names, *(f"{name}_err" for name in names)]
     missing = [name for name in needed if name not in table.colnames]
@@ -249,12 +249,8 @@ def _checked(table):
     twice = wavelength[1:][np.diff(wavelength) == 0]
     if twice.size:
         raise ObservationError(f"target: wavelength {twice[0]} is given twice")
-    mask = np.zeros(len(table), dtype=bool)
-    if "mask" in table.colnames:
-        try:
-            mask = np.array(table["mask"], dtype=bool)
-        except (TypeError, ValueError):
-            raise ObservationError("target: mask must be true or false in each row") from None
+    masked = "mask" in table.colnames
+    mask = _flags(table, "mask", unknown=True) if masked else np.zeros(len(table), dtype=bool)
     units = {_COVARIANCE: u.one}
     for name in names:
         unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
@@ -273,6 +269,16 @@ def _checked(table):
                 "is needed where the row is not masked"
             )
     return table, mask
+
+
+def _flags(table, name, unknown):
+    """Return a column of true and false, or of 1 and 0; a masked one counts as ``unknown``."""
+    column = table[name]
+    column = np.ma.array(getattr(column, "unmasked", column), mask=getattr(column, "mask", False))
+    # of a text numpy would say that it is not empty
+    if column.dtype.kind not in "biu" or column.ndim != 1:
+        raise ObservationError(f"target: {name} must be true or false in each row")
+    return column.astype(bool).filled(unknown)
 
 
 def _with_unit(table, column, unit):

@@ -212,6 +212,9 @@ def _rows(files):
             open(path, encoding="utf-8", newline="") as stream,
         ):
             reader = csv.DictReader(stream, skipinitialspace=True)
+            # programs end lines with a comma
+            while reader.fieldnames and not reader.fieldnames[-1].strip():
+                reader.fieldnames.pop()
             names = reader.fieldnames or ()
             missing = [name for name in _NEEDED if name not in names]
             if missing:
@@ -219,8 +222,9 @@ def _rows(files):
                     f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
                 )
             for row in filter(lambda row: any(row.values()), reader):
+                beyond = row.pop(None, [])
                 # a comma too many, or too few, moves all that follows to another column
-                if None in row or None in row.values() or len(row) < len(names):
+                if any(beyond) or None in row.values() or len(row) < len(names):
                     raise ObservationError(
                         f"{path}, line {reader.line_num}: each of its {len(names)} columns needs a "
                         "name of its own, and one value"

@@ -102,10 +102,8 @@ def run(arguments):
     if arguments.flux is None:
         arguments.flux = EXAMPLE["flux"]
         if arguments.cubes:
-            place = {"image": image, "background": arguments.background}
-            arguments.flux = _usual_flux(
-                chain, instrument, frames, EXAMPLE["flux"], **scene, **place
-            )
+            look = {"image": image, "background": arguments.background}
+            arguments.flux = _usual_flux(chain, instrument, frames, arguments.flux, **scene, **look)
     given = {name: getattr(arguments, name) for name in ("seed", "flux", "gain", "read_noise")}
     options = given | {
         # beside cubes the table is the truth that a reduction must find again

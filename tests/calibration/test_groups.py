@@ -71,6 +71,20 @@ def test_angles_within_half_a_degree_are_one():
         assert len(set(found.tolist())) == n_groups, (step, n_groups)
 
 
+def test_an_encoder_that_begins_again_is_at_the_same_angle():
+    for angles, groups in [
+        ([359.99, 0.01, 45, 90], [0, 0, 1, 2]),
+        ([179.8, 45, 0.1, 359.9], [0, 1, 0, 0]),
+        ([179.4, 179.6, 90], [1, 1, 0]),
+        # 180 deg of a derotator are none
+        ([0, 180, 90], [0, 0, 1]),
+        ([0.3, 179.3, 90], [0, 2, 1]),
+        ([179.9, 0.1], [0, 0]),
+    ]:
+        found = leave_out_groups(_measurement(_dataset("a", angles, n_bins=1)))
+        assert found.tolist() == groups, angles
+
+
 def test_every_wavelength_of_a_datum_is_in_its_group():
     found = leave_out_groups(_measurement(_dataset("a", [45, 60], n_bins=3)))
     assert found.tolist() == [0, 1] * 3

@@ -231,6 +231,10 @@ def test_centres_that_are_none(cubes):
             ParameterError, match=r"centres of shape .*; x and y of each are needed"
         ):
             from_files(cubes[1], centres=centres)
+    # the left beam first; the left beam in two frames
+    for centres in [[(10, 8), (27, 11)], [(10, 8), (9, 7)], np.zeros((4, 2, 2))]:
+        with pytest.raises(ParameterError, match=r"the right beam comes first, about \(x, y\) = "):
+            from_files(cubes[1], centres=centres)
 
 
 def test_files_of_two_cameras(tmp_path):

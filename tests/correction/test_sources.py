@@ -310,6 +310,15 @@ def test_nans_that_signal_are_nans(tmp_path):
             assert np.isfinite(found).sum() == 8, kind
 
 
+def test_pixels_that_lack_exposures_are_as_bright_as_the_others(tmp_path):
+    cube = np.array([1.0, 1.0, 1.0, 1.0, 0.4])[:, None, None] * np.full((5, 6, 12), 400.0)
+    # known in the last exposure only, and in all others
+    cube[:4, 3, 3], cube[4, 4, 3] = np.nan, np.nan
+    fits.PrimaryHDU(cube).writeto(tmp_path / "a.fits")
+    source = CubeFiles([tmp_path / "a.fits"], [(3, 3), (9, 3)], 3, extension=0, stacked=True)
+    np.testing.assert_allclose(source.fluxes(0, slice(0, 1), slice(0, 1)), 352.0)
+
+
 def test_exposures_that_are_no_measurement_take_no_part_in_their_mean(tmp_path):
     class Reader:
         """Of a mean of all exposures, a unit of which is so many electrons."""

@@ -107,7 +107,7 @@ def test_what_is_no_number():
 
 
 def test_ranges_are_of_angles_gains_and_counts():
-    assert set(RANGES) == {*ANGLES, "em_gain", "exposures"}
+    assert set(RANGES) == {*ANGLES, "em_gain", "exposures", "exposure_time"}
     assert RANGES["altitude"] == (0.0, 90.0)
     assert not set(ANGLES) & set(TEXTS)
 

@@ -215,6 +215,16 @@ def test_moment_of_the_header():
             smeared([1.0], [0.1], **options)
 
 
+def test_moment_counts_with_a_single_node_too():
+    observations = on_sky(parallactic=np.array([30, 31, 32, 33]) * u.deg, altitude=60 * u.deg)
+    for when, turned in [("start", 0.5), ("middle", 0.0), ("end", -0.5)]:
+        found = sky_positions(observations, when=when, duty=1)["parallactic"].reshape(-1)
+        np.testing.assert_allclose(np.rad2deg(found), np.arange(30, 34) + turned, err_msg=when)
+    for options in ({"nodes": 0}, {"when": "x"}):
+        with pytest.raises(ObservationError, match="allowed are"):
+            sky_positions(observations, duty=1, **options)
+
+
 def test_nodes_of_all_stages_follow_the_sky():
     observations = on_sky(parallactic=np.array([30, 31, 32, 33]) * u.deg, altitude=60 * u.deg)
     found = sky_positions(observations, nodes=3, duty=1)

@@ -85,6 +85,13 @@ def test_rounding_is_no_contradiction(files):
         assert matched(files(**{keyword: value}))[0].errors == [], (keyword, value)
 
 
+def test_an_encoder_that_begins_again_is_no_contradiction(files):
+    for one, other in [(359.99, 0.01), (0.02, 179.98), (22.5, 202.5)]:
+        for column, keyword in [("hwp", "HWP"), ("derotator", "ROT")]:
+            frame, _, _ = matched(files(**{keyword: other}), **{column: one})
+            assert frame.errors == [], (column, one, other)
+
+
 def test_left_image_comes_first(files):
     with open_cube(files(), LAYOUT) as (_, _, cube, good):
         assert cube.shape == (1, 8, 16)

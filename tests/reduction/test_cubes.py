@@ -336,7 +336,8 @@ def test_without_a_flux_no_pixel_is_saturated(tmp_path, monkeypatch):
     # as much as without a limit
     frames = sky_frames()
     monkeypatch.setattr(Small, "files", replace(Small.files, saturation=np.inf))
-    assert _usual_flux(sky_chain(), SMALL, frames, 3e6, source="star") == 3e6
+    light = {"source": "star", "image": ImageModel(), "background": 0.0}
+    assert _usual_flux(sky_chain(), SMALL, frames, 3e6, **light) == 3e6
 
 
 def test_extinguished_beam_is_dark_not_an_error(tmp_path):

@@ -101,6 +101,11 @@ def test_impossible_values_are_errors_that_name_the_keyword():
         assert len(frame.errors) == 1, (keyword, value)
         assert keyword in frame.errors[0], (keyword, value)
         assert str(value) in frame.errors[0], (keyword, value)
+    # true is no angle of 1 deg
+    assert (
+        "RET-ANG1 = True"
+        in read_header("a.fits", LAYOUT, header=header(**{"RET-ANG1": True})).errors[0]
+    )
 
 
 def test_keywords_of_one_angle_have_to_agree():
@@ -163,6 +168,45 @@ def test_pointing_agrees_with_astropy():
         angle = seen.position_angle(pole) - seen.position_angle(zenith)
         assert altitude == pytest.approx(seen.alt.deg, abs=0.03), mjd
         assert parallactic == pytest.approx(angle.wrap_at(180 * u.deg).deg, abs=0.3), mjd
+
+
+def test_angles_are_those_of_the_middle_of_the_exposure():
+    """Near the zenith the parallactic angle turns by degrees in an exposure."""
+    layout = replace(LAYOUT, alternatives={})
+    place, found = {"RA": 76.27, "DEC": 15.0, "EXPTIME": 120.0}, []
+    for keyword, moment in [
+        ("MJD-OBS", 60982.54),
+        ("MJD", 60982.54 + 60 / 86400),
+        ("DATE-OBS", Time(60982.54, format="mjd").isot),
+    ]:
+        column = "date" if "DATE" in keyword else "mjd"
+        own = replace(layout, keywords={"mjd": "NONE"} | layout.keywords | {column: keyword})
+        cards = header(**place | {keyword: moment})
+        for name in {"MJD", "PARANG", "ALTITUDE", "UTC-DATE", "UTC-TIME"} - {keyword}:
+            cards.pop(name, None)
+        frame = read_header("a.fits", own, header=cards)
+        add_pointing([frame], own)
+        assert frame.errors == []
+        found.append(frame.values["parallactic"])
+    np.testing.assert_allclose(found, found[1], atol=1e-3)
+    start = pointing(
+        {"right_ascension": "76.27", "declination": "15", "mjd": 60982.54}, LAYOUT.site
+    )[1]
+    assert abs(found[0] - start) > 0.2
+
+
+def test_times_and_places_in_other_systems_give_no_angles():
+    for keyword, value, understood in [
+        ("TIMESYS", "UTC", True), ("TIMESYS", "TAI", False),
+        ("EQUINOX", 2000, True), ("EQUINOX", 1950.0, False),
+    ]:  # fmt: skip
+        cards = header(RA=76.27, DEC=15.0, **{keyword: value})
+        cards.pop("PARANG")
+        frame = read_header("a.fits", LAYOUT, header=cards)
+        assert frame.errors == []
+        add_pointing([frame], LAYOUT)
+        assert ("parallactic" in frame.values) is understood, keyword
+        assert any(f"{keyword} = {value!r}" in e for e in frame.errors) is not understood, keyword
 
 
 def _offline():

@@ -348,6 +348,44 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
             reduce_run(paths[1], small, dark=tmp_path / path)
 
 
+def test_dark_in_another_unit_is_refused_and_of_another_exposure_told(tmp_path, small):
+    paths = flat_frames(tmp_path)
+    for unit, time, words in [
+        ("adu", 10.0, ""),
+        (None, 10.0, ""),
+        ("adu", 5.0, "exposed for another time than its dark, 5 s"),
+        ("electron", 10.0, "dark.fits is in electron, the frame in adu"),
+        ("adu/s", 10.0, "dark.fits is in adu/s, the frame in adu"),
+    ]:
+        cards = fits.Header({"EXPTIME": time} | ({"BUNIT": unit} if unit else {}))
+        fits.writeto(tmp_path / "dark.fits", np.ones((201, 201)), cards, overwrite=True)
+        if "dark.fits" in words:
+            with pytest.raises(ObservationError, match=words):
+                reduce_run(paths, small, dark=tmp_path / "dark.fits")
+            continue
+        told = reduce_run(paths, small, dark=tmp_path / "dark.fits").doubts
+        assert all(words in "; ".join(why) for why in told.values()), (unit, time)
+        assert bool(told) is bool(words), (unit, time)
+
+
+def test_pixels_that_lack_exposures_are_as_bright_as_the_others(tmp_path, small):
+    """Known in the last exposure only, or not in it, while the lamp fades."""
+    layout = replace(LAYOUT, shape=(1, 201, 201), stacked=True)
+    light = np.array([1.0, 1.0, 1.0, 1.0, 0.4])
+    stack = light[:, None, None] * np.full((5, 201, 201), 400.0)
+    rng = np.random.default_rng(1)
+    for lost, share in [(slice(4), 0.1), (4, 0.3)]:
+        holes = rng.random((201, 201)) < share
+        # in the right beam only
+        holes[:, :100] = False
+        cube = stack.copy()
+        cube[lost, holes] = np.nan
+        frame = reduce_frame(write_cube(tmp_path / "CRSA00000001_cube.fits", cube), layout)
+        right, left = frame.photometry.flux[:, 0]
+        assert right / left == pytest.approx(1, abs=1e-6), lost
+        assert left == pytest.approx(352 * 44.48 * 112.38, rel=1e-4)
+
+
 def test_nothing_usable_is_an_error_that_says_why(tmp_path, small):
     with pytest.raises(ObservationError, match=r"none of the 2 files .*no such file.*1 more"):
         reduce_cubes([tmp_path / "a.fits", tmp_path / "b.fits"], small)
@@ -393,6 +431,11 @@ def test_corrupted_angles_are_left_out_or_replaced(tmp_path, small):
     assert "replaced by 22.5 deg" in told.doubts[str(paths[6])][0]
     with pytest.raises(ObservationError, match="sequences of 3"):
         reduce_run(paths, small, hwp_sequence=[0, 45, 22.5])
+    # four frames are left, which are no sequence
+    for path in paths[1:3] + paths[5:7]:
+        write_cube(path, np.full((4, 201, 201), np.nan))
+    with pytest.raises(ObservationError, match=f"{paths[1].name}: cannot be used; leave out all"):
+        reduce_run(paths, small, hwp_sequence=CYCLE)
 
 
 def test_pointing_is_computed_where_the_header_lacks_it(tmp_path, small):
@@ -516,6 +559,11 @@ def test_pypolcal_errors_name_file_and_line(tmp_path):
         path.write_text(whole.replace(old, new).replace("\n", "\n\n", 1))
         with pytest.raises(ObservationError, match=r"line 3: each of its \d+ columns needs a name"):
             read_pypolcal(path)
+    # at the end of each line, and of the first one or not, it moves nothing
+    lines = whole.splitlines()
+    for first, rest in (("", ","), (",", ","), (",", "")):
+        path.write_text("\n".join([lines[0] + first, *(line + rest for line in lines[1:5])]))
+        assert read_pypolcal(path).flux_right[0, 0] == 200.0, (first, rest)
     bare = tmp_path / "bare.csv"
     bare.write_text("filepath,D_IMRANG\na,1\n")
     with pytest.raises(ObservationError, match="missing columns RET-ANG1, LCOUNTS"):

@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import InverseVariance, StdDevUncertainty, VarianceUncertainty
-from astropy.table import QTable
+from astropy.table import MaskedColumn, QTable
 from astropy.utils.masked import Masked
 from hypothesis import given
 from hypothesis import strategies as st
@@ -152,6 +152,20 @@ def test_percent_and_masked_columns_are_understood():
     assert spectra["q"].flux.unit == u.percent
     np.testing.assert_allclose(spectra["q"].flux.to_value(u.one), 0.01)
     assert np.isnan(spectra["I"].flux[2])
+
+
+def test_flags_are_true_or_false_and_unknown_ones_mask():
+    for flags in ([True, False, True], [1, 0, 1]):
+        assert spectra_from_table(target(3, mask=flags))["q"].mask.tolist() == [True, False, True]
+    for data in (True, False):
+        for kind in (MaskedColumn, Masked):
+            unknown = kind([data] * 3, mask=[False, True, False])
+            found = spectra_from_table(target(3, mask=unknown))["q"].mask
+            assert found.tolist() == [data, True, data], kind
+    # numpy takes any text for true
+    for flags in (["False", "True", "False"], [np.nan, 0.0, 0.0]):
+        with pytest.raises(ObservationError, match="mask must be true or false"):
+            spectra_from_table(target(3, mask=flags))
 
 
 def test_any_uncertainty_with_a_standard_deviation_will_do():

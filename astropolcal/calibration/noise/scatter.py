@@ -56,7 +56,7 @@ def leave_out_groups(measurement, by="derotator"):
         elif by == "pair":
             number = np.arange(len(plus))
         elif by == "derotator" and turns:
-            number = clusters(table.position("derotator")[plus])
+            number = clusters(table.position("derotator")[plus], turn=np.pi)
         else:
             number = np.unique(cycle_numbers(table)[plus], return_inverse=True)[1]
             if by == "derotator":
@@ -76,11 +76,9 @@ def groups_by(measurement, by="derotator"):
         angle = np.rad2deg(angle_or_zero(part.observations, "derotator"))[part.frames[:, 0]]
         for k, label in enumerate(np.unique(groups[where])):
             rows = groups[where] == label
-            what = {
-                "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
-                "cycle": f"number {k}",
-                "dataset": f"number {i}",
-            }[by]
+            what = f"number {i if by == 'dataset' else k}"
+            if by == "derotator":
+                what = f"{angle[part.group_of_datum[rows][0]]:g} deg"
             most = int(np.bincount(measurement.bins[where][rows]).max())
             found.append((f"{by} {what} of {part.observations.name}", most))
     if len(found) < 2:

@@ -132,21 +132,14 @@ def outlying_data(calibration, limit=_FAR):
         bright = brightness(part.observations)
         for i in np.flatnonzero(np.abs(off) > limit * spread):
             frames = part.frames[groups[i]]
-            numbers = part.observations.frames["frame"][frames]
-            rows.append(
-                (
-                    part.observations.name,
-                    ", ".join(str(n) for n in numbers),
-                    100 * float(np.median(residuals[members[i]])),
-                    float(np.abs(off[i]) / spread[i]),
-                    float(bright[frames].min()),
-                )
-            )
+            numbers = ", ".join(map(str, part.observations.frames["frame"][frames]))
+            percent, times = 100 * np.median(residuals[members[i]]), np.abs(off[i]) / spread[i]
+            found = map(float, (percent, times, bright[frames].min()))
+            rows.append((part.observations.name, numbers, *found))
     rows.sort(key=lambda row: -row[3])
     names = ("dataset", "frames", "residual", "sigma", "brightness")
-    table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
-    table["residual"].unit = "percent"
-    return QTable(table)
+    kinds = (str, str, float, float, float)
+    return QTable(rows=rows or None, names=names, dtype=kinds, units={"residual": u.percent})
 
 
 # ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----
