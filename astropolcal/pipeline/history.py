@@ -4,9 +4,11 @@ Calibrations over the years: parameters against date, what changed, and how sure
 
 A difference between calibrations is judged in the directions that the data of all of them
 determine, with the full covariance of each. Calibrations that share data are refused, because their
-errors are not independent. `restart` refits what changed since a calibration, and holds the rest.
+errors are not independent. `restart` refits what changed since a calibration, and holds the rest;
+as the errors of the rest are not in its own, there is a warning where it is compared.
 """
 
+import warnings
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,12 +24,12 @@ from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
-from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.library import Library
-from astropolcal.words import p_words
+from astropolcal.words import listed, p_words
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
 
@@ -256,6 +258,14 @@ def compared(named, parameters=None):
                     f"{named[other][0]} and {name} were both made from {record.name}: their "
                     "errors are not independent, so that a change cannot be judged"
                 )
+    held = [name for name, calibration in named if calibration.settings.get("restarted")]
+    if held:
+        warnings.warn(
+            f"{listed(held)}: holds what another calibration found, whose errors are not in its "
+            "own; how sure a change from or to it is, is not known",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The health of an instrument through all its calibrations: what changed, and what needs care."""
 
+import warnings
 from itertools import pairwise
 
 import astropy.units as u
@@ -145,11 +146,13 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
         "events": [],
         "left_out": left_out,
     }
-    try:
-        found = courses(dated, events=events)
-    except (ParameterError, FitError) as problem:
-        found = ()
-        content["left_out"].append(str(problem))
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        try:
+            found = courses(dated, events=events)
+        except (ParameterError, FitError) as problem:
+            found = ()
+            left_out.append(str(problem))
     for row in found:
         what, course = row["what"], row["course"]
         words = f"{what} {_COURSE_WORDS[course]} ({row[course]:.0%})"
@@ -168,6 +171,7 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
+    content["alarms"] += dict.fromkeys(f"{doubt.message}." for doubt in doubts)
     following = "Give the calibrations dates: with_validity(valid_from=) states one."
     if dated:
         due, n = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day, len(dated)

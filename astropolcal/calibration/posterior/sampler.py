@@ -18,11 +18,13 @@ from astropolcal.calibration.noise.weighting import (
     Weighting,
     given_noise,
     noise_of,
+    problem_of,
     weighting_of,
 )
 from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.calibration.result.calibration import Calibration
+from astropolcal.calibration.uncertainty.covariance import widening
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import in_one_thread, shown, steps
@@ -334,6 +336,8 @@ def refuse_biased(moves, version):
 __doctest_requires__ = {"sample": ["emcee"]}
 
 _FEWEST_WALKERS = 24
+# a share by which samples may be too narrow without a word
+_NARROW = 0.2
 _PARAMETERS_A_STEP_KEPT = 20
 
 
@@ -394,7 +398,9 @@ def sample(
     Warns
     -----
     AstropolcalWarning
-        If the chain is shorter than 50 autocorrelation times, or the walkers do not agree.
+        If the chain is shorter than 50 autocorrelation times, or the walkers do not agree; or if
+        residuals are correlated or vary so that the errors of the calibration are larger than those
+        of the independent data that the samples are drawn for.
 
     Raises
     ------
@@ -453,7 +459,7 @@ def sample(
     description, arrays = _fingerprint(log_posterior, n_walkers, thin, moves, seed)
     with chain.open(checkpoint, description, arrays, resume):
         _run(emcee, sampler, laplace, chain, thin, seed, progress)
-    kept = chain.count
+    kept, narrow = chain.count, "" if noise is not None else _narrow(calibration, log_posterior)
     posterior = Posterior(
         log_posterior.names,
         log_posterior.units,
@@ -465,7 +471,7 @@ def sample(
         fitted=log_posterior.centre / log_posterior.factors,
         thin=thin,
         seed=seed,
-        settings=_settings(log_posterior, moves, weights, emcee.__version__),
+        settings=_settings(log_posterior, moves, weights, emcee.__version__) | {"scatter": narrow},
         # of kept steps
         burn_in=None if burn_in is None else -(-int(burn_in) // thin),
     )
@@ -476,7 +482,22 @@ def sample(
         )
         complaints = "; ".join(posterior.convergence.complaints(posterior.names))
         warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=2)
+    if narrow:
+        warnings.warn(narrow, AstropolcalWarning, stacklevel=2)
     return posterior
+
+
+def _narrow(calibration, log_posterior):
+    """Return in words by how much the errors of the fit exceed those of independent data."""
+    is_white = calibration.settings.get("errors") == "white"
+    times = widening(problem_of(calibration), not is_white)[log_posterior.sampled]
+    worst = int(np.argmax(times))
+    if times[worst] <= 1 + _NARROW:
+        return ""
+    return (
+        "the samples take data as independent; by the scatter of the residuals the error of "
+        f"{log_posterior.names[worst]} is {times[worst]:.1f} times as large (see the covariance)"
+    )
 
 
 def _check(n, n_walkers, n_steps, thin, every, burn_in):
