@@ -134,8 +134,8 @@ def sampled_systematic(
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
     drawn from its covariance. These stay where they are along directions that the calibration does
-    not determine, whose errors are those of `linear_systematic`. A warning names a posterior that is
-    narrower than the scatter of the residuals allows.
+    not determine, whose errors are those of `linear_systematic`. There is a warning if a posterior
+    is narrower than the scatter of the residuals allows.
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
