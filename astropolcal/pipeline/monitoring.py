@@ -13,7 +13,7 @@ from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
-from astropolcal.pipeline.headers import days_of
+from astropolcal.pipeline.headers import date_of, days_of
 from astropolcal.pipeline.library import Library
 from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
@@ -118,7 +118,7 @@ def _positive(name, value, unit):
 
 
 def _start(entry):
-    return entry.validity.valid_from or ""
+    return date_of(entry.calibration) or ""
 
 
 def _group(instrument, mode, entries, rows, moment, goal, limit, events):
@@ -126,15 +126,15 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     gone = {digest for entry in entries for digest in entry.supersedes}
     left_out = [f"{e.name} is superseded" for e in entries if e.content_hash in gone]
     entries = [entry for entry in entries if entry.content_hash not in gone]
-    left_out += [f"{e.name} has no date" for e in entries if e.validity.valid_from is None]
-    dated = [e for e in entries if e.validity.valid_from is not None]
+    left_out += [f"{e.name} has no date" for e in entries if not _start(e)]
+    dated = [e for e in entries if _start(e)]
     content = {
         "instrument": instrument,
         "mode": mode,
         "calibrations": [
             {
                 "name": entry.name,
-                "date": entry.validity.valid_from,
+                "date": _start(entry) or None,
                 "datasets": rows[entry.name]["datasets"],
                 "s_res_percent": rows[entry.name]["s_res"],
                 "s_cv_percent": rows[entry.name]["s_cv"],

@@ -25,8 +25,8 @@ from astropolcal.calibration.fit.evidence import (
     law_of,
     log_evidence,
 )
-from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.exceptions import ParameterError
+from astropolcal.pipeline.headers import date_of
 from astropolcal.pipeline.history import compared, named_by_date, optics_of
 
 __all__ = ["courses"]
@@ -92,7 +92,7 @@ def courses(calibrations, parameters=None, *, events=()):
     named = named_by_date(calibrations)
     if len(named) < 3:
         raise ParameterError(f"{len(named)} calibrations: at least three are needed for a course")
-    told = [validity_of(calibration).valid_from for _, calibration in named]
+    told = [date_of(calibration) for _, calibration in named]
     for (name, _), date in zip(named, told, strict=True):
         if date is None:
             raise ParameterError(f"{name} has no date: when it changed cannot be said")
