@@ -381,10 +381,10 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95] * u.deg)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95, 110] * u.deg)
     >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
     >>> bootstrap(cal, n=10, seed=1)
-    <Resampled: 10 bootstrap resamples of 5 derotator blocks, 49 parameters>
+    <Resampled: 10 bootstrap resamples of 6 derotator blocks, 49 parameters>
     """
     if n < 2:
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
