@@ -155,8 +155,7 @@ def sampled_systematic(
     if _has_samples(model):
         # the samples have walked along all directions
         along, is_open = along[:0], np.zeros_like(is_open)
-        narrow = model.calibration.posterior.scatter
-        if narrow:
+        if narrow := model.calibration.posterior.scatter:
             words = f"systematic errors are too small: {narrow}"
             warnings.warn(words, AstropolcalWarning, stacklevel=4)
     return _with_model_error(factor, along, is_open, "sampled", model, light)

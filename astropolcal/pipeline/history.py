@@ -258,14 +258,10 @@ def compared(named, parameters=None):
                     f"{named[other][0]} and {name} were both made from {record.name}: their "
                     "errors are not independent, so that a change cannot be judged"
                 )
-    held = [name for name, calibration in named if calibration.settings.get("restarted")]
-    if held:
-        warnings.warn(
-            f"{listed(held)}: holds what another calibration found, whose errors are not in its "
-            "own; how sure a change from or to it is, is not known",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
+    if held := [name for name, one in named if one.settings.get("restarted")]:
+        words = f"{listed(held)}: holds what another calibration found, whose errors are not in its"
+        words += " own; how sure a change from or to it is, is not known"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]

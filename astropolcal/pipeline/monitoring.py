@@ -22,6 +22,8 @@ __all__ = ["health"]
 
 #: A change, or a course, at least this probable is an event.
 LIKELY = 0.9
+# of the table of a library
+_OF_ROWS = ("datasets", "s_res_percent", "s_cv_percent", "converged")
 _COURSE_WORDS = {
     "constant": "constant",
     "steps": "changes in steps",
@@ -132,14 +134,8 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
         "instrument": instrument,
         "mode": mode,
         "calibrations": [
-            {
-                "name": entry.name,
-                "date": _start(entry) or None,
-                "datasets": rows[entry.name]["datasets"],
-                "s_res_percent": rows[entry.name]["s_res"],
-                "s_cv_percent": rows[entry.name]["s_cv"],
-                "converged": rows[entry.name]["converged"],
-            }
+            {"name": entry.name, "date": _start(entry) or None}
+            | {key: rows[entry.name][key.removesuffix("_percent")] for key in _OF_ROWS}
             for entry in entries
         ],
         "courses": [],
@@ -162,9 +158,9 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
             if chance >= LIKELY:
                 days = [_start(e)[:10] for e in (before, after)]
                 words = f"{what} changed between {days[0]} and {days[1]} ({chance:.0%})"
-                one = {"what": what, "before": before.name, "after": after.name}
-                one |= {"from": days[0], "to": days[1], "probability": chance}
-                content["events"].append(one | {"words": words})
+                one = {"what": what, "before": before.name, "after": after.name, "from": days[0]}
+                one |= {"to": days[1], "probability": chance, "words": words}
+                content["events"].append(one)
     content["events"].sort(key=lambda one: one["to"])
     newest = dated[-1] if dated else entries[-1]
     known = known_instrument(newest.calibration.instrument) or Instrument

@@ -489,15 +489,14 @@ def sample(
 
 def _narrow(calibration, log_posterior):
     """Return in words by how much the errors of the fit exceed those of independent data."""
-    is_white = calibration.settings.get("errors") == "white"
-    times = widening(problem_of(calibration), not is_white)[log_posterior.sampled]
+    has_scatter = calibration.settings.get("errors") != "white"
+    times = widening(problem_of(calibration), has_scatter)[log_posterior.sampled]
     worst = int(np.argmax(times))
-    if times[worst] <= 1 + _NARROW:
-        return ""
-    return (
+    words = (
         "the samples take data as independent; by the scatter of the residuals the error of "
         f"{log_posterior.names[worst]} is {times[worst]:.1f} times as large (see the covariance)"
     )
+    return words if times[worst] > 1 + _NARROW else ""
 
 
 def _check(n, n_walkers, n_steps, thin, every, burn_in):
@@ -572,8 +571,8 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
         "data": [dataset.observations.content_hash for dataset in measurement.datasets],
         "observable": measurement.observable.name,
         "priors": [
-            [slot.name, f.dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
-            for slot, f in _distributions(free)
+            [slot.name, (f := p.distribution).dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
+            for slot, p in free.priors
         ],
         "n_walkers": int(n_walkers),
         "thin": int(thin),
@@ -599,11 +598,6 @@ def _optic(leaf):
     return [type(leaf).__name__, leaf.name, leaf.mount, fixed]
 
 
-def _distributions(free):
-    """Return each slot that has a prior, with the frozen distribution of scipy."""
-    return [(slot, prior.distribution) for slot, prior in free.priors]
-
-
 def _settings(log_posterior, moves, weights, version):
     """Return what was sampled and how, as plain values that a file can hold."""
     free, sigma = log_posterior.measurement.free, log_posterior.sigma
@@ -621,11 +615,11 @@ def _settings(log_posterior, moves, weights, version):
             {
                 "parameter": slot.name,
                 "unit": str(slot.unit or ""),
-                "distribution": frozen.dist.name,
+                "distribution": (frozen := prior.distribution).dist.name,
                 "mean": np.asarray(frozen.mean(), dtype=float).tolist(),
                 "std": np.asarray(frozen.std(), dtype=float).tolist(),
             }
-            for slot, frozen in _distributions(free)
+            for slot, prior in free.priors
         ],
         "moves": move_names(moves),
         "emcee": version,

@@ -431,8 +431,7 @@ class Posterior:
             low, high = self.acceptance.min(), self.acceptance.max()
             lines.append(f"The walkers moved in {low:.0%} to {high:.0%} of the steps.")
         lines.append(f"The first {found.burn_in} steps are left out as burn-in.")
-        if self.scatter:
-            lines.append(f"TOO NARROW: {self.scatter}.")
+        lines += [f"TOO NARROW: {self.scatter}."] if self.scatter else []
         return "\n".join(lines)
 
     def kept_words(self):
