@@ -413,8 +413,9 @@ def _pairs(hwp, positions, names):
     """Return the pairs of frames, or None where there are none; only some corrections need them."""
     derotator = positions.get("derotator")
     if derotator is not None:
-        derotator = u.Quantity(derotator, getattr(derotator, "unit", u.rad))
-        derotator = np.broadcast_to(derotator, hwp.shape, subok=True)
+        derotator = np.atleast_2d(u.Quantity(derotator, getattr(derotator, "unit", u.rad)))
+        # the middle of an exposure, of which there may be several nodes
+        derotator = np.broadcast_to(derotator.mean(axis=0), hwp.shape, subok=True)
     # on sky it follows the field, so more than at the internal source
     options = {"derotator_tolerance": 2 * u.deg, "labels": names}
     try:

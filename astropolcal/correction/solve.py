@@ -148,13 +148,8 @@ def estimator(
     frames, (n_frames,) or (n_wavelengths, n_frames). A combination is poorly determined if its
     singular value is smaller than the largest by more than ``max_condition``.
     """
-    settings = {
-        "components": components,
-        "observable": observable,
-        "pairs": pairs,
-        "weights": weights,
-        "max_condition": max_condition,
-    }
+    settings = {"components": components, "observable": observable, "pairs": pairs}
+    settings |= {"weights": weights, "max_condition": max_condition}
     rows = np.asarray(rows, dtype=float)
     check_choice("components", components, COMPONENTS, ParameterError)
     if not max_condition > 1:
@@ -181,20 +176,8 @@ def estimator(
     if "V" in components:
         # where V was solved for, nothing leaks; where it was given up, it does as without it
         leakage[determined[:, 3]] = 0.0
-    return Estimator(
-        components,
-        gain,
-        rows,
-        channels,
-        combined,
-        inverse,
-        condition,
-        determined,
-        leakage,
-        weak.tolist(),
-        scale,
-        settings,
-    )
+    found = condition, determined, leakage, weak.tolist()
+    return Estimator(components, gain, rows, channels, combined, inverse, *found, scale, settings)
 
 
 def _solve(rows, weights, components, max_condition):

@@ -8,6 +8,7 @@ of all pixels and wavelengths, and their correlations, are a few small matrices.
 of the instrument lacks (``model_error`` in the ``fit`` of a calibration) is a few more of them.
 """
 
+import warnings
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -17,7 +18,7 @@ from astropolcal.calibration.identifiability.linearized import led
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.correction.solve import estimator
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ParameterError
 from astropolcal.units import check_seed
 
 __all__ = ["Systematic"]
@@ -133,7 +134,8 @@ def sampled_systematic(
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
     drawn from its covariance. These stay where they are along directions that the calibration does
-    not determine, whose errors are those of `linear_systematic`.
+    not determine, whose errors are those of `linear_systematic`. There is a warning if a posterior
+    is narrower than the scatter of the residuals allows.
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
@@ -153,6 +155,9 @@ def sampled_systematic(
     if _has_samples(model):
         # the samples have walked along all directions
         along, is_open = along[:0], np.zeros_like(is_open)
+        if narrow := model.calibration.posterior.scatter:
+            words = f"systematic errors are too small: {narrow}"
+            warnings.warn(words, AstropolcalWarning, stacklevel=4)
     return _with_model_error(factor, along, is_open, "sampled", model, light)
 
 

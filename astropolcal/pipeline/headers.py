@@ -271,6 +271,12 @@ def days_of(calibration):
     return _dates(calibration) or ([] if start is None else [start])
 
 
+def date_of(calibration):
+    """Return from when a calibration's data are, or else from when it holds; None if not known."""
+    # a change is seen by the data, whatever is stated of when they hold
+    return next((_moment(day, "date") for day in days_of(calibration)), None)
+
+
 def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", dates=True):
     """Refuse frames for which a calibration does not hold, and warn if it is old for some.
 

@@ -4,9 +4,11 @@ Calibrations over the years: parameters against date, what changed, and how sure
 
 A difference between calibrations is judged in the directions that the data of all of them
 determine, with the full covariance of each. Calibrations that share data are refused, because their
-errors are not independent. `restart` refits what changed since a calibration, and holds the rest.
+errors are not independent. `restart` refits what changed since a calibration, and holds the rest;
+as the errors of the rest are not in its own, there is a warning where it is compared.
 """
 
+import warnings
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -18,16 +20,16 @@ from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import calibrate
 from astropolcal.calibration.identifiability.sky import known_instrument
-from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
-from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.pipeline.headers import date_of
 from astropolcal.pipeline.library import Library
-from astropolcal.words import p_words
+from astropolcal.words import listed, p_words
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
 
@@ -40,7 +42,7 @@ _COLUMNS = ("date", "calibration", "parameter", "wavelength", "value", "std", "u
 
 
 def named_by_date(calibrations):
-    """Return (name, calibration) by start of validity; of such pairs the names stay."""
+    """Return (name, calibration) by date of their data; of such pairs the names stay."""
     if isinstance(calibrations, Library):
         if calibrations.problems:
             path, reason = next(iter(calibrations.problems.items()))
@@ -55,7 +57,7 @@ def named_by_date(calibrations):
         inside, path = getattr(item, "calibration", item), getattr(item, "path", None)
         name = ", ".join(r.name for r in inside.datasets) or f"calibration {i}"
         named.append((name if path is None else Path(path).name, inside))
-    return sorted(named, key=lambda pair: validity_of(pair[1]).valid_from or "")
+    return sorted(named, key=lambda pair: date_of(pair[1]) or "")
 
 
 def parameter_history(calibrations, parameters=None):
@@ -72,7 +74,7 @@ def parameter_history(calibrations, parameters=None):
     Returns
     -------
     `~astropy.table.QTable`
-        One row a calibration, parameter and wavelength: ``date`` (start of validity, masked if
+        One row a calibration, parameter and wavelength: ``date`` (of its data, masked if
         it is not known), ``calibration``, ``parameter``, ``wavelength`` (nm; NaN for one value
         for all), ``value``, ``std`` (NaN where not determined or held), ``unit``, ``fixed``.
         Retardances and orientations are in the turn that is nearest to the first calibration's.
@@ -99,7 +101,7 @@ def parameter_history(calibrations, parameters=None):
     """
     rows = []
     for name, calibration in named_by_date(calibrations):
-        date = validity_of(calibration).valid_from
+        date = date_of(calibration)
         for key, entry in calibration.parameter_values().items():
             held = entry["tied"] is not None
             if held if parameters is None else not _belongs(key, parameters):
@@ -256,6 +258,10 @@ def compared(named, parameters=None):
                     f"{named[other][0]} and {name} were both made from {record.name}: their "
                     "errors are not independent, so that a change cannot be judged"
                 )
+    if held := [name for name, one in named if one.settings.get("restarted")]:
+        words = f"{listed(held)}: holds what another calibration found, whose errors are not in its"
+        words += " own; how sure a change from or to it is, is not known"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]

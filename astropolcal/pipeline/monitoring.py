@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The health of an instrument through all its calibrations: what changed, and what needs care."""
 
+import warnings
 from itertools import pairwise
 
 import astropy.units as u
@@ -12,7 +13,7 @@ from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
-from astropolcal.pipeline.headers import days_of
+from astropolcal.pipeline.headers import date_of, days_of
 from astropolcal.pipeline.library import Library
 from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
@@ -21,6 +22,8 @@ __all__ = ["health"]
 
 #: A change, or a course, at least this probable is an event.
 LIKELY = 0.9
+# of the table of a library
+_OF_ROWS = ("datasets", "s_res_percent", "s_cv_percent", "converged")
 _COURSE_WORDS = {
     "constant": "constant",
     "steps": "changes in steps",
@@ -117,7 +120,7 @@ def _positive(name, value, unit):
 
 
 def _start(entry):
-    return entry.validity.valid_from or ""
+    return date_of(entry.calibration) or ""
 
 
 def _group(instrument, mode, entries, rows, moment, goal, limit, events):
@@ -125,31 +128,27 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     gone = {digest for entry in entries for digest in entry.supersedes}
     left_out = [f"{e.name} is superseded" for e in entries if e.content_hash in gone]
     entries = [entry for entry in entries if entry.content_hash not in gone]
-    left_out += [f"{e.name} has no date" for e in entries if e.validity.valid_from is None]
-    dated = [e for e in entries if e.validity.valid_from is not None]
+    left_out += [f"{e.name} has no date" for e in entries if not _start(e)]
+    dated = [e for e in entries if _start(e)]
     content = {
         "instrument": instrument,
         "mode": mode,
         "calibrations": [
-            {
-                "name": entry.name,
-                "date": entry.validity.valid_from,
-                "datasets": rows[entry.name]["datasets"],
-                "s_res_percent": rows[entry.name]["s_res"],
-                "s_cv_percent": rows[entry.name]["s_cv"],
-                "converged": rows[entry.name]["converged"],
-            }
+            {"name": entry.name, "date": _start(entry) or None}
+            | {key: rows[entry.name][key.removesuffix("_percent")] for key in _OF_ROWS}
             for entry in entries
         ],
         "courses": [],
         "events": [],
         "left_out": left_out,
     }
-    try:
-        found = courses(dated, events=events)
-    except (ParameterError, FitError) as problem:
-        found = ()
-        content["left_out"].append(str(problem))
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        try:
+            found = courses(dated, events=events)
+        except (ParameterError, FitError) as problem:
+            found = ()
+            left_out.append(str(problem))
     for row in found:
         what, course = row["what"], row["course"]
         words = f"{what} {_COURSE_WORDS[course]} ({row[course]:.0%})"
@@ -159,15 +158,16 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
             if chance >= LIKELY:
                 days = [_start(e)[:10] for e in (before, after)]
                 words = f"{what} changed between {days[0]} and {days[1]} ({chance:.0%})"
-                one = {"what": what, "before": before.name, "after": after.name}
-                one |= {"from": days[0], "to": days[1], "probability": chance}
-                content["events"].append(one | {"words": words})
+                one = {"what": what, "before": before.name, "after": after.name, "from": days[0]}
+                one |= {"to": days[1], "probability": chance, "words": words}
+                content["events"].append(one)
     content["events"].sort(key=lambda one: one["to"])
     newest = dated[-1] if dated else entries[-1]
     known = known_instrument(newest.calibration.instrument) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
+    content["alarms"] += dict.fromkeys(f"{doubt.message}." for doubt in doubts)
     following = "Give the calibrations dates: with_validity(valid_from=) states one."
     if dated:
         due, n = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day, len(dated)

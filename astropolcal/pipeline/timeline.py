@@ -11,8 +11,6 @@ of one, or three numbers per parameter, or is free. Its size is unknown within t
 magnitude and averaged over, in units of the error of one run (Zellner's g-prior).
 """
 
-from itertools import pairwise
-
 import numpy as np
 from astropy.table import Table
 from astropy.time import Time
@@ -25,8 +23,8 @@ from astropolcal.calibration.fit.evidence import (
     law_of,
     log_evidence,
 )
-from astropolcal.calibration.result.calibration import validity_of
 from astropolcal.exceptions import ParameterError
+from astropolcal.pipeline.headers import date_of
 from astropolcal.pipeline.history import compared, named_by_date, optics_of
 
 __all__ = ["courses"]
@@ -92,13 +90,14 @@ def courses(calibrations, parameters=None, *, events=()):
     named = named_by_date(calibrations)
     if len(named) < 3:
         raise ParameterError(f"{len(named)} calibrations: at least three are needed for a course")
-    told = [validity_of(calibration).valid_from for _, calibration in named]
-    for (name, _), date in zip(named, told, strict=True):
+    told = [date_of(calibration) for _, calibration in named]
+    for i, ((name, _), date) in enumerate(zip(named, told, strict=True)):
         if date is None:
             raise ParameterError(f"{name} has no date: when it changed cannot be said")
-    for (one, first), (other, second) in pairwise(zip((n for n, _ in named), told, strict=True)):
-        if first == second:
-            raise ParameterError(f"{one} and {other} are both of {first}: neither comes first")
+        if i and date == told[i - 1]:
+            raise ParameterError(
+                f"{named[i - 1][0]} and {name} are both of {date}: neither comes first"
+            )
     dates = Time(told, scale="tai")
     priors = chances_of(dates, events, _CHANGE)
     rows = []

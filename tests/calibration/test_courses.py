@@ -2,6 +2,7 @@
 """Courses of optics over the years, and the page on the health of an instrument."""
 
 import json
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -166,6 +167,32 @@ def test_health_says_what_needs_care(folder):
     for events, words in ((["soon"], "is not a date"), (["2022-03-01"] * 2, "two of one date")):
         with pytest.raises(ParameterError, match=words):
             health(folder, events=events)
+
+
+def test_a_change_is_dated_by_the_data_whatever_is_stated_of_when_they_hold(worn):
+    stated = [with_validity(one, valid_from=f"{2010 + i % 3}-01-01") for i, one in enumerate(worn)]
+    assert courses(stated).meta == courses(worn).meta
+    dates = [parameter_history(some)["date"].iso.tolist() for some in (stated, worn)]
+    assert dates[0] == dates[1]
+    library = Library([])
+    library.entries = [
+        Entry(f"{i}.asdf", one, validity_of(one), str(i)) for i, one in enumerate(stated)
+    ]
+    (group,) = health(library, now="2024-01-01")["groups"]
+    (event,) = group["events"]
+    assert (event["from"], event["to"]) == ("2022-01-01", "2022-07-01")
+
+
+def test_health_says_that_changes_about_a_restart_are_unsure(steady):
+    new = replace(steady[2], settings=steady[2].settings | {"restarted": {"from": "", "free": []}})
+    for calibrations, count in ((steady[:3], 0), ([*steady[:2], new], 1)):
+        library = Library([])
+        library.entries = [
+            Entry(f"{i}.asdf", one, validity_of(one), str(i)) for i, one in enumerate(calibrations)
+        ]
+        (group,) = health(library, now="2021-01-01")["groups"]
+        assert sum("whose errors are not in its own" in words for words in group["alarms"]) == count
+        assert group["courses"]
 
 
 @pytest.mark.slow

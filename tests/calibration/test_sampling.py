@@ -26,6 +26,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.measurement import Normal
 from astropolcal.measurement.parameters import Uniform
+from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NOISE = 0.01
@@ -283,6 +284,26 @@ def test_sampled_errors_are_those_of_the_covariance(full_rank):
 
 
 @pytest.mark.long
+def test_samples_narrower_than_the_scatter_of_residuals_say_so():
+    """All frames at a derotator angle err alike: by that the errors are larger."""
+    frames = half_wave_plate_cycles(derotator=np.linspace(45, 110, 8) * u.deg)
+    found = {}
+    for drift in (0.0, 0.03):
+        chain = make_chain(retardance_free=False)
+        data = simulate(chain, WAVELENGTH, frames, flux=1e4, seed=1)
+        table, group = data.to_table(), np.arange(len(frames)).repeat(2) // 8
+        gain = 1 + drift * np.where(group % 2, 1, -1) * np.cos(4 * table["hwp"].to_value(u.rad))
+        table["flux_right"] *= gain
+        cal = calibrate(chain, Observations.from_table(table, name="a"), cross_validate=False)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            posterior = sample(cal, n_steps=500, seed=1)
+        found[drift] = [str(one.message) for one in told if "independent" in str(one.message)]
+        assert (f"TOO NARROW: {posterior.scatter}." in posterior.words()) == bool(drift)
+    assert not found[0.0]
+    assert "times as large" in found[0.03][0]
+
+
 def test_parameters_held_have_no_share_in_the_errors(full_rank):
     """With all else known, the thicknesses are better known than in the fit of all."""
     names = ["hwp.w_sio2", "hwp.w_mgf2"]

@@ -64,6 +64,13 @@ def test_frames_of_two_derotator_angles_are_no_pair():
     assert arrays(positions=far, hwp=HWP).pairs.tolist() == [[2, 3]]
 
 
+def test_pairs_of_exposures_during_which_the_derotator_turns():
+    """At three nodes of each exposure; what counts is the middle."""
+    turning = np.array([-3.0, 0.0, 3.0])[:, None] + [60.0, 60.5, 90.0, 95.0]
+    positions = {"hwp": np.tile(HWP, (3, 1)), "derotator": turning * u.deg}
+    assert arrays(positions=positions, hwp=HWP).pairs.tolist() == [[0, 1]]
+
+
 def test_pairs_that_are_given_are_not_looked_for():
     frames = arrays(hwp=HWP, pairs=[[1, 0]])
     assert np.asarray(frames.pairs).tolist() == [[1, 0]]

@@ -1,11 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Systematic errors: linear against sampled, and against wrong calibrations."""
 
+import warnings
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
 
 from astropolcal import calibrate
+from astropolcal.calibration.posterior import Posterior
 from astropolcal.correction import Systematic
 from astropolcal.correction.rows import RowModel
 from astropolcal.correction.solve import estimator
@@ -124,6 +128,21 @@ def test_samples_know_no_more_of_open_directions(open_calibration, track):
             np.sqrt(np.diag(linear.covariance(STOKES, 9)))[1:],
             rtol=0.2,
         )
+
+
+def test_samples_that_are_too_narrow_make_errors_that_are_said_to_be_too_small(calibration, track):
+    free = calibration.measurement.free
+    chain = np.tile(free.start() / free.factors(), (3, 4, 1))
+    narrow = {"scatter": "the samples take data as independent"}
+    for settings in ({}, narrow):
+        posterior = Posterior(free.names, free.units, chain, np.zeros((3, 4)), settings=settings)
+        sampled = replace(calibration, posterior=posterior)
+        model = RowModel(sampled, track()[1], calibration.wavelength)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            sampled_systematic(model, estimator(model.rows()), n_samples=2, seed=1)
+        expected = ["systematic errors are too small: " + narrow["scatter"]] if settings else []
+        assert [str(one.message) for one in told] == expected
 
 
 def test_open_directions_are_counted_in_degrees_of_their_angles(charis, open_calibration, track):

@@ -18,11 +18,13 @@ from astropolcal.calibration.noise.weighting import (
     Weighting,
     given_noise,
     noise_of,
+    problem_of,
     weighting_of,
 )
 from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.calibration.result.calibration import Calibration
+from astropolcal.calibration.uncertainty.covariance import widening
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import in_one_thread, shown, steps
@@ -334,6 +336,8 @@ def refuse_biased(moves, version):
 __doctest_requires__ = {"sample": ["emcee"]}
 
 _FEWEST_WALKERS = 24
+# a share by which samples may be too narrow without a word
+_NARROW = 0.2
 _PARAMETERS_A_STEP_KEPT = 20
 
 
@@ -394,7 +398,9 @@ def sample(
     Warns
     -----
     AstropolcalWarning
-        If the chain is shorter than 50 autocorrelation times, or the walkers do not agree.
+        If the chain is shorter than 50 autocorrelation times, or the walkers do not agree; or if
+        residuals are correlated or vary so that the errors of the calibration are larger than those
+        of the independent data that the samples are drawn for.
 
     Raises
     ------
@@ -453,7 +459,7 @@ def sample(
     description, arrays = _fingerprint(log_posterior, n_walkers, thin, moves, seed)
     with chain.open(checkpoint, description, arrays, resume):
         _run(emcee, sampler, laplace, chain, thin, seed, progress)
-    kept = chain.count
+    kept, narrow = chain.count, "" if noise is not None else _narrow(calibration, log_posterior)
     posterior = Posterior(
         log_posterior.names,
         log_posterior.units,
@@ -465,7 +471,7 @@ def sample(
         fitted=log_posterior.centre / log_posterior.factors,
         thin=thin,
         seed=seed,
-        settings=_settings(log_posterior, moves, weights, emcee.__version__),
+        settings=_settings(log_posterior, moves, weights, emcee.__version__) | {"scatter": narrow},
         # of kept steps
         burn_in=None if burn_in is None else -(-int(burn_in) // thin),
     )
@@ -476,7 +482,21 @@ def sample(
         )
         complaints = "; ".join(posterior.convergence.complaints(posterior.names))
         warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=2)
+    if narrow:
+        warnings.warn(narrow, AstropolcalWarning, stacklevel=2)
     return posterior
+
+
+def _narrow(calibration, log_posterior):
+    """Return in words by how much the errors of the fit exceed those of independent data."""
+    has_scatter = calibration.settings.get("errors") != "white"
+    times = widening(problem_of(calibration), has_scatter)[log_posterior.sampled]
+    worst = int(np.argmax(times))
+    words = (
+        "the samples take data as independent; by the scatter of the residuals the error of "
+        f"{log_posterior.names[worst]} is {times[worst]:.1f} times as large (see the covariance)"
+    )
+    return words if times[worst] > 1 + _NARROW else ""
 
 
 def _check(n, n_walkers, n_steps, thin, every, burn_in):
@@ -551,8 +571,8 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
         "data": [dataset.observations.content_hash for dataset in measurement.datasets],
         "observable": measurement.observable.name,
         "priors": [
-            [slot.name, f.dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
-            for slot, f in _distributions(free)
+            [slot.name, (f := p.distribution).dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
+            for slot, p in free.priors
         ],
         "n_walkers": int(n_walkers),
         "thin": int(thin),
@@ -578,11 +598,6 @@ def _optic(leaf):
     return [type(leaf).__name__, leaf.name, leaf.mount, fixed]
 
 
-def _distributions(free):
-    """Return each slot that has a prior, with the frozen distribution of scipy."""
-    return [(slot, prior.distribution) for slot, prior in free.priors]
-
-
 def _settings(log_posterior, moves, weights, version):
     """Return what was sampled and how, as plain values that a file can hold."""
     free, sigma = log_posterior.measurement.free, log_posterior.sigma
@@ -600,11 +615,11 @@ def _settings(log_posterior, moves, weights, version):
             {
                 "parameter": slot.name,
                 "unit": str(slot.unit or ""),
-                "distribution": frozen.dist.name,
+                "distribution": (frozen := prior.distribution).dist.name,
                 "mean": np.asarray(frozen.mean(), dtype=float).tolist(),
                 "std": np.asarray(frozen.std(), dtype=float).tolist(),
             }
-            for slot, frozen in _distributions(free)
+            for slot, prior in free.priors
         ],
         "moves": move_names(moves),
         "emcee": version,

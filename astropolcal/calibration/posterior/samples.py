@@ -401,6 +401,11 @@ class Posterior:
         """
         return self.convergence.converged
 
+    @property
+    def scatter(self):
+        """By how much the scatter of the residuals makes errors larger, in words; "" if hardly."""
+        return str(self.settings.get("scatter") or "")
+
     def words(self):
         """
         Return what the run says about itself.
@@ -409,7 +414,7 @@ class Posterior:
         -------
         str
             Length, autocorrelation, agreement of the walkers, acceptance; what
-            to do if it has not converged.
+            to do if it has not converged; whether the samples are too narrow.
         """
         found, times = self.convergence, self.autocorrelation_times
         what = "1 parameter" if times.size == 1 else f"{times.size} parameters"
@@ -426,6 +431,7 @@ class Posterior:
             low, high = self.acceptance.min(), self.acceptance.max()
             lines.append(f"The walkers moved in {low:.0%} to {high:.0%} of the steps.")
         lines.append(f"The first {found.burn_in} steps are left out as burn-in.")
+        lines += [f"TOO NARROW: {self.scatter}."] if self.scatter else []
         return "\n".join(lines)
 
     def kept_words(self):

@@ -16,6 +16,7 @@ Sandwich: the residuals of whole groups of data tell how far each group pulls th
 1980; Liang & Zeger 1986).
 """
 
+import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -38,15 +39,15 @@ from astropolcal.calibration.uncertainty.covariance import (
     white_covariance,
     widening,
 )
-from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.progress import counting, in_one_thread, shown
 from astropolcal.units import check_seed, to_unit
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
-# blocks of a bootstrap, and groups of a robust covariance, of which there are many at best
-_FEWEST = 3
+# blocks of a bootstrap, and groups of a robust covariance, and how many make errors that are right
+_FEWEST, _ENOUGH = 3, 6
 
 
 # ---- profile likelihood: chi-square along one parameter, all others refitted ----
@@ -367,6 +368,11 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
 
+    Warns
+    -----
+    AstropolcalWarning
+        If a dataset has fewer than six blocks: errors are then rough, mostly too small.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -375,10 +381,10 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95] * u.deg)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95, 110] * u.deg)
     >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
     >>> bootstrap(cal, n=10, seed=1)
-    <Resampled: 10 bootstrap resamples of 5 derotator blocks, 49 parameters>
+    <Resampled: 10 bootstrap resamples of 6 derotator blocks, 49 parameters>
     """
     if n < 2:
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
@@ -428,10 +434,12 @@ def _numbered(labels, before, after):
     """
     _, numbers = np.unique(labels, return_inverse=True)
     count = int(numbers.max()) + 1
+    words = f"{before}{count}{after}"
     if count < _FEWEST:
-        raise FitError(
-            f"{before}{count}{after}; {_FEWEST} are needed, and many more to be accurate"
-        )
+        raise FitError(f"{words}; {_FEWEST} are needed, and many more to be accurate")
+    if count < _ENOUGH:
+        words += f"; of fewer than {_ENOUGH} errors are rough, mostly too small"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
     return numbers
 
 
@@ -575,6 +583,11 @@ def robust_covariance(calibration, groups="derotator"):
         or a choice is unknown.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If there are fewer than six groups: errors are then rough, mostly too small.
 
     Notes
     -----

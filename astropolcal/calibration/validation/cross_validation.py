@@ -63,15 +63,14 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
         s_mean = s_res / np.sqrt(n)
     s_cv = [rms(held_out[row][np.isfinite(held_out[row])]) for row in rows]
     table = QTable({"wavelength": part.observations.wavelength, "n": n, "k": np.full(len(n), k)})
-    columns = {
-        "s_res": s_res,
-        "s_mean": s_mean,
-        "s_cv": s_cv,
-        "s_standard": np.full(len(n), np.nan),
-    }
-    for key, values in columns.items():
-        table[key] = 100 * np.array(values) * u.percent
+    add_percent(table, s_res=s_res, s_mean=s_mean, s_cv=s_cv, s_standard=np.full(len(n), np.nan))
     return table
+
+
+def add_percent(table, **fractions):
+    """Add columns in percent."""
+    for key, values in fractions.items():
+        table[key] = 100 * np.asarray(values) * u.percent
 
 
 def held_out_residuals(calibration, groups=None):
@@ -570,15 +569,10 @@ def _errors(measurement):
     """Return number, rms, mean and scatter of the residuals at each wavelength."""
     residuals, (part,) = measurement.residuals(), measurement.datasets
     groups = [residuals[part.bin_of_datum == b] for b in part.bins]
-    nan = np.nan
-    columns = {
-        "s_standard": [rms(r) for r in groups],
-        "bias": [r.mean() if r.size else nan for r in groups],
-        "scatter": [r.std(ddof=1) if r.size > 1 else nan for r in groups],
-    }
+    bias = [r.mean() if r.size else np.nan for r in groups]
+    scatter = [r.std(ddof=1) if r.size > 1 else np.nan for r in groups]
     table = QTable({"wavelength": part.observations.wavelength, "n": [r.size for r in groups]})
-    for key, values in columns.items():
-        table[key] = 100 * np.array(values) * u.percent
+    add_percent(table, s_standard=[rms(r) for r in groups], bias=bias, scatter=scatter)
     return table
 
 
@@ -609,6 +603,13 @@ def _words(table, same_source):
             "a degree, so its gauge counts"
         )
     return words
+
+
+def keep(calibration, key, entry):
+    """Keep what was found of observations, in the place of what was found of the same before."""
+    others = calibration.fit.get(key, [])
+    others = [other for other in others if other["content_hash"] != entry["content_hash"]]
+    calibration.fit[key] = [*others, entry]
 
 
 def add_standard(calibration, chain, observations, positions=None):
@@ -671,12 +672,7 @@ def add_standard(calibration, chain, observations, positions=None):
     entry = {key: table.meta[key] for key in ("name", "source", "content_hash", "n_frames")}
     entry |= columns(table, "wavelength", "n", "s_standard", "bias", "scatter", "s_cv", "chi")
     entry |= {key: table.meta[key] for key in ("open_percent", "not_calibrated", "words")}
-    others = [
-        other
-        for other in calibration.fit.get("standards", [])
-        if other["content_hash"] != entry["content_hash"]
-    ]
-    calibration.fit["standards"] = [*others, entry]
+    keep(calibration, "standards", entry)
     for record in (r for r in calibration.datasets if r.accuracy is not None):
         same = (s for s in calibration.fit["standards"] if s["source"] == record.source)
         found = [(s["wavelength_nm"], s["s_standard_percent"], s["n"]) for s in same]

@@ -6,7 +6,12 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
-from astropolcal.calibration.validation.cross_validation import predicted_chain, refuse_fitted
+from astropolcal.calibration.validation.cross_validation import (
+    add_percent,
+    keep,
+    predicted_chain,
+    refuse_fitted,
+)
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import (
@@ -20,7 +25,7 @@ from astropolcal.measurement import Measurement
 from astropolcal.observations.grid import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
-from astropolcal.stokes import polarization_angle
+from astropolcal.stokes import polarization_angle, polarization_errors
 from astropolcal.words import listed
 
 __all__ = ["fitted_stars", "star_accuracy", "star_check", "star_stokes"]
@@ -120,19 +125,19 @@ def _table(wavelength, found):
     # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
     error = np.sqrt(_mean((found - mean[..., None]) ** 2) / np.where(count > 1, count - 1, np.nan))
     table = QTable({"wavelength": wavelength})
-    _add(table, q=mean[0], u=mean[1], q_err=error[0], u_err=error[1])
+    add_percent(table, q=mean[0], u=mean[1], q_err=error[0], u_err=error[1])
     # rms of both components: the degree has the error of one of them
     spread = np.hypot(*error) / np.sqrt(2)
     dolp, known = np.hypot(*mean), np.isfinite(spread)
     debiased = np.full(dolp.shape, np.nan)
     debiased[known] = stokes.debias_dolp(dolp[known], spread[known])
-    _add(table, dolp=debiased, dolp_err=spread)
+    add_percent(table, dolp=debiased, dolp_err=spread)
     table["aolp"] = stokes.polarization_angle(*mean) * u.deg
     with np.errstate(divide="ignore", invalid="ignore"):
         # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
         table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
     table["n_cycles"] = count
-    _add(table, q_cycles=found[0], u_cycles=found[1])
+    add_percent(table, q_cycles=found[0], u_cycles=found[1])
     return table
 
 
@@ -140,12 +145,6 @@ def _mean(values):
     """Return means of what is known along the last axis, NaN of nothing."""
     with np.errstate(invalid="ignore"):
         return np.nansum(values, axis=-1) / np.isfinite(values).sum(axis=-1)
-
-
-def _add(table, **fractions):
-    """Add columns in percent."""
-    for key, values in fractions.items():
-        table[key] = 100 * values * u.percent
 
 
 def star_accuracy(table, q=0.0, u_=0.0):
@@ -190,10 +189,10 @@ def star_accuracy(table, q=0.0, u_=0.0):
     # angles of polarization repeat after 180 deg: the shortest way, -90 to 90 deg
     turn = np.mod(angle + np.pi / 2, np.pi) - np.pi / 2
     result = QTable({"wavelength": table["wavelength"]})
-    _add(result, dolp_error=np.hypot(*mean) - length)
+    add_percent(result, dolp_error=np.hypot(*mean) - length)
     result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
     s_q, s_u = np.sqrt(_mean(off**2))
-    _add(result, s_dolp=np.sqrt(_mean(squares)), s_q=s_q, s_u=s_u)
+    add_percent(result, s_dolp=np.sqrt(_mean(squares)), s_q=s_q, s_u=s_u)
     return result
 
 
@@ -267,7 +266,7 @@ def _fitted_star(calibration, star, free):
         error = np.sqrt(np.diag(covariance.propagate(matrix)))
         value, known = (one.mueller(wavelength)[..., row, 0] for one in (star, before))
         columns = {key: value, f"{key}_err": error, f"{key}_prior": known}
-        _add(table, **columns, **{f"{key}_prior_err": np.sqrt(prior)})
+        add_percent(table, **columns, **{f"{key}_prior_err": np.sqrt(prior)})
         share.append(1 - np.clip(error**2 / prior, 0, 1))
     table.meta |= {"name": star.name, "from_data": float(np.median(share))}
     i = len(table) // 2
@@ -392,18 +391,16 @@ def _known(observations, star):
 
 def _add_known(table, q, stokes_u, covariance):
     length = np.hypot(q, stokes_u)
-    _add(table, q_known=q, u_known=stokes_u, dolp_known=length)
+    add_percent(table, q_known=q, u_known=stokes_u, dolp_known=length)
     table["aolp_known"] = np.where(length > 0, polarization_angle(q, stokes_u), np.nan) * u.deg
     along, across = np.full((2, length.size), np.nan)
     if covariance is not None:
-        # the direction of the polarization in the (q, u) plane; of a star without any that of q,
-        # as good as another one, and its error of the angle ends in the division by zero below
-        c = np.divide(q, length, out=np.ones_like(length), where=length > 0)
-        s = np.divide(stokes_u, length, out=np.zeros_like(length), where=length > 0)
-        matrix = np.broadcast_to(np.asarray(covariance), (length.size, 2, 2))
-        along = _error_along(np.stack([c, s], -1), matrix)
-        across = _error_along(np.stack([-s, c], -1), matrix)
-    _add(table, dolp_known_err=along)
+        # of a star without polarization in the direction of q, which is as good as another one,
+        # and its error of the angle ends in the division by zero below
+        pair = np.where(length > 0, [q, stokes_u], [[1.0], [0.0]])
+        (qq, qu), (_, uu) = np.broadcast_to(covariance, (length.size, 2, 2)).transpose(1, 2, 0)
+        along, _, across = polarization_errors(*pair, np.sqrt(qq), np.sqrt(uu), qu)
+    add_percent(table, dolp_known_err=along)
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
@@ -418,13 +415,6 @@ def _pull(table, key):
     stated = np.sqrt(sum(part**2 for part in known.values()))
     times = np.nanmedian(np.abs(table[f"{key}_error"].value) / stated)
     return f"{times:.1f} times the errors of {listed(known)}"
-
-
-def _error_along(direction, matrix):
-    """Return the standard error along unit vectors, shape (n_wavelengths, 2)."""
-    variance = np.einsum("wi,wij,wj->w", direction, matrix, direction)
-    # where it is zero rounding may leave less
-    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def _words(table):
@@ -446,8 +436,5 @@ def add_star_check(calibration, chain, observations, positions=None):
     entry = {key: table.meta[key] for key in ("name", "star", "words")}
     entry["content_hash"] = observations.content_hash
     entry |= columns(table, "wavelength", "n_cycles", *_KEPT)
-    others = calibration.fit.get("stars", [])
-    # checked again, a star replaces its entry
-    others = [other for other in others if other["content_hash"] != entry["content_hash"]]
-    calibration.fit["stars"] = [*others, entry]
+    keep(calibration, "stars", entry)
     return table
