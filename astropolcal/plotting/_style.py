@@ -124,8 +124,17 @@ def draw_line(axes, lam, values, **look):
 
 def draw_band(axes, x, value, error, color, alpha, label=None):
     """Draw a band of one error to either side of values; it has gaps where the error is NaN."""
+    x, value, error = widened(x, value, error)
     look = {"color": color, "alpha": alpha, "linewidth": 0, "label": label}
     axes.fill_between(x, value - error, value + error, **look)
+
+
+def widened(x, *values):
+    """Return what a line or a band is drawn of, in order; at one wavelength as long as a cell."""
+    order = np.argsort(np.ravel(x))
+    x = cell_edges(np.ravel(x)) if order.size == 1 else np.asarray(x)[order]
+    values = (v[order] if np.ndim(v) and order.size > 1 else v for v in map(np.asarray, values))
+    return x, *(np.broadcast_to(value, x.shape) for value in values)
 
 
 def draw_points(axes, x, value, std, labels, **look):

@@ -376,18 +376,17 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
             # a star whose polarization no catalogue has is drawn alone
             if np.isfinite(known).any():
-                top.plot(
-                    lam, known, color=st.VERMILION, label="catalogue, with the published errors"
-                )
+                look = {"color": st.VERMILION, "label": "catalogue, with the published errors"}
+                top.plot(*st.widened(lam, known), **look)
                 st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
             bottom.axhline(0, color=st.GREY, linewidth=1)
             bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
             # of the angle no such error is known
             if key == "dolp":
-                single = values["s_dolp_percent"][order]
+                x, single = st.widened(lam, values["s_dolp_percent"][order])
                 look = {"color": st.GREY, "linestyle": "--"}
-                bottom.plot(lam, single, label="± rms error of a single cycle", **look)
-                bottom.plot(lam, -single, **look)
+                bottom.plot(x, single, label="± rms error of a single cycle", **look)
+                bottom.plot(x, -single, **look)
             top.set_ylabel(label)
             bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")
             st.wavelength_label(bottom)

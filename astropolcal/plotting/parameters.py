@@ -12,7 +12,12 @@ from astropy.modeling import Parameter
 from astropy.time import Time
 
 from astropolcal import instruments
-from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
+from astropolcal.calibration.uncertainty.derived import (
+    METALS,
+    derived_retardance,
+    mirror_names,
+    mirror_values,
+)
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import named_by_date, parameter_history, significance
@@ -33,7 +38,6 @@ _ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
 _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
-_STEP = 1e-3
 _TITLE_WIDTH = 58
 
 
@@ -41,7 +45,8 @@ def _draw_entry(axes, calibration, entry, look):
     """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
     lam, (color, marker) = st.nanometres(calibration.wavelength), look
     if not entry["value"].ndim:
-        ends = np.array([lam.min(), lam.max()])
+        (x,) = st.widened(lam)
+        ends = x[[0, -1]]
         value, std = float(entry["value"]), float(entry["std"])
         label = _FIXED if entry["fixed"] else "one value for all wavelengths"
         if not (np.isfinite(std) or entry["fixed"]):
@@ -73,13 +78,17 @@ def _draw_law(axes, calibration, leaf, known, look):
     """Draw a retardance that follows a law, its band, and the stages' points."""
     lam = np.sort(st.nanometres(calibration.wavelength))
     # a law is smooth between the wavelengths unless its parameters are given at these
-    if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
+    if lam.size > 1 and not any(getattr(leaf, key).size > 1 for key in leaf.param_names):
         lam = np.linspace(lam[0], lam[-1], _FINE)
-    value, std = _retardance(leaf, lam), _law_std(calibration, leaf, lam)
+    value, std = _retardance(leaf, lam), None
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
     free = {key: entry for key, entry in own.items() if not entry["fixed"]}
+    if free:
+        dataset = next(i for i, c in enumerate(calibration.chains) if leaf in leaves(c))
+        found = derived_retardance(calibration, leaf.name, lam * u.nm, dataset)
+        std = found.std.to_value(u.deg) if found.is_determined.all() else None
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
-    axes.plot(lam, value, color=look[0], label=label)
+    axes.plot(*st.widened(lam, value), color=look[0], label=label)
     if std is not None:
         st.draw_band(axes, lam, value, std, look[0], 0.3)
     # those of a first stage that fitted one per wavelength
@@ -106,29 +115,6 @@ def _words(own):
 
 def _retardance(leaf, lam):
     return np.atleast_1d(leaf.retardance(lam * u.nm).to_value(u.deg))
-
-
-def _law_std(calibration, leaf, lam):
-    """Return the 1 sigma error of the law, or None where a parameter has none."""
-    names = calibration.covariance.names
-    keys = [key for key in leaf.own_names if f"{leaf.name}.{key}" in names]
-    index = [names.index(f"{leaf.name}.{key}") for key in keys]
-    matrix = calibration.covariance.matrix[np.ix_(index, index)]
-    if not keys or not np.isfinite(matrix).all():
-        return None
-    slopes = []
-    for key in keys:
-        parameter = getattr(leaf, key)
-        unit = 1 if parameter.unit is None else parameter.unit
-        # central differences; relative, but for parameters that are zero
-        step = _STEP * max(abs(float(parameter.value)), 1e-6)
-        high, low = (
-            _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
-            for sign in (1, -1)
-        )
-        slopes.append((high - low) / (2 * step))
-    # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
-    return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
 
 
 # ---- legend -----------------------------------------------------------------------
@@ -468,11 +454,13 @@ def _draw_mirror(axes, calibration, table, key, reference):
     table = table[np.argsort(table["wavelength"])]
     lam, name = st.nanometres(table["wavelength"]), table.meta["name"]
     for metal, (color, line) in _METAL_LOOKS.items():
-        axes.plot(lam, table[f"{key}_{metal}"].value, color=color, linestyle=line, label=metal)
+        x, value = st.widened(lam, table[f"{key}_{metal}"].value)
+        axes.plot(x, value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):
         value = getattr(mirror, key)(table["wavelength"])
         value = value.to_value(u.deg) if key == "retardance" else 100 * value
-        axes.plot(lam, value, color=st.BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
+        x, value = st.widened(lam, value)
+        axes.plot(x, value, color=st.BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
     value, std = table[key].value, table[f"{key}_err"].value
     # with a law in wavelength the diattenuation is computed and no parameter
     if f"{name}.diattenuation" in calibration.parameter_values():
@@ -482,8 +470,8 @@ def _draw_mirror(axes, calibration, table, key, reference):
         return
     known = np.isfinite(std).all()
     label = f"fitted law, with 1{st.SIGMA} band" if known else _MIRROR_LAW_ALONE
-    line = "-" if known else (0, (5, 1))
-    axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=st.BLUE)
+    look = {"linestyle": "-" if known else (0, (5, 1)), "linewidth": 2.2, "color": st.BLUE}
+    axes.plot(*st.widened(lam, value), label=label, **look)
     st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
 
 
