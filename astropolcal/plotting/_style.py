@@ -42,6 +42,8 @@ _SETTINGS = {
     "grid.linewidth": 0.7,
     "axes.axisbelow": True,
     "axes.unicode_minus": True,
+    # "+9e1" in a corner is easily missed
+    "axes.formatter.useoffset": False,
     "text.usetex": False,
     "lines.linewidth": 1.5,
     "lines.markersize": 5.5,

@@ -576,8 +576,6 @@ def _draw_history(ax, own, name, most):
     unit = f" ({own['unit'][0]})" if own["unit"][0] else ""
     ax.set(title=name, ylabel=f"{'difference to the mean' if several else 'value'}{unit}")
     ax.margins(y=0.18)
-    # "+9e1" in a corner is easily missed
-    ax.ticklabel_format(axis="y", useOffset=False)
     if several:
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 

@@ -348,6 +348,22 @@ def test_band_of_a_law_counts_what_is_tied_and_open():
     assert labels(window)[0] == parameters._LAW_ALONE
 
 
+def test_numbers_on_axes_are_whole():
+    """No "+9.799e1" in a corner, beside labels that are what is left of 98 deg."""
+    chain = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=98 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.98, fixed={"efficiency": True}, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[20, 30, 60] * u.deg)
+    data = simulate(chain, [1.2, 1.6] * u.um, frames, flux=1e11, seed=1)
+    single = "normalized_single_difference"
+    cal = calibrate(chain, data, observable=single, search=False, cross_validate=False)
+    figure = plot_retardances(cal)
+    figure.draw_without_rendering()
+    assert [axes.yaxis.get_offset_text().get_text() for axes in figure.axes] == [""]
+
+
 def test_one_wavelength_is_seen_with_its_errors():
     """A line from a wavelength to itself has no length, a band no width."""
     chain = (
