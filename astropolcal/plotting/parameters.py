@@ -14,9 +14,10 @@ from astropy.time import Time
 from astropolcal import instruments
 from astropolcal.calibration.uncertainty.derived import (
     METALS,
-    derived_retardance,
     mirror_names,
     mirror_values,
+    of_law,
+    of_optic,
 )
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
@@ -39,6 +40,21 @@ _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
 _TITLE_WIDTH = 58
+
+
+def _entries(calibration):
+    """Return the parameters by name; what follows a law of the wavelength has its value at each."""
+    known = calibration.parameter_values()
+    for i, chain in enumerate(calibration.chains):
+        laws = ((o.name, key, law) for o in leaves(chain) for key, law in o._follows.items())
+        for optic, key, law in laws:
+            if law.of == ("wavelength",):
+                found = of_optic(calibration, i, optic, [key])
+                value, std = (u.Quantity(x).value for x in (found.value, found.std))
+                std = np.where(found.is_determined, std, np.nan)
+                own = {"value": value, "std": std, "at_bound": np.zeros(value.shape, dtype=bool)}
+                known[f"{optic}.{key}"] |= own | {"fixed": False}
+    return known
 
 
 def _draw_entry(axes, calibration, entry, look):
@@ -85,7 +101,7 @@ def _draw_law(axes, calibration, leaf, known, look):
     free = {key: entry for key, entry in own.items() if not entry["fixed"]}
     if free:
         dataset = next(i for i, c in enumerate(calibration.chains) if leaf in leaves(c))
-        found = derived_retardance(calibration, leaf.name, lam * u.nm, dataset)
+        found = of_law(calibration, leaf.name, "retardance", lam * u.nm, dataset)
         std = found.std.to_value(u.deg) if found.is_determined.all() else None
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
     axes.plot(*st.widened(lam, value), color=look[0], label=label)
@@ -203,7 +219,7 @@ def plot_retardances(calibration, *, figure=None):
     >>> len(plot_retardances(cal).axes)
     2
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     panels = [
         (leaf, key)
         for leaf in _optics(calibration).values()
@@ -279,7 +295,7 @@ def plot_efficiency(calibration, *, figure=None):
     >>> len(plot_efficiency(cal).axes)
     1
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     names = [name for name in known if name.endswith(".efficiency")]
     if not names:
         raise ChainError("no optic of the chain has an efficiency to draw")
@@ -299,7 +315,7 @@ def plot_parameters(calibration, names=None, *, figure=None):
 
     ``names`` are ``"optic.parameter"``, by default all free ones given per wavelength.
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     names = _per_wavelength(known) if names is None else list(names)
     for name in names:
         check_choice("parameter", name, known, ParameterError)
