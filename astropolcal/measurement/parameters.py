@@ -368,9 +368,8 @@ class FreeParameters:
     def check_priors(self):
         """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
         for name, (slot, factor, offset) in self._followers.items():
-            prior, lead = (self._table[key][0].prior for key in (name, slot.name))
-            same = factor == 1 and not offset.any() and _told(prior) == _told(lead)
-            if prior is not None and not same:
+            own, lead = (_told(self._table[key][0].prior) for key in (name, slot.name))
+            if own != _told(None) and (own != lead or factor != 1 or offset.any()):
                 raise ParameterError(
                     f"{name} is tied to {slot.name}, and its own prior would be lost; give the "
                     f"prior to {slot.name}, or set that of {name} to None"

@@ -119,8 +119,9 @@ def wavelength_label(axes):
 
 def draw_line(axes, lam, values, **look):
     """Draw values over the wavelength, which need not be in order; return the line."""
-    order = np.argsort(lam)
-    (line,) = axes.plot(np.asarray(lam)[order], np.asarray(values)[order], **look)
+    # a marker is seen at a single wavelength, too
+    drawn = (lam, values) if "marker" in look and np.size(lam) == 1 else widened(lam, values)
+    (line,) = axes.plot(*drawn, **look)
     return line
 
 

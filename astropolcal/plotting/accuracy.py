@@ -138,7 +138,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
         for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
-            axes.plot(lam, value, color=st.BLACK, linestyle=line, label=label)
+            st.draw_line(axes, lam, value, color=st.BLACK, linestyle=line, label=label)
 
 
 def _label(key, values, calibration):
@@ -377,16 +377,16 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             # a star whose polarization no catalogue has is drawn alone
             if np.isfinite(known).any():
                 look = {"color": st.VERMILION, "label": "catalogue, with the published errors"}
-                top.plot(*st.widened(lam, known), **look)
+                st.draw_line(top, lam, known, **look)
                 st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
             bottom.axhline(0, color=st.GREY, linewidth=1)
             bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
             # of the angle no such error is known
             if key == "dolp":
-                x, single = st.widened(lam, values["s_dolp_percent"][order])
+                single = values["s_dolp_percent"][order]
                 look = {"color": st.GREY, "linestyle": "--"}
-                bottom.plot(x, single, label="± rms error of a single cycle", **look)
-                bottom.plot(x, -single, **look)
+                st.draw_line(bottom, lam, single, label="± rms error of a single cycle", **look)
+                st.draw_line(bottom, lam, -single, **look)
             top.set_ylabel(label)
             bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")
             st.wavelength_label(bottom)

@@ -46,14 +46,13 @@ def _entries(calibration):
     """Return the parameters by name; what follows a law of the wavelength has its value at each."""
     known = calibration.parameter_values()
     for i, chain in enumerate(calibration.chains):
-        laws = ((o.name, key, law) for o in leaves(chain) for key, law in o._follows.items())
-        for optic, key, law in laws:
-            if law.of == ("wavelength",):
-                found = of_optic(calibration, i, optic, [key])
-                value, std = (u.Quantity(x).value for x in (found.value, found.std))
-                std = np.where(found.is_determined, std, np.nan)
-                own = {"value": value, "std": std, "at_bound": np.zeros(value.shape, dtype=bool)}
-                known[f"{optic}.{key}"] |= own | {"fixed": False}
+        laws = ((o.name, key, law.of) for o in leaves(chain) for key, law in o._follows.items())
+        for optic, key in ((optic, key) for optic, key, of in laws if of == ("wavelength",)):
+            found = of_optic(calibration, i, optic, [key])
+            value, std = np.asarray(found.value), np.asarray(found.std)
+            std = np.where(found.is_determined, std, np.nan)
+            own = {"value": value, "std": std, "at_bound": np.zeros(value.shape, dtype=bool)}
+            known[f"{optic}.{key}"] |= own | {"fixed": False}
     return known
 
 
@@ -104,7 +103,7 @@ def _draw_law(axes, calibration, leaf, known, look):
         found = of_law(calibration, leaf.name, "retardance", lam * u.nm, dataset)
         std = found.std.to_value(u.deg) if found.is_determined.all() else None
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
-    axes.plot(*st.widened(lam, value), color=look[0], label=label)
+    st.draw_line(axes, lam, value, color=look[0], label=label)
     if std is not None:
         st.draw_band(axes, lam, value, std, look[0], 0.3)
     # those of a first stage that fitted one per wavelength
@@ -470,13 +469,13 @@ def _draw_mirror(axes, calibration, table, key, reference):
     table = table[np.argsort(table["wavelength"])]
     lam, name = st.nanometres(table["wavelength"]), table.meta["name"]
     for metal, (color, line) in _METAL_LOOKS.items():
-        x, value = st.widened(lam, table[f"{key}_{metal}"].value)
-        axes.plot(x, value, color=color, linestyle=line, label=metal)
+        value = table[f"{key}_{metal}"].value
+        st.draw_line(axes, lam, value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):
         value = getattr(mirror, key)(table["wavelength"])
         value = value.to_value(u.deg) if key == "retardance" else 100 * value
-        x, value = st.widened(lam, value)
-        axes.plot(x, value, color=st.BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
+        look = {"color": st.BLACK, "linestyle": ("-", "--", "-.")[i % 3]}
+        st.draw_line(axes, lam, value, label=label, **look)
     value, std = table[key].value, table[f"{key}_err"].value
     # with a law in wavelength the diattenuation is computed and no parameter
     if f"{name}.diattenuation" in calibration.parameter_values():
@@ -487,7 +486,7 @@ def _draw_mirror(axes, calibration, table, key, reference):
     known = np.isfinite(std).all()
     label = f"fitted law, with 1{st.SIGMA} band" if known else _MIRROR_LAW_ALONE
     look = {"linestyle": "-" if known else (0, (5, 1)), "linewidth": 2.2, "color": st.BLUE}
-    axes.plot(*st.widened(lam, value), label=label, **look)
+    st.draw_line(axes, lam, value, label=label, **look)
     st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
 
 

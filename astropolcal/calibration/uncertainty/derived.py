@@ -673,11 +673,12 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         raise ChainError(f"no mirror {name!r}; the calibration has {', '.join(known) or 'none'}")
     wavelength = calibration.wavelength
     table = QTable({"wavelength": wavelength})
-    leaf = _leaf(calibration.chains, name)
+    where = [any(o.name == name for o in leaves(c)) for c in calibration.chains].index(True)
+    leaf = find_optic(calibration.chains[where], name)
     percent = 100 * u.percent
     for key, unit in (("diattenuation", percent), ("retardance", u.deg)):
         if hasattr(leaf, key):
-            value, std = _with_error(calibration, name, key)
+            value, std = _with_error(calibration, where, name, key)
             table[key], table[f"{key}_err"] = value * unit, std * unit
     fitted = ["retardance"] if isinstance(leaf, DiattenuatorRetarder) else leaf.own_names
     table.meta |= {"name": name, "held": all(getattr(leaf, key).fixed for key in fitted)}
@@ -688,16 +689,11 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
     return table
 
 
-def _leaf(chains, name):
-    return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
-
-
-def _with_error(calibration, name, key):
+def _with_error(calibration, where, name, key):
     """Return a value and its error, plain (degree), shape (n_wavelengths,)."""
     size, own = len(calibration.wavelength), calibration.parameter_values().get(f"{name}.{key}")
     if own is not None:
         return (np.broadcast_to(own[part], size).astype(float) for part in ("value", "std"))
 
-    where = next(i for i, c in enumerate(calibration.chains) for o in leaves(c) if o.name == name)
     found = of_law(calibration, name, key, calibration.wavelength, where)
     return np.asarray(found.value), np.asarray(found.std)
