@@ -95,16 +95,15 @@ def _draw_law(axes, calibration, leaf, known, look):
     # a law is smooth between the wavelengths unless its parameters are given at these
     if lam.size > 1 and not any(getattr(leaf, key).size > 1 for key in leaf.param_names):
         lam = np.linspace(lam[0], lam[-1], _FINE)
-    value, std = _retardance(leaf, lam), None
+    found = of_law(calibration, leaf.name, "retardance", lam * u.nm)
+    value, std = (x.to_value(u.deg) for x in (found.value, found.std))
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
     free = {key: entry for key, entry in own.items() if not entry["fixed"]}
+    label = f"law, {_FIXED}"
     if free:
-        dataset = next(i for i, c in enumerate(calibration.chains) if leaf in leaves(c))
-        found = of_law(calibration, leaf.name, "retardance", lam * u.nm, dataset)
-        std = found.std.to_value(u.deg) if found.is_determined.all() else None
-    label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
+        label = _LAW if found.is_determined.all() else _LAW_ALONE
     st.draw_line(axes, lam, value, color=look[0], label=label)
-    if std is not None:
+    if label == _LAW:
         st.draw_band(axes, lam, value, std, look[0], 0.3)
     # those of a first stage that fitted one per wavelength
     grid, name = st.nanometres(calibration.wavelength), f"{leaf.name}.retardance"

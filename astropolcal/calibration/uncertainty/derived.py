@@ -299,7 +299,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
         raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
     lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
     _check_laws(leaf, leaf.own_names)
-    return of_law(calibration, optic, "retardance", lam, dataset)
+    return of_law(calibration, optic, "retardance", lam)
 
 
 def derived_efficiency(calibration, wavelength=None, dataset=0):
@@ -388,26 +388,22 @@ def _check_laws(leaf, keys, *known):
             )
 
 
-def of_law(calibration, optic, law, lam, dataset):
+def _leaf(chains, name):
+    return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
+
+
+def of_law(calibration, optic, law, lam):
     """Return a law of an optic, with exact derivatives where it gives them."""
-    free, grid = free_of(calibration), calibration.wavelength.to_value(u.nm)
-    weights = between(np.atleast_1d(lam.to_value(u.nm)), grid).reshape(*lam.shape, -1)
-
-    def slopes(*chains):
+    free, leaf = free_of(calibration), _leaf(calibration.chains, optic)
+    if law in leaf._laws:
         # a thickness cannot be stepped below zero, and phases of mirrors jump by a turn
-        found, known = {}, find_optic(chains[dataset], optic)._laws_at(lam)[law][1]
-        for name, slope in ((f"{optic}.{key}", slope) for key, slope in known.items()):
-            if slot := free.lookup(name)[0]:
-                slope = np.broadcast_to(slope, lam.shape)
-                found[name] = slope[..., None] * weights if slot.per_wavelength else slope
-        return found
-
-    exact = law in find_optic(calibration.chains[dataset], optic)._laws
-    found = propagate(
-        calibration,
-        lambda *chains: getattr(find_optic(chains[dataset], optic), law)(lam),
-        slopes if exact else None,
-    )
+        value, slopes = leaf._laws_at(lam)[law]
+        slopes = per_canonical(free, {f"{optic}.{key}": slope for key, slope in slopes.items()})
+        mix = between(np.atleast_1d(lam.to_value(u.nm)), calibration.wavelength.to_value(u.nm))
+        slopes = spread_out(free, slopes, lam.shape, mix, -1).reshape(-1, free.size)
+        found = derive(calibration, free, value * (leaf._laws[law] or u.one), slopes)
+    else:
+        found = propagate(calibration, lambda *chains: getattr(_leaf(chains, optic), law)(lam))
     return replace(found, wavelength=lam)
 
 
@@ -673,13 +669,15 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         raise ChainError(f"no mirror {name!r}; the calibration has {', '.join(known) or 'none'}")
     wavelength = calibration.wavelength
     table = QTable({"wavelength": wavelength})
-    where = [any(o.name == name for o in leaves(c)) for c in calibration.chains].index(True)
-    leaf = find_optic(calibration.chains[where], name)
-    percent = 100 * u.percent
+    leaf = _leaf(calibration.chains, name)
+    percent, values = 100 * u.percent, calibration.parameter_values()
     for key, unit in (("diattenuation", percent), ("retardance", u.deg)):
         if hasattr(leaf, key):
-            value, std = _with_error(calibration, where, name, key)
-            table[key], table[f"{key}_err"] = value * unit, std * unit
+            own = values.get(f"{name}.{key}")
+            found = vars(of_law(calibration, name, key, wavelength)) if own is None else own
+            for column, part in ((key, "value"), (f"{key}_err", "std")):
+                plain = np.asarray(found[part], dtype=float)
+                table[column] = np.broadcast_to(plain, wavelength.shape) * unit
     fitted = ["retardance"] if isinstance(leaf, DiattenuatorRetarder) else leaf.own_names
     table.meta |= {"name": name, "held": all(getattr(leaf, key).fixed for key in fitted)}
     for metal in METALS:
@@ -687,13 +685,3 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         table[f"diattenuation_{metal}"] = mirror.diattenuation(wavelength) * percent
         table[f"retardance_{metal}"] = mirror.retardance(wavelength)
     return table
-
-
-def _with_error(calibration, where, name, key):
-    """Return a value and its error, plain (degree), shape (n_wavelengths,)."""
-    size, own = len(calibration.wavelength), calibration.parameter_values().get(f"{name}.{key}")
-    if own is not None:
-        return (np.broadcast_to(own[part], size).astype(float) for part in ("value", "std"))
-
-    found = of_law(calibration, name, key, calibration.wavelength, where)
-    return np.asarray(found.value), np.asarray(found.std)
