@@ -449,6 +449,11 @@ def at_positions(chain, **positions):
     ParameterError
         If a position is not finite, not an angle, or not a number where one is due.
 
+    Warns
+    -----
+    AstropolcalWarning
+        If a law is asked beyond the frames that it was calibrated with.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -470,6 +475,7 @@ def at_positions(chain, **positions):
         inputs = {name for law in leaf._follows.values() for name in law.of} & set(positions)
         places = {name: finite_position(positions[name], name) for name in inputs}
         leaf._places = leaf._places | places
+        warn_beyond(Train([leaf]), places)
     return copy
 
 
@@ -526,6 +532,11 @@ def system_mueller(chain, wavelength=None, positions=None):
         If a wavelength is missing, out of range, or does not match the
         parameters given per wavelength, or a position has the wrong unit.
 
+    Warns
+    -----
+    AstropolcalWarning
+        As `at_positions`.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -536,6 +547,7 @@ def system_mueller(chain, wavelength=None, positions=None):
     (3, 2, 4, 4)
     """
     positions, shape = _check_axes(wavelength, positions)
+    warn_beyond(chain, positions)
     has_grid = np.ndim(wavelength) == 1
     n_waves = len(wavelength) if has_grid else 1
     n_frames = math.prod(shape) // n_waves

@@ -312,14 +312,31 @@ def test_extrapolation_is_said_and_its_errors_grow(calibrated):
     where = {"hwp": 20 * u.deg, "derotator": 60 * u.deg, "time": Time("2026-02-01")}
     inside = calibration.system_mueller(positions=where, light="internal")
     where["time"] = Time("2027-02-01")
-    with pytest.warns(
-        AstropolcalWarning,
-        match=r"the law of hwp.retardance is extrapolated: time = 2027-02-01, calibrated from "
-        r"2026-01-01 to 2026-04-11",
-    ):
+    words = (
+        r"the law of hwp.retardance is extrapolated: time = 2027-02-01, calibrated from "
+        r"2026-01-01 to 2026-04-11"
+    )
+    with pytest.warns(AstropolcalWarning, match=words):
         beyond = calibration.system_mueller(positions=where, light="internal")
+    # of the chain alone, too
+    with pytest.warns(AstropolcalWarning, match=words):
+        at_positions(calibration.chain, time=where["time"])
+    with pytest.warns(AstropolcalWarning, match=words):
+        system_mueller(calibration.chain, WAVELENGTH, where)
     # the V of the detector hangs on the retardance
     assert (beyond.std[..., 0, 3] > 3 * inside.std[..., 0, 3]).all()
+
+
+def test_a_law_of_a_stage_is_not_extrapolated_in_silence(still, frames):
+    chain = follow(still, "wollaston.efficiency", LINE, "derotator")
+    chain["wollaston"].efficiency_c1 = 2e-4 / u.deg
+    observations = simulate(chain, WAVELENGTH, frames, flux=1e7, seed=1)
+    calibration = calibrate(chain, observations, gauge=None, **ARRAY)
+    # the prism would be better than perfect there
+    with pytest.warns(AstropolcalWarning, match=r"derotator = 175 deg, calibrated from 40 deg"):
+        calibration.system_mueller(
+            positions={"hwp": 0 * u.deg, "derotator": 175 * u.deg}, light="internal"
+        )
 
 
 def test_summary_names_the_law(calibrated):

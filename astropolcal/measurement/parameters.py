@@ -365,6 +365,16 @@ class FreeParameters:
             high[slot.slice] = np.minimum(high[slot.slice], end)
         return low, high
 
+    def check_priors(self):
+        """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
+        for name, (slot, factor, offset) in self._followers.items():
+            own, lead = (_told(self._table[key][0].prior) for key in (name, slot.name))
+            if own != _told(None) and (own != lead or factor != 1 or offset.any()):
+                raise ParameterError(
+                    f"{name} is tied to {slot.name}, and its own prior would be lost; give the "
+                    f"prior to {slot.name}, or set that of {name} to None"
+                )
+
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])

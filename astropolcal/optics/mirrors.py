@@ -116,15 +116,6 @@ class _Mirror(Optic):
         """Return the retardance, 0 to 360 deg (Quantity); 180 deg for an ideal mirror."""
         return self._laws_at(wavelength)["retardance"][0] * u.deg
 
-    def law_slopes(self, wavelength):
-        """
-        Return the derivatives of diattenuation and retardance to the parameters.
-
-        ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
-        ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
-        """
-        return {law: slopes for law, (_, slopes) in self._laws_at(wavelength).items()}
-
     def loosened(self, wavelength):
         """Return the diattenuator-retarder of the same values, free at each wavelength."""
         values = {law: getattr(self, law)(wavelength) for law in self._laws}

@@ -24,7 +24,7 @@ from astropolcal.calibration.system import (
     model_error,
 )
 from astropolcal.calibration.uncertainty.covariance import full_covariance
-from astropolcal.chain import join, leaves, warn_beyond, with_beam
+from astropolcal.chain import join, leaves, with_beam
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -418,7 +418,6 @@ class LoadedCalibration:
             positions = {name: angle * units.get(name, u.rad) for name, angle in found.items()}
         lam, mix = match_wavelengths(self.wavelength, chain, wavelength, interpolate)
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
-        warn_beyond(chain, {k: finite_position(x, k) for k, x in positions.items() if k in PLACES})
         settings, which = distinct(positions)
         which = which[0] if single else which
         covariance = self._covariance

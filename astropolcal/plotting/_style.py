@@ -42,6 +42,8 @@ _SETTINGS = {
     "grid.linewidth": 0.7,
     "axes.axisbelow": True,
     "axes.unicode_minus": True,
+    # "+9e1" in a corner is easily missed
+    "axes.formatter.useoffset": False,
     "text.usetex": False,
     "lines.linewidth": 1.5,
     "lines.markersize": 5.5,
@@ -117,15 +119,25 @@ def wavelength_label(axes):
 
 def draw_line(axes, lam, values, **look):
     """Draw values over the wavelength, which need not be in order; return the line."""
-    order = np.argsort(lam)
-    (line,) = axes.plot(np.asarray(lam)[order], np.asarray(values)[order], **look)
+    # a marker is seen at a single wavelength, too
+    drawn = (lam, values) if "marker" in look and np.size(lam) == 1 else widened(lam, values)
+    (line,) = axes.plot(*drawn, **look)
     return line
 
 
 def draw_band(axes, x, value, error, color, alpha, label=None):
     """Draw a band of one error to either side of values; it has gaps where the error is NaN."""
+    x, value, error = widened(x, value, error)
     look = {"color": color, "alpha": alpha, "linewidth": 0, "label": label}
     axes.fill_between(x, value - error, value + error, **look)
+
+
+def widened(x, *values):
+    """Return what a line or a band is drawn of, in order; at one wavelength as long as a cell."""
+    order = np.argsort(np.ravel(x))
+    x = cell_edges(np.ravel(x)) if order.size == 1 else np.asarray(x)[order]
+    values = (v[order] if np.ndim(v) and order.size > 1 else v for v in map(np.asarray, values))
+    return x, *(np.broadcast_to(value, x.shape) for value in values)
 
 
 def draw_points(axes, x, value, std, labels, **look):

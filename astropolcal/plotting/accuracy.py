@@ -138,7 +138,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
         for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
-            axes.plot(lam, value, color=st.BLACK, linestyle=line, label=label)
+            st.draw_line(axes, lam, value, color=st.BLACK, linestyle=line, label=label)
 
 
 def _label(key, values, calibration):
@@ -376,9 +376,8 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
             # a star whose polarization no catalogue has is drawn alone
             if np.isfinite(known).any():
-                top.plot(
-                    lam, known, color=st.VERMILION, label="catalogue, with the published errors"
-                )
+                look = {"color": st.VERMILION, "label": "catalogue, with the published errors"}
+                st.draw_line(top, lam, known, **look)
                 st.draw_band(top, lam, known, spread, st.VERMILION, 0.2)
             bottom.axhline(0, color=st.GREY, linewidth=1)
             bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
@@ -386,8 +385,8 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             if key == "dolp":
                 single = values["s_dolp_percent"][order]
                 look = {"color": st.GREY, "linestyle": "--"}
-                bottom.plot(lam, single, label="± rms error of a single cycle", **look)
-                bottom.plot(lam, -single, **look)
+                st.draw_line(bottom, lam, single, label="± rms error of a single cycle", **look)
+                st.draw_line(bottom, lam, -single, **look)
             top.set_ylabel(label)
             bottom.set_ylabel(f"obs. {st.MINUS} catalogue\n({short})")
             st.wavelength_label(bottom)

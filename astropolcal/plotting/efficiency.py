@@ -145,9 +145,11 @@ def _map_of_wavelengths(fig, ax, lam, values):
     # between a few filters there is nothing to interpolate
     filters = lam.size < _LEAST_SPECTRUM
     y, values = np.arange(lam.size) if filters else lam[order], values.T[order]
+    # cells between edges: the one of a single wavelength has no neighbours that tell its size
+    edges = np.arange(lam.size + 1) - 0.5 if filters else st.cell_edges(y)
     # 0 to 1 in all maps of wavelengths, so that colours of two instruments mean the same
-    look = {"cmap": "cividis", "vmin": 0, "vmax": 1, "shading": "nearest"}
-    mesh = ax.pcolormesh(_DEROTATOR, y, values, **look)
+    look = {"cmap": "cividis", "vmin": 0, "vmax": 1}
+    mesh = ax.pcolormesh(st.cell_edges(_DEROTATOR), edges, values, **look)
     for levels, color in () if filters else ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")):
         # a level that no value reaches is no fault
         inside = [level for level in levels if values.min() < level < values.max()]

@@ -101,8 +101,9 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
             noise = np.where(channel.valid, 100 * channel.sigma, np.nan)
             for c, (axes, (title, label)) in enumerate(zip(row, _CHANNELS.values(), strict=True)):
                 floor, one, two = (st.rms(v[c], axis=1)[order] for v in (noise, before, after))
-                axes.fill_between(nm[order], floor, color="0.85", label="noise")
-                axes.plot(nm[order], floor, color=st.GREY, linewidth=1)
+                x, level = st.widened(nm[order], floor)
+                axes.fill_between(x, level, color="0.85", label="noise")
+                axes.plot(x, level, color=st.GREY, linewidth=1)
                 axes.plot(nm[order], two, "o-", color=st.BLUE, markersize=4, label="after")
                 # hollow and larger, so that both are seen where they are the same
                 hollow = {"markerfacecolor": "none", "markersize": 8}

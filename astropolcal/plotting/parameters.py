@@ -12,7 +12,13 @@ from astropy.modeling import Parameter
 from astropy.time import Time
 
 from astropolcal import instruments
-from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
+from astropolcal.calibration.uncertainty.derived import (
+    METALS,
+    mirror_names,
+    mirror_values,
+    of_law,
+    of_optic,
+)
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import named_by_date, parameter_history, significance
@@ -33,15 +39,29 @@ _ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
 _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
-_STEP = 1e-3
 _TITLE_WIDTH = 58
+
+
+def _entries(calibration):
+    """Return the parameters by name; what follows a law of the wavelength has its value at each."""
+    known = calibration.parameter_values()
+    for i, chain in enumerate(calibration.chains):
+        laws = ((o.name, key, law.of) for o in leaves(chain) for key, law in o._follows.items())
+        for optic, key in ((optic, key) for optic, key, of in laws if of == ("wavelength",)):
+            found = of_optic(calibration, i, optic, [key])
+            value, std = np.asarray(found.value), np.asarray(found.std)
+            std = np.where(found.is_determined, std, np.nan)
+            own = {"value": value, "std": std, "at_bound": np.zeros(value.shape, dtype=bool)}
+            known[f"{optic}.{key}"] |= own | {"fixed": False}
+    return known
 
 
 def _draw_entry(axes, calibration, entry, look):
     """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
     lam, (color, marker) = st.nanometres(calibration.wavelength), look
     if not entry["value"].ndim:
-        ends = np.array([lam.min(), lam.max()])
+        (x,) = st.widened(lam)
+        ends = x[[0, -1]]
         value, std = float(entry["value"]), float(entry["std"])
         label = _FIXED if entry["fixed"] else "one value for all wavelengths"
         if not (np.isfinite(std) or entry["fixed"]):
@@ -73,14 +93,17 @@ def _draw_law(axes, calibration, leaf, known, look):
     """Draw a retardance that follows a law, its band, and the stages' points."""
     lam = np.sort(st.nanometres(calibration.wavelength))
     # a law is smooth between the wavelengths unless its parameters are given at these
-    if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
+    if lam.size > 1 and not any(getattr(leaf, key).size > 1 for key in leaf.param_names):
         lam = np.linspace(lam[0], lam[-1], _FINE)
-    value, std = _retardance(leaf, lam), _law_std(calibration, leaf, lam)
+    found = of_law(calibration, leaf.name, "retardance", lam * u.nm)
+    value, std = (x.to_value(u.deg) for x in (found.value, found.std))
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
     free = {key: entry for key, entry in own.items() if not entry["fixed"]}
-    label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
-    axes.plot(lam, value, color=look[0], label=label)
-    if std is not None:
+    label = f"law, {_FIXED}"
+    if free:
+        label = _LAW if found.is_determined.all() else _LAW_ALONE
+    st.draw_line(axes, lam, value, color=look[0], label=label)
+    if label == _LAW:
         st.draw_band(axes, lam, value, std, look[0], 0.3)
     # those of a first stage that fitted one per wavelength
     grid, name = st.nanometres(calibration.wavelength), f"{leaf.name}.retardance"
@@ -106,29 +129,6 @@ def _words(own):
 
 def _retardance(leaf, lam):
     return np.atleast_1d(leaf.retardance(lam * u.nm).to_value(u.deg))
-
-
-def _law_std(calibration, leaf, lam):
-    """Return the 1 sigma error of the law, or None where a parameter has none."""
-    names = calibration.covariance.names
-    keys = [key for key in leaf.own_names if f"{leaf.name}.{key}" in names]
-    index = [names.index(f"{leaf.name}.{key}") for key in keys]
-    matrix = calibration.covariance.matrix[np.ix_(index, index)]
-    if not keys or not np.isfinite(matrix).all():
-        return None
-    slopes = []
-    for key in keys:
-        parameter = getattr(leaf, key)
-        unit = 1 if parameter.unit is None else parameter.unit
-        # central differences; relative, but for parameters that are zero
-        step = _STEP * max(abs(float(parameter.value)), 1e-6)
-        high, low = (
-            _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
-            for sign in (1, -1)
-        )
-        slopes.append((high - low) / (2 * step))
-    # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
-    return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
 
 
 # ---- legend -----------------------------------------------------------------------
@@ -217,7 +217,7 @@ def plot_retardances(calibration, *, figure=None):
     >>> len(plot_retardances(cal).axes)
     2
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     panels = [
         (leaf, key)
         for leaf in _optics(calibration).values()
@@ -293,7 +293,7 @@ def plot_efficiency(calibration, *, figure=None):
     >>> len(plot_efficiency(cal).axes)
     1
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     names = [name for name in known if name.endswith(".efficiency")]
     if not names:
         raise ChainError("no optic of the chain has an efficiency to draw")
@@ -313,7 +313,7 @@ def plot_parameters(calibration, names=None, *, figure=None):
 
     ``names`` are ``"optic.parameter"``, by default all free ones given per wavelength.
     """
-    known = calibration.parameter_values()
+    known = _entries(calibration)
     names = _per_wavelength(known) if names is None else list(names)
     for name in names:
         check_choice("parameter", name, known, ParameterError)
@@ -468,11 +468,13 @@ def _draw_mirror(axes, calibration, table, key, reference):
     table = table[np.argsort(table["wavelength"])]
     lam, name = st.nanometres(table["wavelength"]), table.meta["name"]
     for metal, (color, line) in _METAL_LOOKS.items():
-        axes.plot(lam, table[f"{key}_{metal}"].value, color=color, linestyle=line, label=metal)
+        value = table[f"{key}_{metal}"].value
+        st.draw_line(axes, lam, value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):
         value = getattr(mirror, key)(table["wavelength"])
         value = value.to_value(u.deg) if key == "retardance" else 100 * value
-        axes.plot(lam, value, color=st.BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
+        look = {"color": st.BLACK, "linestyle": ("-", "--", "-.")[i % 3]}
+        st.draw_line(axes, lam, value, label=label, **look)
     value, std = table[key].value, table[f"{key}_err"].value
     # with a law in wavelength the diattenuation is computed and no parameter
     if f"{name}.diattenuation" in calibration.parameter_values():
@@ -482,8 +484,8 @@ def _draw_mirror(axes, calibration, table, key, reference):
         return
     known = np.isfinite(std).all()
     label = f"fitted law, with 1{st.SIGMA} band" if known else _MIRROR_LAW_ALONE
-    line = "-" if known else (0, (5, 1))
-    axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, color=st.BLUE)
+    look = {"linestyle": "-" if known else (0, (5, 1)), "linewidth": 2.2, "color": st.BLUE}
+    st.draw_line(axes, lam, value, label=label, **look)
     st.draw_band(axes, lam, value, std, st.BLUE, 0.3)
 
 
@@ -588,8 +590,6 @@ def _draw_history(ax, own, name, most):
     unit = f" ({own['unit'][0]})" if own["unit"][0] else ""
     ax.set(title=name, ylabel=f"{'difference to the mean' if several else 'value'}{unit}")
     ax.margins(y=0.18)
-    # "+9e1" in a corner is easily missed
-    ax.ticklabel_format(axis="y", useOffset=False)
     if several:
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 

@@ -4,6 +4,8 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling import models
+from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.calibration import Calibration, calibrate, propagate
@@ -15,7 +17,8 @@ from astropolcal.calibration.uncertainty import (
     derived_sky,
 )
 from astropolcal.calibration.uncertainty.covariance import full_covariance
-from astropolcal.chain import system_mueller, with_beam
+from astropolcal.calibration.uncertainty.derived import mirror_values
+from astropolcal.chain import follow, system_mueller, with_beam
 from astropolcal.exceptions import (
     CalibrationFileError,
     ChainError,
@@ -23,6 +26,8 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.measurement import Tie
+from astropolcal.plotting import plot_efficiency, plot_retardances
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
 AT = {"hwp": [0, 22.5] * u.deg, "derotator": 60 * u.deg}
@@ -267,6 +272,77 @@ def test_retardance_between_the_wavelengths(full_rank):
     law = derived_retardance(full_rank, "hwp", 1400 * u.nm)
     assert u.isclose(law.value, full_rank.chain["hwp"].retardance(1.4 * u.um))
     assert law.std.shape == ()
+
+
+def straight(still, model, of, **since):
+    """A calibration of a plate and a prism that follow a straight line, and the truth."""
+    truth = still
+    for name, slope in (("hwp.retardance", 10), ("wollaston.efficiency", 0.04)):
+        truth = follow(truth, name, model(slope), of, **since)
+    frames = half_wave_plate_cycles(derotator=[40, 60, 100, 140] * u.deg)
+    frames["time"] = Time("2026-03-01") + np.linspace(0, 1, len(frames)) * u.day
+    data = simulate(truth, LAM, frames, seed=1)
+    return calibrate(truth, data, gauge=None, search=False, cross_validate=False)
+
+
+def test_what_follows_a_law_of_the_wavelength_has_its_values():
+    still = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=155 * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(retardance=100 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.9, name="wollaston")
+    )
+
+    def line(slope):
+        return models.Polynomial1D(1, c1=slope)
+
+    cal = straight(still, line, "wavelength")
+    between = [1.2, 1.4, 2.2] * u.um
+    for found, true in (
+        (derived_retardance(cal, "hwp", between), (155 + 10 * between.value) * u.deg),
+        (derived_efficiency(cal, between), 0.9 + 0.04 * between.value),
+    ):
+        assert (np.abs(found.value - true) < 4 * found.std).all()
+        assert (found.std < 0.001 * true).all()
+    with pytest.raises(WavelengthRangeError):
+        derived_retardance(cal, "hwp", 2.5 * u.um)
+    # figures, too
+    for draw, start, slope in ((plot_retardances, 155, 10), (plot_efficiency, 0.9, 0.04)):
+        points = draw(cal).axes[0].containers[0]
+        np.testing.assert_allclose(points[0].get_ydata(), start + slope * LAM.value, rtol=1e-3)
+    # of time there is no value for all frames
+    cal = straight(still, line, "time", since="2026-03-01")
+    for ask in (lambda: derived_retardance(cal, "hwp"), lambda: derived_efficiency(cal)):
+        with pytest.raises(ParameterError, match="follows a law of time; derived_mueller"):
+            ask()
+
+
+def test_mirrors_that_follow_and_bare_ones_have_errors():
+    """A film that is tied moves though it is fixed by default; one of no thickness has a law."""
+    metal = {"film_thickness": 50 * u.nm}
+    chain = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=172 * u.deg, mount="hwp", name="hwp")
+        | optics.MetalMirror(theta=20 * u.deg, fixed={"film_thickness": False}, name="m1", **metal)
+        | optics.MetalMirror(theta=-30 * u.deg, name="m2", **metal)
+        | optics.LinearRetarder(retardance=98 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    for name in ("hwp", "derotator"):
+        chain[name].retardance.fixed = True
+    chain["wollaston"].efficiency.fixed = True
+    frames = half_wave_plate_cycles(derotator=[0, 30, 60, 100] * u.deg)
+    quick = {"search": False, "cross_validate": False}
+    ties = {"m2.film_thickness": Tie("m1.film_thickness")}
+    cal = calibrate(chain, simulate(chain, LAM, frames, seed=1), ties=ties, **quick)
+    first, second = (mirror_values(cal, name) for name in ("m1", "m2"))
+    for key in ("retardance_err", "diattenuation_err"):
+        assert (first[key] > 0).all()
+        np.testing.assert_array_equal(second[key], first[key])
+    bare = chain.copy()
+    bare["m1"].film_thickness = 0 * u.nm
+    cal = calibrate(bare, simulate(bare, LAM, frames, seed=2), **quick)
+    assert derived_retardance(cal, "m1").is_determined.all()
 
 
 def test_interpolated_error_by_hand(full_rank):

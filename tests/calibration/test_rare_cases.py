@@ -339,3 +339,25 @@ def test_an_instrument_without_files_only_tells_its_name(monkeypatch):
     lab = SimpleNamespace(name="lab", files=None, headers=None, configured=lambda header: lab)
     monkeypatch.setattr(instruments, "get", lambda name: lab)
     assert describe({"INSTRUME": "CHARIS"}, "lab") == {"instrument": "lab"}
+
+
+def test_components_of_a_retarder_may_be_constant_or_per_wavelength():
+    """The mirror solutions of one that has both are looked for, too."""
+    chain = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=172 * u.deg, mount="hwp", name="hwp")
+        | optics.EllipticalRetarder(
+            horizontal=[100, 90, 80] * u.deg,
+            diagonal=4 * u.deg,
+            circular=3 * u.deg,
+            mount="derotator",
+            name="derotator",
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    seen = simulate(chain, LAM, half_wave_plate_cycles(derotator=ANGLES), seed=1)
+    cal = calibrate(chain, seen, search=False, cross_validate=False)
+    # d (1 - 360 deg / |d|) differs from wavelength to wavelength, the other hand does not
+    words = " ".join(cal.identifiability.mirrors)
+    assert "all retardances with the other sign" in words
+    assert "derotator: a retardance d" not in words

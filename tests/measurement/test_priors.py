@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from astropolcal import optics
+from astropolcal import calibrate, optics
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.measurement.parameters import FreeParameters, Uniform, bind_prior
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -107,6 +107,27 @@ def test_a_prior_that_does_not_fit_is_refused():
     ]:
         with pytest.raises(ParameterError, match=complaint):
             bind_prior(prior, "plate.theta", unit, bounds)
+
+
+def test_a_prior_of_what_is_tied_is_not_lost_in_silence():
+    def fit(prior, lead=None, **tie):
+        chain = _chain(plate__theta=lead, wollaston__theta=prior)
+        chain["plate"].theta.fixed = False
+        data = _measurement(_chain()).datasets[0].observations
+        ties = {"wollaston.theta": Tie("plate.theta", **tie)}
+        return calibrate(chain, data, ties=ties, search=False, cross_validate=False)
+
+    narrow = Normal(0 * u.deg, 0.1 * u.deg)
+    for lead, tie in (
+        (None, {}),
+        (Normal(0 * u.deg, 0.2 * u.deg), {}),
+        (narrow, {"factor": 2.0}),
+        (narrow, {"offset": 1 * u.deg}),
+    ):
+        with pytest.raises(ParameterError, match=r"wollaston\.theta is tied to plate\.theta"):
+            fit(narrow, lead, **tie)
+    # the same twice is what shares of one parameter have
+    assert fit(narrow, narrow).converged
 
 
 def test_uniform_is_a_tighter_bound_and_moves_the_start_inside():

@@ -299,6 +299,17 @@ def test_star_and_catalogue_are_drawn_with_their_errors(elliptical, entry):
     assert not [line for line in figure.axes[3].lines if line.get_linestyle() == "--"]
 
 
+def test_a_star_at_one_wavelength_has_its_catalogue(elliptical, entry):
+    one = {key: x[:1] if isinstance(x, list) else x for key, x in entry.items()}
+    top, _, bottom, _ = plot_star_check(elliptical, checked(one)).axes
+    known = curves(top)["catalogue, with the published errors"]
+    assert known.get_ydata().tolist() == [2.1, 2.1]
+    dashed = [line for line in bottom.lines if line.get_linestyle() == "--"]
+    assert all(np.ptp(line.get_xdata()) > 0 for line in (known, *dashed))
+    (band,) = [c for c in top.collections if c.get_alpha() == 0.2]
+    assert (np.ptp(band.get_paths()[0].vertices, axis=0) > 0).all()
+
+
 def test_labels_of_a_star(elliptical, entry):
     figure = plot_star_check(elliptical, checked(entry))
     assert [axes.get_ylabel() for axes in figure.axes] == [

@@ -65,6 +65,10 @@ def test_few_filters_are_rows_of_their_own():
     figure = plot_polarimetric_efficiency(irdis.published(), irdis.wavelength, instrument=irdis)
     labels = [text.get_text() for text in figure.axes[1].get_yticklabels()]
     assert labels == ["1043", "1245", "1625", "2182"]
+    # one alone is seen, too
+    chain = irdis.chain("polarized", wavelength=irdis.wavelength[1:2])
+    axes = plot_polarimetric_efficiency(chain, irdis.wavelength[1:2], instrument=irdis).axes[1]
+    assert np.ptp(axes.collections[0].get_coordinates()[..., 1]) == 1
 
 
 def test_without_a_derotator_the_sky_turns():

@@ -321,27 +321,67 @@ def test_a_constant_is_a_line_over_the_range():
 # ---- laws ----------------------------------------------------------------------------------
 
 
-def test_band_of_a_law_is_propagated_from_the_covariance():
-    """Retardance in the thickness of one layer: the slope is exact, as it is proportional."""
-    plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
-    lam = np.array([1200.0, 1700.0])
-    sigma = 1e-4
-    covariance = SimpleNamespace(names=["other.x", "hwp.w_sio2"], matrix=np.diag([7.0, sigma**2]))
-    found = parameters._law_std(calibration(covariance=covariance), plate, lam)
-    thicker = plate.with_parameters(w_sio2=(plate.w_sio2.value + 0.1) * u.mm)
-    slope = (parameters._retardance(thicker, lam) - parameters._retardance(plate, lam)) / 0.1
-    np.testing.assert_allclose(found, np.abs(slope) * sigma, rtol=1e-6)
+def test_band_of_a_law_counts_what_is_tied_and_open():
+    """A layer that follows the other moves the retardance, too; what no datum tells has no band."""
+    chain = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+        | optics.TwoLayerWaveplate(fixed={"w_mgf2": True}, name="window")
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    lam, share = [1.2, 1.6] * u.um, 0.78
+    frames = half_wave_plate_cycles(derotator=[0, 30] * u.deg)
+    data = simulate(chain, lam, frames, seed=1)
+    ties = {"hwp.w_mgf2": Tie("hwp.w_sio2", share)}
+    cal = calibrate(chain, data, ties=ties, search=False, cross_validate=False)
+    per_mm = [
+        optics.TwoLayerWaveplate(w_sio2=a * u.mm, w_mgf2=b * u.mm).retardance(lam).value
+        for a, b in ((1, 0), (0, 1))
+    ]
+    sigma = cal.covariance.std("hwp.w_sio2").value
+    plate, window = plot_retardances(cal).axes
+    (band,) = plate.collections
+    vertices = band.get_paths()[0].vertices
+    widths = [np.ptp(vertices[np.isclose(vertices[:, 0], nm), 1]) / 2 for nm in (1200, 1600)]
+    np.testing.assert_allclose(widths, np.abs(per_mm[0] + share * per_mm[1]) * sigma, rtol=1e-4)
+    assert not window.collections
+    assert labels(window)[0] == parameters._LAW_ALONE
 
 
-def test_a_law_whose_parameters_have_no_error_has_no_band():
-    for covariance in [
-        SimpleNamespace(names=["other.x"], matrix=np.ones((1, 1))),
-        SimpleNamespace(names=["hwp.w_sio2"], matrix=np.full((1, 1), np.nan)),
-    ]:
-        plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
-        assert parameters._law_std(calibration(covariance=covariance), plate, NM) is None, (
-            covariance
-        )
+def test_numbers_on_axes_are_whole():
+    """No "+9.799e1" in a corner, beside labels that are what is left of 98 deg."""
+    chain = (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=98 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.98, fixed={"efficiency": True}, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[20, 30, 60] * u.deg)
+    data = simulate(chain, [1.2, 1.6] * u.um, frames, flux=1e11, seed=1)
+    single = "normalized_single_difference"
+    cal = calibrate(chain, data, observable=single, search=False, cross_validate=False)
+    figure = plot_retardances(cal)
+    figure.draw_without_rendering()
+    assert [axes.yaxis.get_offset_text().get_text() for axes in figure.axes] == [""]
+
+
+def test_one_wavelength_is_seen_with_its_errors():
+    """A line from a wavelength to itself has no length, a band no width."""
+    chain = (
+        optics.MetalMirror(film_thickness=50 * u.nm, fixed={"film_thickness": False}, name="m3")
+        | optics.TwoLayerWaveplate(mount="hwp", fixed={"w_mgf2": True}, name="hwp")
+        | optics.LinearRetarder(retardance=98 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.98, fixed={"efficiency": True}, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[0, 30, 60] * u.deg)
+    data = simulate(chain, [1.6] * u.um, frames, flux=1e8, seed=1)
+    cal = calibrate(chain, data, search=False, cross_validate=False)
+    for draw, bands in ((plot_retardances, 3), (plot_efficiency, 0), (plot_mirrors, 2)):
+        axes = draw(cal).axes
+        drawn = [line for one in axes for line in one.lines]
+        assert all(np.ptp(line.get_xdata()) > 0 for line in drawn), draw
+        found = [band.get_paths()[0].vertices for one in axes for band in one.collections]
+        assert len(found) == bands, draw
+        assert all((np.ptp(vertices, axis=0) > 0).all() for vertices in found), draw
 
 
 def test_values_of_a_law_are_words():

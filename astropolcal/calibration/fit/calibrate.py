@@ -126,7 +126,7 @@ def calibrate(
         Or the noise itself, its standard deviation as one value, one per wavelength or one per
         datum.
     ties : dict of str to Tie, optional
-        Parameters that follow others.
+        Parameters that follow others. They have no priors but those of what they follow.
     own : sequence of str, or dict of str to sequence
         Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
         the group of each dataset, such as its night, in which they have the same. All others are
@@ -260,6 +260,7 @@ def _fixed(chain, fix):
 
 def _check(measurement):
     refuse_repeated([dataset.observations for dataset in measurement.datasets])
+    measurement.free.check_priors()
     if not measurement.free.size:
         raise FitError("nothing to fit: every parameter is fixed or tied")
     if measurement.free.size > measurement.n_data:

@@ -394,9 +394,10 @@ def mirror_branches(measurement, vector, view):
     for words, names, edit in candidates:
         other = np.array(vector, dtype=float)
         for slots in (retarders[name] for name in names):
-            changed = edit(np.array([vector[slot.slice] for slot in slots]))
-            for slot, values in zip(slots, changed, strict=True):
-                other[slot.slice] = values
+            parts = np.broadcast_arrays(*(vector[slot.slice] for slot in slots))
+            for slot, values in zip(slots, edit(np.array(parts)), strict=True):
+                # one value for all wavelengths where these want several is no mirror: see below
+                other[slot.slice] = values[: slot.size]
         inside = np.all((other >= low) & (other <= high))
         change = np.abs(measurement.predict(other) - measurement.predict(vector)).max()
         if inside and change < _SAME and not np.allclose(other, vector):

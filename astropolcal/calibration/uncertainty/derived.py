@@ -271,6 +271,8 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     ------
     ChainError
         If there is no such optic, or it is not a retarder.
+    ParameterError
+        If it depends on more than the wavelength, by a law of time for instance.
     WavelengthRangeError
         If a wavelength is outside the grid of its parameters or the law's range.
 
@@ -292,14 +294,12 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     components = ("retardance", "horizontal", "diagonal", "circular")
     components = [key for key in components if key in leaf.param_names]
     if components:
-        return _of_optic(calibration, dataset, optic, components, wavelength)
+        return of_optic(calibration, dataset, optic, components, wavelength)
     if not callable(getattr(leaf, "retardance", None)):
         raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
     lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
-    found = propagate(
-        calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
-    )
-    return replace(found, wavelength=lam)
+    _check_laws(leaf, leaf.own_names)
+    return of_law(calibration, optic, "retardance", lam)
 
 
 def derived_efficiency(calibration, wavelength=None, dataset=0):
@@ -325,6 +325,8 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     ------
     ChainError
         If no optic has an efficiency.
+    ParameterError
+        If it depends on more than the wavelength, by a law of time for instance.
     WavelengthRangeError
         If a wavelength is outside the grid.
 
@@ -344,30 +346,65 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     found = [o for o in leaves(calibration.chains[dataset]) if "efficiency" in o.param_names]
     if not found:
         raise ChainError("no optic of the chain has an efficiency")
-    return _of_optic(calibration, dataset, found[0].name, ["efficiency"], wavelength)
+    return of_optic(calibration, dataset, found[0].name, ["efficiency"], wavelength)
 
 
-def _of_optic(calibration, dataset, optic, keys, wavelength):
+def of_optic(calibration, dataset, optic, keys, wavelength=None):
     """Return one parameter of an optic, or the length of several, between the wavelengths, too."""
     leaf = find_optic(calibration.chains[dataset], optic)
+    _check_laws(leaf, keys, "wavelength")
     lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
     grid, wanted = calibration.wavelength.to_value(u.nm), np.atleast_1d(lam.to_value(u.nm))
     # one number for all wavelengths holds anywhere
-    if any(np.size(getattr(leaf, key).value) > 1 for key in keys):
+    if any(getattr(leaf, key).size > 1 or key in leaf._follows for key in keys):
         check_range(lam, calibration.wavelength)
     weights, unit = between(wanted, grid), getattr(leaf, keys[0]).unit
 
+    def canonical(parameter):
+        value = np.ravel(parameter.value) * canonical_factor(parameter.unit)
+        return weights @ value if value.size > 1 else np.full(wanted.size, value[0])
+
     def length(*chains):
-        parts = []
-        for parameter in (getattr(find_optic(chains[dataset], optic), key) for key in keys):
-            value = np.ravel(
-                parameter.value if unit is None else parameter.quantity.to_value(u.deg)
-            )
-            parts.append(weights @ value if value.size > 1 else np.full(wanted.size, value[0]))
+        leaf, parts = find_optic(chains[dataset], optic), []
+        for key in keys:
+            parts.append(canonical(getattr(leaf, key)))
+            if law := leaf._follows.get(key):
+                more = [canonical(getattr(leaf, name)) for name in law.names(key)]
+                parts[-1] += law.value(wanted / 1000, {}, more)
         found = parts[0] if len(keys) == 1 else np.linalg.norm(parts, axis=0)
-        return found.reshape(lam.shape) * (1 if unit is None else u.deg)
+        return found.reshape(lam.shape) / canonical_factor(unit) * (1 if unit is None else unit)
 
     return replace(propagate(calibration, length), wavelength=lam)
+
+
+def _check_laws(leaf, keys, *known):
+    """Refuse parameters that follow a law of something else than what is known."""
+    for key in keys:
+        law = leaf._follows.get(key)
+        if law and not {*law.of} <= {*known}:
+            raise ParameterError(
+                f"{leaf.name}.{key} follows a law of {', '.join(law.of)}; derived_mueller says "
+                "what it does at some positions"
+            )
+
+
+def _leaf(chains, name):
+    return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
+
+
+def of_law(calibration, optic, law, lam):
+    """Return a law of an optic, with exact derivatives where it gives them."""
+    free, leaf = free_of(calibration), _leaf(calibration.chains, optic)
+    if law in leaf._laws:
+        # a thickness cannot be stepped below zero, and phases of mirrors jump by a turn
+        value, slopes = leaf._laws_at(lam)[law]
+        slopes = per_canonical(free, {f"{optic}.{key}": slope for key, slope in slopes.items()})
+        mix = between(np.atleast_1d(lam.to_value(u.nm)), calibration.wavelength.to_value(u.nm))
+        slopes = spread_out(free, slopes, lam.shape, mix, -1).reshape(-1, free.size)
+        found = derive(calibration, free, value * (leaf._laws[law] or u.one), slopes)
+    else:
+        found = propagate(calibration, lambda *chains: getattr(_leaf(chains, optic), law)(lam))
+    return replace(found, wavelength=lam)
 
 
 def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
@@ -633,11 +670,14 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
     wavelength = calibration.wavelength
     table = QTable({"wavelength": wavelength})
     leaf = _leaf(calibration.chains, name)
-    percent = 100 * u.percent
+    percent, values = 100 * u.percent, calibration.parameter_values()
     for key, unit in (("diattenuation", percent), ("retardance", u.deg)):
         if hasattr(leaf, key):
-            value, std = _with_error(calibration, name, key)
-            table[key], table[f"{key}_err"] = value * unit, std * unit
+            own = values.get(f"{name}.{key}")
+            found = vars(of_law(calibration, name, key, wavelength)) if own is None else own
+            for column, part in ((key, "value"), (f"{key}_err", "std")):
+                plain = np.asarray(found[part], dtype=float)
+                table[column] = np.broadcast_to(plain, wavelength.shape) * unit
     fitted = ["retardance"] if isinstance(leaf, DiattenuatorRetarder) else leaf.own_names
     table.meta |= {"name": name, "held": all(getattr(leaf, key).fixed for key in fitted)}
     for metal in METALS:
@@ -645,27 +685,3 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         table[f"diattenuation_{metal}"] = mirror.diattenuation(wavelength) * percent
         table[f"retardance_{metal}"] = mirror.retardance(wavelength)
     return table
-
-
-def _leaf(chains, name):
-    return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
-
-
-def _with_error(calibration, name, key):
-    """Return a value and its error, plain (degree), shape (n_wavelengths,)."""
-    size, own = len(calibration.wavelength), calibration.parameter_values().get(f"{name}.{key}")
-    if own is not None:
-        return (np.broadcast_to(own[part], size).astype(float) for part in ("value", "std"))
-
-    def law(*chains):
-        value = getattr(_leaf(chains, name), key)(calibration.wavelength)
-        return value.to_value(u.deg) if isinstance(value, u.Quantity) else value
-
-    def slopes(*chains):
-        leaf = _leaf(chains, name)
-        found = leaf.law_slopes(calibration.wavelength)[key]
-        # the thickness of a film cannot be stepped below zero, so no differences are taken
-        return {f"{name}.{own}": found[own] for own in found if not getattr(leaf, own).fixed}
-
-    derived = propagate(calibration, law, slopes)
-    return np.asarray(derived.value), np.asarray(derived.std)
