@@ -311,10 +311,11 @@ def _groups(diagnosis):
 def _telling_apart(forecast, group, foreseen):
     """Return the line on the exposure that tells the members of an alias group apart best."""
     names, recipes, shares = zip(*group, strict=True)
-    weights = np.array(shares) / sum(shares)
+    weights = np.array(shares)
     # what a cell is called says no more than its title
     titles = {e.name: e.title + f" ({e.name})" * (e.kind != "cell") for e, _ in recipes}
-    hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
+    hypotheses = forecast.foreseen(names)
+    now = float(np.sum(weights**2) / weights.sum())
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
     timed = any(Dependence(effect.dependence).kind in _TIMED for effect, _ in recipes)
@@ -558,9 +559,13 @@ def _log_det(factor):
 
 
 def expected(weights, factors):
-    """Return the probability that the true one of several causes is expected to have."""
-    against = np.exp(np.clip(-factors, -700, 50)) @ weights
-    return float(np.sum(weights**2 / against))
+    """
+    Return the probability that the true one of several causes is expected to have.
+
+    What their weights lack of one is that of causes which nothing is known to tell from it.
+    """
+    against = np.exp(np.clip(-factors, -700, 50)) @ weights + max(1 - weights.sum(), 0.0)
+    return float(np.sum(weights**2 / against) / weights.sum())
 
 
 # ---- exposures ---------------------------------------------------------------------------------
