@@ -8,11 +8,13 @@ says what stays unexplained.
 """
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from astropolcal.exceptions import GapError
+from astropolcal import instruments
+from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
@@ -281,7 +283,7 @@ def diagnose(
     say = progress or (lambda line: None)
     observations = as_tables(observations)
     library = _library(effects)
-    _check_instruments(observations)
+    check_instruments(calibration, observations)
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
@@ -365,10 +367,19 @@ def _library(effects):
     return [get_effect(name) for name in names]
 
 
-def _check_instruments(observations):
-    named = {o.instrument for o in observations if o.instrument is not None}
-    if len({name.lower() for name in named}) > 1:
-        raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")
+def check_instruments(calibration, observations):
+    """Raise GapError if a calibration, or chains, and datasets are not of one instrument."""
+    stated = {getattr(one, "instrument", None) for one in (calibration, *observations)} - {None}
+    if len({_called(name) for name in stated}) > 1:
+        raise GapError(
+            f"calibration and datasets are of different instruments: {', '.join(sorted(stated))}"
+        )
+
+
+def _called(name):
+    with suppress(InstrumentError):
+        name = instruments.get(name).name
+    return name.lower()
 
 
 # ---- conclusion --------------------------------------------------------------------------------
