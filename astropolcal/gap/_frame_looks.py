@@ -368,12 +368,8 @@ class Frame:
         curvature = (low - 2 * middle + high) / h**2 / 2
         error = 1 / np.sqrt(max(curvature, 1.0))
         cost = _occam(offset, error, _ANGLES)
-        others = tuple(
-            told + x
-            for x, value in near
-            if abs(x - offset) > error
-            and value + _occam(x, error, _ANGLES) < chi2 + cost + _AS_PROBABLE
-        )
+        far = [(x, y + _occam(x, error, _ANGLES)) for x, y in near if abs(x - offset) > error]
+        others = tuple(told + x for x, total in far if total < chi2 + cost + _AS_PROBABLE)
         return Trial(f"{stage} angle", chi2, cost, told + offset, error, others=others)
 
     def _turned(self, stage, offsets):

@@ -26,7 +26,7 @@ from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.measurement.datasets import as_tables
 from astropolcal.progress import in_one_thread
-from astropolcal.words import counted, html
+from astropolcal.words import counted, html, listed
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
@@ -371,9 +371,7 @@ def check_instruments(calibration, observations):
     """Raise GapError if a calibration, or chains, and datasets are not of one instrument."""
     stated = {getattr(one, "instrument", None) for one in (calibration, *observations)} - {None}
     if len({_called(name) for name in stated}) > 1:
-        raise GapError(
-            f"calibration and datasets are of different instruments: {', '.join(sorted(stated))}"
-        )
+        raise GapError(f"model or datasets are of different instruments: {listed(sorted(stated))}")
 
 
 def _called(name):

@@ -381,15 +381,11 @@ def _repetitions(diagnosis):
 
 def _fixing(forecast, directions, foreseen):
     """Return the line on the exposure that fixes what is open among the parameters."""
-    best, n_open = (LEAST_GAIN, None), directions[2].shape[1]
-    for exposure, columns in foreseen:
-        names, gain, count = forecast.fixes(directions, columns)
-        worth = gain / (1 + exposure.effort)
-        if worth > best[0]:
-            best = worth, (exposure, names, gain, count)
-    if best[1] is None:
+    found = [(one, *forecast.fixes(directions, columns)) for one, columns in foreseen]
+    worth = [gain / (1 + one.effort) for one, _, gain, _ in found]
+    if max(worth, default=0.0) <= LEAST_GAIN:
         return []
-    exposure, names, gain, count = best[1]
+    (exposure, names, gain, count), n_open = found[int(np.argmax(worth))], directions[2].shape[1]
     words = (
         f"Take {exposure.words}: fixes {count} of {n_open} open directions of the parameters, the "
         f"clearest that of {' with '.join(names)}, at {_sigmas(gain)} standard deviations"

@@ -75,14 +75,8 @@ def changes(diagnosis, causes):
         run = cell and _run_of(cell, names, chains)
         if run is not None:
             brought = _brought(cell, run, names, chains)
-            entry = {
-                "cell": cause["cell"],
-                "dataset": run,
-                "size": cause["size"],
-                "probability": cause["probability"],
-                "significance": cause["significance"],
-                "brought_by": brought,
-            }
+            same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
+            entry = same | {"dataset": run, "brought_by": brought}
             entry["words"] = _sentence(cell, entry, names, wavelength)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
@@ -150,8 +144,7 @@ def paragraph(content, names, asked=False):
         many = f"{len(brought)} of the changes are" if len(brought) > 1 else "One change is"
         words.append(
             f"{many} at or downstream of what only one run has ({listed(list(optics))}): "
-            "that may have "
-            "brought them."
+            "that may have brought them."
         )
     return words
 
@@ -199,6 +192,7 @@ def _size(parameters, wavelength):
             continue
         i = int(np.nanargmax(clear))
         if best is None or clear[i] > best[0]:
-            where = f" at {wavelength[i]:.0f} nm" if values.size == len(wavelength) > 1 else ""
+            one_of = values.size == len(wavelength) > 1 and np.ptp(values) > 0
+            where = f" at {wavelength[i]:.0f} nm" if one_of else ""
             best = (clear[i], factor * values[i], factor * errors[i], unit, where)
     return best and best[1:]

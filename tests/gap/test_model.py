@@ -147,3 +147,13 @@ def test_a_known_mounting_is_no_row_of_the_data():
     told = to_dict(diagnose(chains, observations))
     assert told["verdict"] in ("named", "located")
     assert told["causes"][0]["cell"]["dependence"] == "time"
+
+
+def test_errors_of_sizes_are_those_of_the_report():
+    """Also where the residuals are larger than the noise, as they are of a missing optic."""
+    gain = data.with_effect("beam_gain", imbalance=0.003)
+    model = data.fitted(data.observed(gain)).with_effect(get_effect("hwp_encoder_two_lobe"))
+    assert model.mean_square > 1.5
+    for name, (_, errors, _, _) in model.sizes("hwp_encoder_two_lobe").items():
+        told = Fitted(model).sizes("hwp_encoder_two_lobe")[name]["std"]
+        np.testing.assert_allclose(errors, told, rtol=1e-6)

@@ -159,7 +159,7 @@ def test_bad_input(folder, cal, tmp_path, capsys):
     assert "'polarized' only" in line
     other = tmp_path / "other.ecsv"
     other.write_text(table.read_text().replace("SCExAO/CHARIS", "irdis"))
-    assert "of different instruments: charis, irdis" in complaint(capsys, cal, other)
+    assert "of different instruments: charis and irdis" in complaint(capsys, cal, other)
     assert "nowhere.ecsv" in complaint(capsys, folder / "nowhere.ecsv")
     assert "mirror" in complaint(capsys, table, "--without", "mirror")
     assert "no parameter 'nonsense'" in complaint(capsys, table, "--free", "hwp.nonsense")
