@@ -360,8 +360,7 @@ class Frame:
         lowest = np.flatnonzero((chi2 <= np.roll(chi2, 1)) & (chi2 <= np.roll(chi2, -1)))
         lowest = lowest[np.argsort(chi2[lowest], kind="stable")][:_MINIMA]
         found = [self._refined(stage, grid[k]) for k in lowest]
-        least = min(value for _, value in found)
-        near = [one for one in found if one[1] < least + _ALIKE]
+        near = [one for one in found if one[1] < min(value for _, value in found) + _ALIKE]
         offset, chi2 = min(near, key=lambda one: abs(one[0]))
         h = np.deg2rad(0.02)
         low, middle, high = self._turned(stage, offset + np.array([-h, 0.0, h]))

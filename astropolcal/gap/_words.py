@@ -40,11 +40,8 @@ _AMPLITUDES = {
 }
 # what the parameter "right" is of what a detector does, by the kind of its cell: no sum tells a
 # background of one beam from the lamp
-_BEAMS = {
-    "background_of_one_beam": "right beam, or the left with the other sign",
-    "nonlinearity": "both beams",
-    "persistence": "both beams",
-}
+_BEAMS = dict.fromkeys(("nonlinearity", "persistence"), "both beams")
+_BEAMS["background_of_one_beam"] = "right beam, or the left with the other sign"
 
 
 # ---- numbers ---------------------------------------------------------------------------------

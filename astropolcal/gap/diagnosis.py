@@ -392,16 +392,15 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
-    left_p = improved.p_value
     return Diagnosis(
-        verdict=_verdict(causes, nominal, left_p, selection.courses),
+        verdict=_verdict(causes, nominal, improved.p_value, selection.courses),
         nominal=nominal,
         improved=improved,
         causes=causes,
         scan=selection.scan,
         held_out=[h for h in selection.history if h is not None],
         gap_p_value=nominal.p_value,
-        remainder_p_value=left_p,
+        remainder_p_value=improved.p_value,
         seconds=time.perf_counter() - started,
         frames=frames,
         settings={"unlisted": selection.unlisted},

@@ -242,8 +242,7 @@ def _fault(problem, place, trial, evidence, probability):
     if trial.partner is not None:
         fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
     fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others)}"
-    if others.size:
-        fault.error = float(np.abs(others - value).max())
+    fault.error = float(np.abs(others - value).max()) if others.size else fault.error
     return fault
 
 
@@ -264,8 +263,8 @@ def _words(fault, told, beam, others):
     finest = max(fault.error, abs(fault.value - told) / 30)
     digits = int(np.clip(np.ceil(1 - np.log10(finest)), 1, 4))
     stood = listed([f"{angle:.{digits}f}" for angle in (fault.value, *others)], "or") + " deg"
-    told = f"{told:.{digits}f} deg"
-    return f"its data are those of {name} at {stood}, not at {told} as the table says"
+    words = f"its data are those of {name} at {stood}, not at"
+    return f"{words} {told:.{digits}f} deg as the table says"
 
 
 def _exchanges(place, frames, trials):

@@ -233,8 +233,7 @@ class Model:
 
         The errors are those of the noise, or of the scatter of the residuals where it is larger.
         """
-        larger = max(1.0, np.sqrt(self.mean_square))
-        errors = larger * self.problem.errors(self.fit.coefficients)
+        errors = max(1.0, np.sqrt(self.mean_square)) * self.problem.errors(self.fit.coefficients)
         found = {}
         for parameter in self.added[name]:
             slot = self.problem.free.by_name[parameter.name]

@@ -284,8 +284,7 @@ def plan(diagnosis, candidates=None):
             # foresees nothing there
             if error.argument != "chain":
                 raise
-    for group in groups:
-        lines.append(_telling_apart(forecast, group, foreseen))
+    lines += [_telling_apart(forecast, group, foreseen) for group in groups]
     if directions[2].shape[1]:
         lines += _fixing(forecast, directions, foreseen)
     return _merged(lines)[:_MOST_LINES]

@@ -67,7 +67,8 @@ def changes(diagnosis, causes):
     """
     if not causes or count_runs(diagnosis.improved.problem) < 2:
         return []
-    names, chains = _runs(diagnosis)
+    names = [o.name for o in diagnosis.improved.observations]
+    chains = [leaves(chain) for chain in diagnosis.improved.chains]
     wavelength = 1e3 * diagnosis.improved.problem.wavelength
     found = []
     for cause in causes:
@@ -80,12 +81,6 @@ def changes(diagnosis, causes):
             entry["words"] = _sentence(cell, entry, names, wavelength)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
-
-
-def _runs(diagnosis):
-    """Return names and chains of the datasets."""
-    model = diagnosis.improved
-    return [o.name for o in model.observations], [leaves(chain) for chain in model.chains]
 
 
 def _run_of(cell, names, chains):
@@ -128,8 +123,7 @@ def paragraph(content, names, asked=False):
     found = content["changes"]
     if not found:
         quoted = [f'"{name}"' for name in names]
-        words = [f"Nothing changed between {listed(quoted)} that the data can tell."]
-        return words if asked else []
+        return [f"Nothing changed between {listed(quoted)} that the data can tell."] * asked
     words = [one["words"] for one in found[:_MOST]]
     if len(found) > _MOST:
         words.append(f"{len(found) - _MOST} smaller changes are listed below.")
