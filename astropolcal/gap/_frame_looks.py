@@ -26,6 +26,8 @@ _ZOOMS, _POINTS = 6, 13
 _MINIMA = 4
 # minima that differ by less are alike: the one nearest to the table counts
 _ALIKE = 9.0
+# and the others are told whose evidence, minus twice its logarithm, is above it by less
+_AS_PROBABLE = 2 * np.log(20)
 # what the size of an angle's error or of a factor may be: log-uniform between these
 _ANGLES = np.deg2rad([0.005, 90.0])
 _FACTORS = np.array([1e-4, 2.0])
@@ -282,6 +284,8 @@ class Trial:
     #: Index of the other frame of an exchange.
     partner: int | None = None
     beam: str = ""
+    #: Other angles that describe the frame as well, in radian.
+    others: tuple = ()
 
     @property
     def total(self):
@@ -356,14 +360,16 @@ class Frame:
         lowest = np.flatnonzero((chi2 <= np.roll(chi2, 1)) & (chi2 <= np.roll(chi2, -1)))
         lowest = lowest[np.argsort(chi2[lowest], kind="stable")][:_MINIMA]
         found = [self._refined(stage, grid[k]) for k in lowest]
-        least = min(value for _, value in found)
-        near = [one for one in found if one[1] < least + _ALIKE]
+        near = [one for one in found if one[1] < min(value for _, value in found) + _ALIKE]
         offset, chi2 = min(near, key=lambda one: abs(one[0]))
         h = np.deg2rad(0.02)
         low, middle, high = self._turned(stage, offset + np.array([-h, 0.0, h]))
         curvature = (low - 2 * middle + high) / h**2 / 2
         error = 1 / np.sqrt(max(curvature, 1.0))
-        return Trial(f"{stage} angle", chi2, _occam(offset, error, _ANGLES), told + offset, error)
+        cost = _occam(offset, error, _ANGLES)
+        far = [(x, y + _occam(x, error, _ANGLES)) for x, y in near if abs(x - offset) > error]
+        others = tuple(told + x for x, total in far if total < chi2 + cost + _AS_PROBABLE)
+        return Trial(f"{stage} angle", chi2, cost, told + offset, error, others=others)
 
     def _turned(self, stage, offsets):
         """Return the sum of squares that each of some angles leaves, in all frames, (n,)."""

@@ -13,7 +13,7 @@ from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
-from astropolcal.gap.problem import OPEN, TOUCHES
+from astropolcal.gap.problem import TOUCHES
 from astropolcal.measurement import Measurement
 from astropolcal.observations.observables import default_observable
 from astropolcal.optics import Perturbation
@@ -161,10 +161,7 @@ class Fitted:
     @cached_property
     def _directions(self):
         """Root of the covariance for unit noise, and directions that data do not determine."""
-        singular, right, scale = self.problem.decomposed(self.model.fit.coefficients)
-        good = singular > OPEN * singular[0]
-        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
-        return right[good] / singular[good, None] / scale, right[~good]
+        return self.problem.directions(self.model.fit.coefficients)
 
     @cached_property
     def covariance(self):

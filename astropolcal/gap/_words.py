@@ -38,6 +38,10 @@ _AMPLITUDES = {
     "direction": "change after moves backwards",
     "move": "change with a move of one radian",
 }
+# what the parameter "right" is of what a detector does, by the kind of its cell: no sum tells a
+# background of one beam from the lamp
+_BEAMS = dict.fromkeys(("nonlinearity", "persistence"), "both beams")
+_BEAMS["background_of_one_beam"] = "right beam, or the left with the other sign"
 
 
 # ---- numbers ---------------------------------------------------------------------------------
@@ -112,6 +116,7 @@ def labels(entry):
     if entry["cell"]:
         kind = entry["cell"]["dependence"].partition(":")[0]
         known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
+        known |= {"right": _BEAMS.get(entry["cell"]["kind"])}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]
 

@@ -8,11 +8,13 @@ says what stays unexplained.
 """
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from astropolcal.exceptions import GapError
+from astropolcal import instruments
+from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
@@ -24,7 +26,7 @@ from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.measurement.datasets import as_tables
 from astropolcal.progress import in_one_thread
-from astropolcal.words import counted, html
+from astropolcal.words import counted, html, listed
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
@@ -293,7 +295,7 @@ def diagnose(
     say = progress or (lambda line: None)
     observations = as_tables(observations)
     library = _library(effects)
-    _check_instruments(observations)
+    check_instruments(calibration, observations)
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
@@ -377,10 +379,17 @@ def _library(effects):
     return [get_effect(name) for name in names]
 
 
-def _check_instruments(observations):
-    named = {o.instrument for o in observations if o.instrument is not None}
-    if len({name.lower() for name in named}) > 1:
-        raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")
+def check_instruments(calibration, observations):
+    """Raise GapError if a calibration, or chains, and datasets are not of one instrument."""
+    stated = {getattr(one, "instrument", None) for one in (calibration, *observations)} - {None}
+    if len({_called(name) for name in stated}) > 1:
+        raise GapError(f"model or datasets are of different instruments: {listed(sorted(stated))}")
+
+
+def _called(name):
+    with suppress(InstrumentError):
+        name = instruments.get(name).name
+    return name.lower()
 
 
 # ---- conclusion --------------------------------------------------------------------------------
@@ -395,16 +404,15 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
-    left_p = improved.p_value
     return Diagnosis(
-        verdict=_verdict(causes, nominal, left_p, selection.courses),
+        verdict=_verdict(causes, nominal, improved.p_value, selection.courses),
         nominal=nominal,
         improved=improved,
         causes=causes,
         scan=selection.scan,
         held_out=[h for h in selection.history if h is not None],
         gap_p_value=nominal.p_value,
-        remainder_p_value=left_p,
+        remainder_p_value=improved.p_value,
         seconds=time.perf_counter() - started,
         frames=frames,
         settings={"unlisted": selection.unlisted},

@@ -20,6 +20,7 @@ from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Tria
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
+from astropolcal.words import listed
 
 __all__ = []
 
@@ -65,7 +66,7 @@ class FrameFault:
     with_: int | None = None
     #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
     value: float | None = None
-    #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
+    #: Its standard error; where other angles do as well, the distance to the farthest of them.
     error: float | None = None
     #: By how much chi-square is lower than without the fault, less what the freedom of size, kind
     #: and frame costs.
@@ -221,7 +222,7 @@ def _of_design(problem, fault, rivals, probability):
 
 def _fault(problem, place, trial, evidence, probability):
     """Return the fault that a trial of a frame is, in the units of the user."""
-    (i, f), told = place, None
+    (i, f), told, others = place, None, np.array(trial.others)
     dataset = problem.datasets[i]
     observations = dataset.observations
     value, error = trial.value, trial.error
@@ -231,6 +232,7 @@ def _fault(problem, place, trial, evidence, probability):
         # where a law turns what the table says into the angle of the optic, its error is added
         if stage in observations.frames.colnames:
             told = float(observations.position(stage)[f])
+        others = np.rad2deg(told + others - stood)
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
     numbers = observations.frames["frame"]
     fault = FrameFault(observations.name, int(numbers[f]), trial.what, place=place)
@@ -239,11 +241,12 @@ def _fault(problem, place, trial, evidence, probability):
         fault.value, fault.error = value, error
     if trial.partner is not None:
         fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
-    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam)}"
+    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others)}"
+    fault.error = float(np.abs(others - value).max()) if others.size else fault.error
     return fault
 
 
-def _words(fault, told, beam):
+def _words(fault, told, beam, others):
     """Return what is wrong with a frame, beside the angle (degree) that its table states."""
     if not fault.what.endswith(" angle"):
         off = None if fault.value is None else f"{100 * abs(fault.value - 1):.2g} %"
@@ -259,8 +262,9 @@ def _words(fault, told, beam):
     # as many digits as tell the two angles apart, and no more than the error is worth
     finest = max(fault.error, abs(fault.value - told) / 30)
     digits = int(np.clip(np.ceil(1 - np.log10(finest)), 1, 4))
-    stood, told = (f"{angle:.{digits}f} deg" for angle in (fault.value, told))
-    return f"its data are those of {name} at {stood}, not at {told} as the table says"
+    stood = listed([f"{angle:.{digits}f}" for angle in (fault.value, *others)], "or") + " deg"
+    words = f"its data are those of {name} at {stood}, not at"
+    return f"{words} {told:.{digits}f} deg as the table says"
 
 
 def _exchanges(place, frames, trials):

@@ -258,8 +258,10 @@ class Model:
     def sizes(self, name):
         """
         Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
+
+        The errors are those of the noise, or of the scatter of the residuals where it is larger.
         """
-        errors = self.problem.errors(self.fit.coefficients)
+        errors = max(1.0, np.sqrt(self.mean_square)) * self.problem.errors(self.fit.coefficients)
         found = {}
         for parameter in self.added[name]:
             slot = self.problem.free.by_name[parameter.name]

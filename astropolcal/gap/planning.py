@@ -284,8 +284,7 @@ def plan(diagnosis, candidates=None):
             # foresees nothing there
             if error.argument != "chain":
                 raise
-    for group in groups:
-        lines.append(_telling_apart(forecast, group, foreseen))
+    lines += [_telling_apart(forecast, group, foreseen) for group in groups]
     if directions[2].shape[1]:
         lines += _fixing(forecast, directions, foreseen)
     return _merged(lines)[:_MOST_LINES]
@@ -311,10 +310,11 @@ def _groups(diagnosis):
 def _telling_apart(forecast, group, foreseen):
     """Return the line on the exposure that tells the members of an alias group apart best."""
     names, recipes, shares = zip(*group, strict=True)
-    weights = np.array(shares) / sum(shares)
+    weights = np.array(shares)
     # what a cell is called says no more than its title
     titles = {e.name: e.title + f" ({e.name})" * (e.kind != "cell") for e, _ in recipes}
-    hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
+    hypotheses = forecast.foreseen(names)
+    now = float(np.sum(weights**2) / weights.sum())
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
     timed = any(Dependence(effect.dependence).kind in _TIMED for effect, _ in recipes)
@@ -380,15 +380,11 @@ def _repetitions(diagnosis):
 
 def _fixing(forecast, directions, foreseen):
     """Return the line on the exposure that fixes what is open among the parameters."""
-    best, n_open = (LEAST_GAIN, None), directions[2].shape[1]
-    for exposure, columns in foreseen:
-        names, gain, count = forecast.fixes(directions, columns)
-        worth = gain / (1 + exposure.effort)
-        if worth > best[0]:
-            best = worth, (exposure, names, gain, count)
-    if best[1] is None:
+    found = [(one, *forecast.fixes(directions, columns)) for one, columns in foreseen]
+    worth = [gain / (1 + one.effort) for one, _, gain, _ in found]
+    if max(worth, default=0.0) <= LEAST_GAIN:
         return []
-    exposure, names, gain, count = best[1]
+    (exposure, names, gain, count), n_open = found[int(np.argmax(worth))], directions[2].shape[1]
     words = (
         f"Take {exposure.words}: fixes {count} of {n_open} open directions of the parameters, the "
         f"clearest that of {' with '.join(names)}, at {_sigmas(gain)} standard deviations"
@@ -558,9 +554,13 @@ def _log_det(factor):
 
 
 def expected(weights, factors):
-    """Return the probability that the true one of several causes is expected to have."""
-    against = np.exp(np.clip(-factors, -700, 50)) @ weights
-    return float(np.sum(weights**2 / against))
+    """
+    Return the probability that the true one of several causes is expected to have.
+
+    What their weights lack of one is that of causes which nothing is known to tell from it.
+    """
+    against = np.exp(np.clip(-factors, -700, 50)) @ weights + max(1 - weights.sum(), 0.0)
+    return float(np.sum(weights**2 / against) / weights.sum())
 
 
 # ---- exposures ---------------------------------------------------------------------------------

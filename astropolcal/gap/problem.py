@@ -421,14 +421,19 @@ class GapProblem:
         _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
         return singular, right, scale
 
-    def errors(self, coefficients):
-        """Return the standard errors of the coefficients, infinite where they are open."""
+    def directions(self, coefficients):
+        """Return a root of the covariance, (k, size), and the directions that are open."""
         singular, right, scale = self.decomposed(coefficients)
         good = singular > OPEN * singular[0]
-        variance = np.sum((right[good] / singular[good, None]) ** 2, axis=0)
-        is_open = np.sum(right[~good] ** 2, axis=0) > TOUCHES**2
+        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
+        return right[good] / singular[good, None] / scale, right[~good]
+
+    def errors(self, coefficients):
+        """Return the standard errors of the coefficients, infinite where they are open."""
+        half, null = self.directions(coefficients)
+        is_open = np.sum(null**2, axis=0) > TOUCHES**2
         prior = np.divide(1, self.tight, out=np.full(self.size, np.inf), where=self.tight > 0)
-        return np.minimum(np.where(is_open, np.inf, np.sqrt(variance) / scale), prior)
+        return np.minimum(np.where(is_open, np.inf, np.linalg.norm(half, axis=0)), prior)
 
 
 def _within(triangle, wanted, low, high, found):

@@ -67,7 +67,8 @@ def changes(diagnosis, causes):
     """
     if not causes or count_runs(diagnosis.improved.problem) < 2:
         return []
-    names, chains = _runs(diagnosis)
+    names = [o.name for o in diagnosis.improved.observations]
+    chains = [leaves(chain) for chain in diagnosis.improved.chains]
     wavelength = 1e3 * diagnosis.improved.problem.wavelength
     found = []
     for cause in causes:
@@ -75,23 +76,11 @@ def changes(diagnosis, causes):
         run = cell and _run_of(cell, names, chains)
         if run is not None:
             brought = _brought(cell, run, names, chains)
-            entry = {
-                "cell": cause["cell"],
-                "dataset": run,
-                "size": cause["size"],
-                "probability": cause["probability"],
-                "significance": cause["significance"],
-                "brought_by": brought,
-            }
+            same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
+            entry = same | {"dataset": run, "brought_by": brought}
             entry["words"] = _sentence(cell, entry, names, wavelength)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
-
-
-def _runs(diagnosis):
-    """Return names and chains of the datasets."""
-    model = diagnosis.improved
-    return [o.name for o in model.observations], [leaves(chain) for chain in model.chains]
 
 
 def _run_of(cell, names, chains):
@@ -134,8 +123,7 @@ def paragraph(content, names, asked=False):
     found = content["changes"]
     if not found:
         quoted = [f'"{name}"' for name in names]
-        words = [f"Nothing changed between {listed(quoted)} that the data can tell."]
-        return words if asked else []
+        return [f"Nothing changed between {listed(quoted)} that the data can tell."] * asked
     words = [one["words"] for one in found[:_MOST]]
     if len(found) > _MOST:
         words.append(f"{len(found) - _MOST} smaller changes are listed below.")
@@ -150,8 +138,7 @@ def paragraph(content, names, asked=False):
         many = f"{len(brought)} of the changes are" if len(brought) > 1 else "One change is"
         words.append(
             f"{many} at or downstream of what only one run has ({listed(list(optics))}): "
-            "that may have "
-            "brought them."
+            "that may have brought them."
         )
     return words
 
@@ -199,6 +186,7 @@ def _size(parameters, wavelength):
             continue
         i = int(np.nanargmax(clear))
         if best is None or clear[i] > best[0]:
-            where = f" at {wavelength[i]:.0f} nm" if values.size == len(wavelength) > 1 else ""
+            one_of = values.size == len(wavelength) > 1 and np.ptp(values) > 0
+            where = f" at {wavelength[i]:.0f} nm" if one_of else ""
             best = (clear[i], factor * values[i], factor * errors[i], unit, where)
     return best and best[1:]

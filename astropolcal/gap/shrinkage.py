@@ -152,22 +152,15 @@ def foreseen(model, groups):
     labels, numbers = groups
     linear = model if isinstance(model, Linear) else model.linear
     problem, tangent, residual = linear.model.problem, linear.tangent, linear.residual
-    sizes = [c.shape for c in problem.channels]
-    found = []
+    found, group, scale = [], [], []
+    for number, channel in zip(numbers, problem.channels, strict=True):
+        group.append([np.where(channel.valid, number, -1)] * 2)
+        # whitened differences are divided by their noise; sums have none of their own here
+        scale.append(np.zeros(channel.shape))
+        scale[-1][channel.told] = channel.sigma[channel.told]
+    group, scale = (np.concatenate([np.ravel(one) for one in each]) for each in (group, scale))
     for i in range(len(labels)):
-        rows, scale, count = [], [], 0
-        for number, channel, shape, segment in zip(
-            numbers, problem.channels, sizes, problem.segments, strict=True
-        ):
-            seen = np.broadcast_to(channel.valid & (number == i), shape)
-            here = np.arange(segment.start, segment.stop).reshape(shape)[seen]
-            rows.append(here)
-            # whitened differences are divided by their noise; sums have none of their own here
-            size = np.zeros(shape)
-            size[channel.told] = channel.sigma[channel.told]
-            scale.append(size[seen])
-            count += seen[0].sum()
-        rows, scale = np.concatenate(rows), np.concatenate(scale)
+        rows = np.flatnonzero(group == i)
         here = tangent[rows]
         # there are fewer parameters than data of a group
         lever, along = np.linalg.eigh(here.T @ here)
@@ -176,9 +169,8 @@ def foreseen(model, groups):
         pull = (here @ along).T @ residual[rows]
         # N (1 - N^T N)^-1 N^T r is what (1 - N N^T)^-1 r has beyond r
         gap = residual[rows] + here @ (along @ pull)
-        found.append(
-            (np.sum((gap * scale) ** 2), np.sum(gap**2) / problem.channels[0].count, count)
-        )
+        whitened = np.sum(gap**2) / problem.channels[0].count
+        found.append((np.sum((gap * scale[rows]) ** 2), whitened, len(rows) // 2))
     return HeldOut.of_rows(labels, found)
 
 

@@ -433,7 +433,7 @@ def frame_coordinate(observations, name):
     if name == "sequence":
         # affine in time, so that a drift has the same parameter whatever the unit of the clock
         passed = time - time.min()
-        return passed / passed.max() if passed.max() > 0 else passed
+        return passed / (passed.max() or 1.0)
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
     if name in MOVES:
@@ -577,4 +577,6 @@ def modulator_states(frames, label):
 
 def _time_or_order(observations):
     times = clock(observations.frames)
-    return np.arange(observations.n_frames, dtype=float) if times is None else times
+    # a date alone is the same in all frames, and says no more than none
+    known = times is not None and np.ptp(times) > 0
+    return times if known else np.arange(observations.n_frames, dtype=float)

@@ -234,7 +234,12 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
     two = [data.observed(meta={"instrument": name}) for name in ("CHARIS", "IRDIS")]
     cases = {
         "too few frames to leave out in groups: 8 in the shortest": (chain, short, {}),
-        "of different instruments: CHARIS, IRDIS": (chain, two, {}),
+        "of different instruments: CHARIS and IRDIS": (chain, two, {}),
+        "model or datasets are of different instruments: CHARIS and GPI": (
+            SimpleNamespace(instrument="GPI"),
+            two[0],
+            {},
+        ),
         "2 chains for 1 datasets": ([chain] * 2, [observed], {}),
         "no effects to ask for; give names, or 'all'": (chain, observed, {"effects": []}),
         "no effect 'beam_gian'.*'beam_gain'": (chain, observed, {"effects": ["beam_gian"]}),

@@ -73,6 +73,15 @@ def test_angle_of_any_size_is_found_with_its_value():
         assert fault.probability > 0.9
 
 
+def test_angles_that_do_as_well_are_told():
+    """Polarized light along the derotator's diagonal sees how far it is off, not on which side."""
+    for error in (2.5, -2.5):
+        (fault,) = found(observed(table(derotator=(1, error))))
+        assert fault.what == "derotator angle"
+        assert abs(fault.value - 45 - error) < fault.error + 0.2, error
+        assert "at 47.477 or 42.523 deg" in fault.words
+
+
 def test_exchanged_frames_are_named_with_each_other():
     for one, other in ((12, 13), (3, 40)):
         faults = found(observed(exchanged(one, other)))

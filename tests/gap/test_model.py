@@ -157,3 +157,13 @@ def test_what_noise_may_hide_holds_in_95_of_100():
     hidden = np.mean([model.fit.chi2 for model in models]) - np.mean(clean)
     assert hidden > 80
     assert sum(model.could_hide() >= hidden for model in models) >= 17
+
+
+def test_errors_of_sizes_are_those_of_the_report():
+    """Also where the residuals are larger than the noise, as they are of a missing optic."""
+    gain = data.with_effect("beam_gain", imbalance=0.003)
+    model = data.fitted(data.observed(gain)).with_effect(get_effect("hwp_encoder_two_lobe"))
+    assert model.mean_square > 1.5
+    for name, (_, errors, _, _) in model.sizes("hwp_encoder_two_lobe").items():
+        told = Fitted(model).sizes("hwp_encoder_two_lobe")[name]["std"]
+        np.testing.assert_allclose(errors, told, rtol=1e-6)

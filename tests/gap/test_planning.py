@@ -118,10 +118,13 @@ def test_time_and_derotator_are_told_apart_by_another_order():
 
 
 def test_the_expected_probability():
-    """Two causes that nothing tells apart stay as they are; what is told apart is sure."""
+    """Two causes that nothing tells apart stay as they are; the others lose what is told apart."""
     weights = np.array([0.7, 0.3])
     assert expected(weights, np.zeros((2, 2))) == pytest.approx(0.58)
-    assert expected(weights, np.array([[0.0, 50.0], [50.0, 0.0]])) == pytest.approx(1.0)
+    apart = np.array([[0.0, 50.0], [50.0, 0.0]])
+    assert expected(weights, apart) == pytest.approx(1.0)
+    # what is not asked about may still be it: the true one of two of 0.4 shares with 0.2
+    assert expected(np.array([0.4, 0.4]), apart) == pytest.approx(0.4 / 0.6)
 
 
 def elliptical(angles):

@@ -329,7 +329,7 @@ def test_runs_of_different_instruments():
     runs = pair()
     runs[0].meta["instrument"] = "CHARIS"
     runs[1].meta["instrument"] = "IRDIS"
-    with pytest.raises(GapError, match="datasets are of different instruments: CHARIS, IRDIS"):
+    with pytest.raises(GapError, match="datasets are of different instruments: CHARIS and IRDIS"):
         diagnose(data.chain(), runs, changes=True)
 
 

@@ -170,6 +170,13 @@ def test_parameters_of_a_cell_have_names_without_its_name():
     own = entry(cell("after:hwp", "rotation", "harmonic:hwp:2"), size=sizes)
     assert _words.labels(own) == ["amplitude of the cosine", "amplitude of the sine"]
     # two optics of one effect are told apart
+    # of one law for both beams the parameter is that of the right one
+    size = {"gap_detector.right": entry()["size"]["g.i"]}
+    for kind, label in (
+        ("nonlinearity", "both beams"),
+        ("background_of_one_beam", "right beam, or the left with the other sign"),
+    ):
+        assert _words.labels(entry(cell("detector", kind, "flux"), size=size)) == [label]
     sizes = dict.fromkeys(("one.size", "other.size"), entry()["size"]["g.i"])
     assert _words.labels(entry(size=sizes)) == ["size of one", "size of other"]
 

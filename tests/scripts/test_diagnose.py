@@ -157,6 +157,9 @@ def test_bad_input(folder, cal, tmp_path, capsys):
     line = complaint(capsys, cal, dark)
     assert "unpolarized.ecsv: its source is 'unpolarized'" in line
     assert "'polarized' only" in line
+    other = tmp_path / "other.ecsv"
+    other.write_text(table.read_text().replace("SCExAO/CHARIS", "irdis"))
+    assert "of different instruments: charis and irdis" in complaint(capsys, cal, other)
     assert "nowhere.ecsv" in complaint(capsys, folder / "nowhere.ecsv")
     assert "mirror" in complaint(capsys, table, "--without", "mirror")
     assert "no parameter 'nonsense'" in complaint(capsys, table, "--free", "hwp.nonsense")

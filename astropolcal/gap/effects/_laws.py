@@ -86,8 +86,8 @@ class WavelengthScale(Effect):
             plate.retardance(context.wavelength * (1 + s) * u.um).to_value(u.rad)
             for s in (step, -step)
         )
-        # d retardance / d ln(wavelength), radian; a shift and a stretch are this times a line
-        slope = (up - down) / (2 * step)
+        # d retardance / d wavelength; a shift and a stretch are this times a line
+        slope = (up - down) / (2 * step * context.wavelength)
         return slope[:, None] * context.basis(1) / np.abs(slope).max()
 
 
