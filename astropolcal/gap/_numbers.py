@@ -41,8 +41,9 @@ class Fitted:
         Return the fitted parameters of an added effect, ready for JSON.
 
         Each is a dictionary of ``value`` and ``std`` (a number, or one per wavelength),
-        ``unit`` and ``limit``, the largest size that is physical. The errors are those
-        of the noise, or of the scatter of the residuals where it is larger.
+        ``unit``, ``limit``, the largest size that is physical, and ``degree``, that of the
+        polynomial in wavelength, None without one. The errors are those of the noise, or of
+        the scatter of the residuals where it is larger.
         """
         found = {}
         for parameter in self.model.added.get(name) or ():
@@ -56,7 +57,10 @@ class Fitted:
             # one open coefficient leaves every value of a law open
             std = np.where(self.is_open[where].any(), np.nan, std / factor)
             size = {"value": _number(value), "std": _number(std), "unit": unit}
-            found[parameter.name] = size | {"limit": float(parameter.canonical_limit / factor)}
+            size |= {"limit": float(parameter.canonical_limit / factor)}
+            # the errors hold if the law has no more freedom than that
+            degree = block.shape[1] - 1 if block.shape[1] < len(block) else None
+            found[parameter.name] = size | {"degree": degree}
         return found
 
     def unit_of(self, name):

@@ -121,7 +121,7 @@ def labels(entry):
     return [one.replace("_", " ") for one in words]
 
 
-def _size(value, std, unit, limit):
+def _size(value, std, unit, limit, degree=None):
     several = isinstance(value, list)
     values, errors = (np.array(one, dtype=float, ndmin=1) for one in (value, std))
     known = is_determined(errors, limit)
@@ -136,6 +136,8 @@ def _size(value, std, unit, limit):
     if low == high and least == most:
         text = f"{middle} +- {errors[0]:.{digits}f}{ends}"
         text += " at every wavelength" if several else ""
+    elif degree is not None:
+        text += f", if it is a polynomial of degree {degree} in wavelength"
     if known.all():
         return text
     return f"{text}; determined at {known.sum()} of {known.size} wavelengths"

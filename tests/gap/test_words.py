@@ -149,7 +149,7 @@ def test_sizes_are_in_units_that_people_use():
     lines = _words.sizes(
         entry(
             size={
-                "a.b": {"value": [1.0, 2.0, 9.0], "std": [0.1, 0.011, 25.0], **known},
+                "a.b": {"value": [1.0, 2.0, 9.0], "std": [0.1, 0.011, 25.0], **known, "degree": 2},
                 "a.c": {"value": [1.0, 2.0], "std": [None, 25.0], **known},
                 "a.long_name": {"value": 0.0123456, "std": 0.000123, **share},
                 "a.e": {"value": [0.01, 0.01], "std": [0.001, 0.001], **share},
@@ -157,8 +157,8 @@ def test_sizes_are_in_units_that_people_use():
         )
     )
     assert lines == [
-        "b: 1.000 to 2.000 deg, median 1.500, errors 0.011 to 0.10 deg; "
-        "determined at 2 of 3 wavelengths",
+        "b: 1.000 to 2.000 deg, median 1.500, errors 0.011 to 0.10 deg, if it is a polynomial of "
+        "degree 2 in wavelength; determined at 2 of 3 wavelengths",
         "c: not determined by these data at any wavelength",
         "long name: 1.235 +- 0.012 %",
         "e: 1.00 +- 0.10 % at every wavelength",
