@@ -117,7 +117,8 @@ def simulate(
     ------
     ParameterError
         If flux, gain, lamp or noise are not positive, too large or of the wrong shape,
-        the chain gives negative flux, the seed is none, or there are no frames.
+        the chain gives negative flux, the seed is none, there are no frames, or the chain
+        has values per wavelength and the wavelengths do not ascend.
     ChainError
         If the position of a stage is missing in ``frames``.
 
@@ -132,6 +133,11 @@ def simulate(
     16
     """
     wavelength, seed = np.atleast_1d(wavelengths_of(wavelength)), check_seed(seed)
+    values = (getattr(leaf, key).size for leaf in leaves(chain) for key in leaf.param_names)
+    if np.any(np.diff(wavelength) <= 0) and max(values, default=1) > 1:
+        raise ParameterError(
+            f"wavelength = {wavelength}: values per wavelength are those of ascending wavelengths"
+        )
     wanted = "a table is needed, such as half_wave_plate_cycles() gives"
     check_type("frames", frames, Table, wanted, ParameterError)
     if not len(frames):

@@ -195,6 +195,15 @@ def test_unphysical_chain_is_refused(frames):
         simulate(chain, 1.6 * u.um, frames)
 
 
+def test_values_per_wavelength_are_those_of_ascending_wavelengths(chain, frames):
+    """As a calibration takes them, whatever the order of the rows."""
+    with pytest.raises(ParameterError, match="ascending"):
+        simulate(chain, WAVELENGTH[::-1], frames)
+    plain = optics.LinearPolarizer() | optics.WollastonPrism()
+    up, down = (simulate(plain, w, frames, noise=False) for w in (WAVELENGTH, WAVELENGTH[::-1]))
+    np.testing.assert_allclose(up.flux_right, down.flux_right[:, ::-1])
+
+
 def test_stage_without_position_is_refused(chain, frames):
     frames.remove_column("hwp")
     with pytest.raises(ChainError, match="stage 'hwp'"):
