@@ -191,8 +191,8 @@ def _clock(frames):
 
 
 def _cells(reduction, k, name):
-    """Return an array of the photometry over the run, (2, F), NaN where a cell failed."""
-    values = np.array([getattr(frame.photometry, name)[:, k] for frame in reduction.frames]).T
+    """Return an array of the photometry over the run, (..., F), NaN where a cell failed."""
+    values = np.array([getattr(frame.photometry, name)[..., k] for frame in reduction.frames]).T
     failed = np.array([bool(frame.photometry.reasons[k]) for frame in reduction.frames])
     # a frame that was masked has numbers, which mean nothing
     return np.where(failed, np.nan, values)
@@ -206,8 +206,10 @@ def _draw_fluxes(top, below, reduction, clock, k):
         top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **look)
     top.set_ylabel(f"flux ({reduction.frames[0].unit})")
     total = flux.sum(axis=0)
-    # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2
-    scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
+    # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2, and both have one background
+    variance = np.sum((flux[::-1] * error) ** 2, axis=0)
+    variance -= 2 * flux.prod(axis=0) * _cells(reduction, k, "covariance")
+    scatter = 2 * np.sqrt(variance.clip(0)) / total**2
     single = (flux[0] - flux[1]) / total
     look = {"fmt": "D", "color": st.GREEN, "ms": 5, "lw": 0, "elinewidth": 1.2}
     below.errorbar(clock, single, scatter, label="single difference", **look)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from matplotlib.figure import Figure
+from pytest import approx
 
 from astropolcal.plotting import reduction
 
@@ -34,6 +35,21 @@ def test_cells_that_failed_have_no_value():
     )
     # at another wavelength the frame is good
     assert np.isfinite(reduction._cells(run, 1, "flux")).all()
+
+
+def test_what_both_beams_share_is_in_the_error_of_a_single_difference():
+    run = SimpleNamespace(frames=[frame()])
+    photometry = run.frames[0].photometry
+    # fluxes 300 and 500, known to 3 and 4, of which 6 are of the common background
+    run.frames[0].unit, photometry.flux = "adu", np.array([[300.0], [500.0]])
+    photometry.variance, photometry.covariance = np.array([[9.0], [16.0]]), np.array([6.0])
+    photometry.reasons = [""]
+    top, below = Figure().subplots(2)
+    reduction._draw_fluxes(top, below, run, np.zeros(1), 0)
+    (segment,) = below.containers[0][2][0].get_segments()
+    slope = 2 * np.array([500.0, -300.0]) / 800.0**2
+    expected = np.sqrt(slope @ [[9.0, 6.0], [6.0, 16.0]] @ slope)
+    assert np.ptp(segment[:, 1]) / 2 == approx(expected)
 
 
 def test_an_image_without_values_says_so():
