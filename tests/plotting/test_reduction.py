@@ -4,8 +4,8 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
-from pytest import approx
 
 from astropolcal.plotting import reduction
 
@@ -49,7 +49,7 @@ def test_what_both_beams_share_is_in_the_error_of_a_single_difference():
     (segment,) = below.containers[0][2][0].get_segments()
     slope = 2 * np.array([500.0, -300.0]) / 800.0**2
     expected = np.sqrt(slope @ [[9.0, 6.0], [6.0, 16.0]] @ slope)
-    assert np.ptp(segment[:, 1]) / 2 == approx(expected)
+    assert np.ptp(segment[:, 1]) / 2 == pytest.approx(expected)
 
 
 def test_an_image_without_values_says_so():
