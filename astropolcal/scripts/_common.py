@@ -499,8 +499,12 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     """
     _check_fixed(fix, free, prior)
     # before the rest: what is out of the model has no parameters to edit
+    known = {leaf.name for chain in chains for leaf in leaves(chain)}
     for name in without:
-        chains = _changed(chains, name, partial(remove_optic, name=name))
+        # an effect of a diagnosis stands between two rotations into the frame of its optic
+        around = [f"{name}_in", f"{name}_out"] if name.startswith("gap_") else []
+        for each in (name, *(other for other in around if other in known)):
+            chains = _changed(chains, each, partial(remove_optic, name=each))
     for name in free:
         for parameter in _parameters(chains, name):
             parameter.fixed = False

@@ -21,6 +21,9 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
+from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects import Context
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.observations import example_table
 from astropolcal.scripts._common import (
     Continued,
@@ -368,6 +371,16 @@ def test_an_optic_that_only_one_chain_has_may_be_taken_out(chains):
     assert edited[1] is chains[1]
     with pytest.raises(ChainError, match="no optic 'nobody' in the chain"):
         edit_chains(chains, without=["nobody"])
+
+
+def test_an_effect_goes_with_the_rotations_around_it(chains):
+    effect = CellEffect(Cell("in:derotator", "retardance_h", "constant"), 0)
+    added = effect.edit(chains, Context(np.array([1.2, 1.6]))).chains
+    names = [[leaf.name for leaf in leaves(chain)] for chain in (chains[0], added[0])]
+    into, own, out_of = (name for name in names[1] if name not in names[0])
+    assert (into, out_of) == (f"{own}_in", f"{own}_out")
+    edited = edit_chains(added, without=[own])
+    assert [leaf.name for leaf in leaves(edited[0])] == names[0]
 
 
 def test_bad_edits(chains):
