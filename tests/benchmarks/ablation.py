@@ -48,6 +48,7 @@ RULES = {
         "selection._NEAR": -1.0,
     },
     "many causes are one that no table has": {"selection._UNLISTED": (0.0, *[0.02] * 8)},
+    "what noise may hide lowers a single cause": {"selection._UNSEEN": (0.0, 0.0)},
     "one course that does as well is in place of them": {
         "selection._ONE_COURSE": 0.0,
         "selection._BETTER_COURSE": 0.0,
