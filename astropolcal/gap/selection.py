@@ -181,9 +181,8 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = courses(base, base) if runs < 2 else []
-        seen = [one for one in seen if one.p_value * len(seen) < REMAINDER]
-        return Selection([], base, first, 0.0, [_errors(base, groups)], _alike_courses(seen))
+        seen = _alike_courses(_real_courses(base, base, runs))
+        return Selection([], base, first, 0.0, [_errors(base, groups)], seen)
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
@@ -198,12 +197,18 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = courses(best.model, base) if runs < 2 else []
+    rivals = _real_courses(best.model, base, runs)
     chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
     told = rivals if max(chances, default=0.0) > _MAY_BE else []
     return Selection(found, best.model, first, unlisted, history, _alike_courses(told))
+
+
+def _real_courses(model, base, runs):
+    """Return the courses that noise does not make, of so many looks; none of several runs."""
+    found = courses(model, base) if runs < 2 else []
+    return [one for one in found if one.p_value * len(found) < REMAINDER]
 
 
 def _alike_courses(found):
