@@ -80,7 +80,7 @@ _MAY_HIDE, _UNSEEN = (0.25, 0.35), (0.0, 0.11)
 _ONE_COURSE, _AS_WELL = 0.65, 1.5
 # and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
 # right, and none of 53 to cells
-_BETTER_COURSE, _BETTER = 0.85, -2.5
+_BETTER_COURSE, _BETTER = 0.85, -2.8
 # from this probability on it is told
 _MAY_BE = 0.3
 # the same where one of several causes is not asked for in every part of the data: 23 of 52
