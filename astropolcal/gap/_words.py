@@ -364,8 +364,8 @@ def _how_large(content):
 def _what_is_left(content):
     if content["verdict"] == "none":
         return (
-            "What is below the noise, or what the parameters absorb entirely, does not show; the "
-            f"noise may hide a gap of {percent(content['hidden_percent'])} % (rms, 95 %)."
+            "What is below the noise, or what the parameters absorb entirely, does not show: a gap "
+            f"of up to {percent(content['hidden_percent'])} % (rms, 95 %)."
         )
     if not content["causes"]:
         return "Nothing should be added to the model before its cause is known."

@@ -175,8 +175,7 @@ class Diagnosis:
     @property
     def hidden_share(self):
         """Share of the gap that what is left does not exclude (95 %), 1 where no cause is."""
-        most = self.improved.could_hide()
-        return most / (most + max(self.nominal.fit.chi2 - self.improved.fit.chi2, 0.0))
+        return self.improved.hidden_share(self.nominal)
 
     @property
     def hidden_percent(self):

@@ -149,6 +149,11 @@ class Model:
         # noncentral chi-square, which is nearly normal: (x - excess)^2 = spread (freedom + 2 x)
         return float(excess + spread + np.sqrt(spread * (2 * excess + spread + freedom)))
 
+    def hidden_share(self, base):
+        """Return the share that this may be of a gap, which ``base`` shows without the causes."""
+        hidden = self.could_hide()
+        return hidden / (hidden + max(base.fit.chi2 - self.fit.chi2, 0.0))
+
     @cached_property
     def linear(self):
         """The model with all of its effects, to first order."""

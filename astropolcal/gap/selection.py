@@ -79,7 +79,7 @@ _MAY_HIDE, _UNSEEN = (0.25, 0.35), (0.0, 0.11)
 # 36 to mechanisms, of whose 68 causes 9 were right
 _ONE_COURSE, _AS_WELL = 0.65, 1.5
 # and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
-# right, and none of 53 to cells
+# right, and none of 53 to cells; of other cells one or another is there
 _BETTER_COURSE, _BETTER = 0.85, -2.8
 # from this probability on it is told
 _MAY_BE = 0.3
@@ -658,8 +658,7 @@ def _unlisted(base, best, stable, instead):
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
         prior = max(prior, _SHAKY)
     elif len(best.chosen) == 1:
-        hidden = best.model.could_hide()
-        hidden /= hidden + max(base.fit.chi2 - best.model.fit.chi2, 0.0)
+        hidden = best.model.hidden_share(base)
         prior = max(prior, float(np.interp(hidden, _MAY_HIDE, _UNSEEN)))
     prior = max(prior, instead)
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))

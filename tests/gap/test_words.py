@@ -275,7 +275,7 @@ def test_every_verdict_has_its_sentence():
         ({"verdict": "unexplained"} | left, "20 % of what is left follows a pattern."),
         (left, "What is left, 30 % of the gap, is more than noise (p < 1e-6): 20 % of it"),
         ({}, "What is left is noise (p = 0.4), which may hide up to 12 % of the gap (95 %)."),
-        ({"verdict": "none", "causes": []}, "the noise may hide a gap of 0.0123 % (rms, 95 %)."),
+        ({"verdict": "none", "causes": []}, "does not show: a gap of up to 0.0123 % (rms, 95 %)."),
         ({"cross_validated": False}, "the frames of the fit"),
         ({"converged": False}, "The nominal fit did not converge"),
         ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),

@@ -475,16 +475,20 @@ def sample(
         # of kept steps
         burn_in=None if burn_in is None else -(-int(burn_in) // thin),
     )
+    _warn(posterior)
+    return posterior
+
+
+def _warn(posterior):
+    """Warn of a chain that has not converged, and of samples that are too narrow."""
+    doubts = [posterior.scatter]
     if not posterior.converged:
         short = posterior.n_times < ENOUGH
-        problem = (
-            f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
-        )
+        problem = f"shorter than {ENOUGH} autocorrelation times" if short else "not converged"
         complaints = "; ".join(posterior.convergence.complaints(posterior.names))
-        warnings.warn(f"the chain {problem}: {complaints}", AstropolcalWarning, stacklevel=2)
-    if narrow:
-        warnings.warn(narrow, AstropolcalWarning, stacklevel=2)
-    return posterior
+        doubts.append(f"the chain is {problem}: {complaints}")
+    for doubt in filter(None, doubts):
+        warnings.warn(doubt, AstropolcalWarning, stacklevel=3)
 
 
 def _narrow(calibration, log_posterior):
