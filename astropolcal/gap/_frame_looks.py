@@ -36,6 +36,8 @@ _NEWTON = 8
 _UNKNOWN = 1e12
 # differences that are wrong for no known reason, wavelength by wavelength
 _ANY = 0.3
+# of fewer wavelengths one is as good as all
+_FEW = 3
 #: Evidence that is the same to so many digits is not ordered by what rounding leaves.
 DIGITS = 6
 _TINY = 1e-6
@@ -281,8 +283,9 @@ class Trial:
     #: Angle in radian, or factor of the beam, and its error; NaN where there is none.
     value: float = np.nan
     error: float = np.nan
-    #: Index of the other frame of an exchange.
+    #: Index of the other frame of an exchange, and of the only wavelength that is off.
     partner: int | None = None
+    bin: int | None = None
     beam: str = ""
     #: Other angles that describe the frame as well, in radian.
     others: tuple = ()
@@ -348,9 +351,28 @@ class Frame:
         degrees = range(self.look.law(self.i).shape[1])
         sides = (1,) if self.single else _BEAMS
         beams = [self.beam(degree, side) for degree in degrees for side in sides]
-        # every wavelength of the frame is off by its own amount
-        width = 1 + (_ANY * self.weight[self.valid]) ** 2
-        return [*stages, *beams, Trial("unknown", 0.0, float(np.log(width).sum()))]
+        # every wavelength of the frame is off by its own amount, or one alone
+        width = np.log1p((_ANY * self.weight) ** 2)
+        unknown = Trial("unknown", 0.0, float(width[self.valid].sum()))
+        return [*stages, *beams, *self.wavelength(width), unknown]
+
+    def wavelength(self, width):
+        """Return the trial in which the data of one wavelength are off, of three or more."""
+        n = int(self.valid.sum())
+        if n < _FEW:
+            return []
+        left = (self.observed - self._plain + self._offset) * self.weight
+        missed, whiten = self._sums
+        # an amount of its own in the differences, and one in the sums, which single beams lack
+        whiten = whiten * (not self.single)
+        seen = np.array([np.diag(self._sight), np.sum(whiten**2, axis=0)])
+        along = np.array([self._sight @ left, whiten.T @ missed])
+        fall = np.divide(along**2, seen, out=np.zeros(seen.shape), where=seen > _TINY).sum(axis=0)
+        best = int(np.argmax(np.where(self.valid, fall, -1.0)))
+        cost = width[best] + np.log1p(_ANY**2 * seen[1, best]) + 2 * np.log(n)
+        return [
+            Trial("one wavelength", self.as_told().chi2 - float(fall[best]), float(cost), bin=best)
+        ]
 
     def angle(self, stage):
         """Return the trial in which a stage stood elsewhere."""

@@ -22,6 +22,8 @@ _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
 _WHERE, _SUMMARY = 5, 24
 # an alias at another place is the same thing if it is this probable against the best
 _SAME = 0.5
+# a cause is one thing, and not one of several, from this share on
+_ONE = 0.9
 # of causes less probable than this the table is enough
 _UNLIKELY = 0.1
 # a share of a signal below this is none
@@ -195,6 +197,12 @@ def title(entry):
     return _title(_alike(entry))
 
 
+def _one_or_like(entry):
+    """Return the title of a cause, and that other things look the same where some do."""
+    like = own_share(entry) < _ONE and others(entry, {})
+    return f"{title(entry)}{' or what looks the same' if like else ''}"
+
+
 def own_share(entry):
     """Return how probable a cause is among its aliases, regardless of its place."""
     return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
@@ -218,7 +226,7 @@ def cause(entry):
 
 def _found(entry):
     chance = share(entry["probability"])
-    if own_share(entry) < _SAME:
+    if own_share(entry) < _ONE and others(entry, {}):
         first = f"{title(entry)} ({share(own_share(entry))})"
         several = listed([first, *others(entry, {})], "or", _NAMED)
         return f"The model lacks one of several things ({chance}): {several}."
@@ -280,6 +288,9 @@ def details(entry, ranks):
 def sentences(content):
     """Return frames to distrust, what causes the gap, how large it is, and what is left."""
     faults = [fault["words"].rstrip(".") for fault in content["frames"]]
+    if len({fault["dataset"] for fault in content["frames"]}) > 1:
+        pairs = zip(content["frames"], faults, strict=True)
+        faults = [f"{fault['dataset']}, {words}" for fault, words in pairs]
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
     rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
     return [words for words in (first, *rest) if words]
@@ -291,7 +302,7 @@ def _what(content):
         return "The model agrees with the measurements: it lacks nothing that these data show."
     # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])
-    names = [f"{title(entry)} ({share(entry['probability'])})" for entry in largest]
+    names = [f"{_one_or_like(entry)} ({share(entry['probability'])})" for entry in largest]
     if verdict != "unexplained":
         nameless = "" if verdict == "named" else ", not all of which have a name"
         many = f"The model lacks {len(causes)} things{nameless}: "
@@ -327,6 +338,7 @@ def _instead(content):
 def where_words(entry, of=None):
     """Return a sentence on where a part of the gap lies; without ``of`` its end."""
     verb = "follows" if entry["kind"] == "pattern" else "lies in"
+    verb = "lies at" if entry["axis"] == "wavelength" else verb
     whole = f"{share(entry['share'])} of {of} " if of else ""
     return f"{whole}{verb} {entry['detail']}"
 

@@ -18,7 +18,7 @@ from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.frames import suspect_frames, without_frames
+from astropolcal.gap.frames import suspect_frames, unknown_angles, without_frames
 from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
@@ -32,6 +32,8 @@ __all__ = ["Cause", "Diagnosis", "diagnose"]
 
 # probabilities from which a cause is named, and from which it is located
 _SURE, _LIKELY = 0.9, 0.5
+# of an alternative beside which nothing is left
+_SURE_SIGN = 0.99
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
 # too large: by the roughness of a large gap, before its causes were known
 _TOO_QUIET, _TOO_PROBABLE = 0.8, 0.999
@@ -301,6 +303,8 @@ def diagnose(
     groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
+    edges = unknown_angles(observations, exchanged[0]) if exchanged else []
+    observations = without_frames(observations, edges)
     say("looking for frames that are not what the table says")
     frames = suspect_frames(base)
     wrong = [fault for fault in frames if fault.what != "lamp"]
@@ -325,7 +329,7 @@ def diagnose(
         say("looking for causes again: they leave less than what was taken for noise")
         nominal = base = _with_noise_of(base, selection)
         selection = select(base, smooth, groups, say, cells=cells, changes=changes)
-    found = _conclude(nominal, base, exchanged, selection, frames, started)
+    found = _conclude(nominal, base, exchanged, selection, edges + frames, started)
     found.settings["changes"] = changes
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)
@@ -399,7 +403,7 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
-    causes = [_exchanged(nominal, base, exchanged, total)] if exchanged else []
+    causes = [_exchanged(nominal, base, improved, exchanged, total)] if exchanged else []
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
@@ -419,12 +423,14 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     )
 
 
-def _exchanged(nominal, base, exchanged, total):
-    """Return the cause that an exchanged optic or sign is."""
+def _exchanged(nominal, base, improved, exchanged, total):
+    """Return the cause that an alternative is, as sure as all causes explain the gap."""
     effect, *others = exchanged
+    excess = improved.fit.chi2 - (improved.problem.n_data - improved.problem.size)
+    sure = _SURE_SIGN * (1 - min(max(excess / total, 0.0), 1.0))
     aliases = [(Candidate(other, None, 0.0, 1, 0.0), 1 / len(exchanged)) for other in others]
     share = (nominal.fit.chi2 - base.fit.chi2) / total
-    return Cause(effect, None, 0.99, aliases, 1 / len(exchanged), 0.0, float(share))
+    return Cause(effect, None, float(sure), aliases, 1 / len(exchanged), 0.0, float(share))
 
 
 def _cause(group, improved, explained, before=None, after=None):

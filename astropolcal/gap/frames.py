@@ -59,8 +59,9 @@ class FrameFault:
     #: The frame's number in the table.
     frame: int
     #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"brightness"``
-    #: of a single beam, ``"unknown"`` where none of these, or more than one, describes it, or
-    #: ``"lamp"`` where only the brightness is off its drift, which does not harm the differences.
+    #: of a single beam, ``"one wavelength"`` where the others are right, ``"unknown"`` where none
+    #: of these, or more than one, describes it, or ``"lamp"`` where only the brightness is off its
+    #: drift, which does not harm the differences.
     what: str
     #: Number of the frame with which it was exchanged.
     with_: int | None = None
@@ -77,6 +78,8 @@ class FrameFault:
     #: Index of the dataset and of the frame, and of that with which it was exchanged.
     place: tuple = field(default=(0, 0), repr=False)
     partner_place: tuple | None = field(default=None, repr=False)
+    #: Index of the only wavelength that is off.
+    bin: int | None = field(default=None, repr=False)
 
     def to_dict(self):
         """Return the fault as JSON holds it (dict)."""
@@ -105,13 +108,27 @@ def suspect_frames(model):
     return found + [fault for fault in _lamp(model) if fault.place not in named]
 
 
+def unknown_angles(observations, effect):
+    """Return the frames whose angle, as an alternative reads it, is in no row of the table."""
+    found = []
+    for i, one in enumerate(observations):
+        f = effect.edge(one)
+        if f is not None:
+            number = int(one.frames["frame"][f])
+            words = f"frame {number}: its angle is in no row of the table"
+            told = {"probability": 1.0, "words": words, "place": (i, f)}
+            found.append(FrameFault(one.name, number, "unknown", **told))
+    return found
+
+
 def without_frames(observations, faults):
     """Mask the frames that are not what the table says."""
     observations = list(observations)
     for fault in faults:
         if fault.what != "lamp":
             i, f = fault.place
-            mask = np.arange(observations[i].n_frames) == f
+            mask = np.zeros((observations[i].n_frames, observations[i].n_bins), dtype=bool)
+            mask[f, slice(None) if fault.bin is None else fault.bin] = True
             reason = f"not as the table says: {fault.what}"
             observations[i] = observations[i].with_mask(mask, reason)
     return observations
@@ -241,12 +258,14 @@ def _fault(problem, place, trial, evidence, probability):
         fault.value, fault.error = value, error
     if trial.partner is not None:
         fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
-    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others)}"
+    fault.bin = trial.bin
+    nm = None if trial.bin is None else observations.wavelength[trial.bin].to_value("nm")
+    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others, nm)}"
     fault.error = float(np.abs(others - value).max()) if others.size else fault.error
     return fault
 
 
-def _words(fault, told, beam, others):
+def _words(fault, told, beam, others, nm):
     """Return what is wrong with a frame, beside the angle (degree) that its table states."""
     if not fault.what.endswith(" angle"):
         off = None if fault.value is None else f"{100 * abs(fault.value - 1):.2g} %"
@@ -254,6 +273,7 @@ def _words(fault, told, beam, others):
             "exchanged": f"its data are those of frame {fault.with_}, and the other way round",
             "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
             "brightness": f"its brightness is off that of its group by {off}",
+            "one wavelength": f"its data at {nm or 0:.0f} nm are off, those at others are not",
             "lamp": f"the lamp is off its drift by {off}",
             "unknown": "its differences fit no angle of a stage and no factor of a beam",
         }[fault.what]

@@ -18,6 +18,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
+from astropolcal.gap.effects._laws import Misread
 from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
@@ -47,6 +48,8 @@ _WRONG_SIGN = 0.02
 _WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
 # an alternative must lower the residuals to this share, and those within a tenth are aliases
 _FAR_BETTER, _ALIKE = 0.5, 1.1
+# one that leaves more than this share is no answer before the others were tried
+_SETTLED = 0.25
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
 _FEW = 3
@@ -464,23 +467,28 @@ def starting_model(calibration, observations, library, say):
     made = nominal_calibration(chains, observations)
     if _may_be_wrong(made):
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
-        found = _tried(chains, observations, discrete, say)
-        if found and found[0][0] < _FAR_BETTER * _misfit(made):
+        misfit, found = _misfit(made), []
+        # tables are seldom misread: that is asked where signs and reflections leave much
+        for misread in (False, True):
+            if not found or found[0][0] > _SETTLED * misfit:
+                some = [e for e in discrete if isinstance(e, Misread) is misread]
+                found = _tried(chains, observations, some, say, found)
+        if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
             edited = found[0][1].edit(chains, _context(observations)).chains
             best = nominal_calibration(edited, observations)
-            if _misfit(best) < _FAR_BETTER * _misfit(made):
+            if _misfit(best) < _FAR_BETTER * misfit:
                 return _with_alternative(observations, edited, made, best, found)
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
 
 
-def _tried(chains, observations, effects, say):
-    """Return misfit and effect of every alternative at a few wavelengths, best first."""
+def _tried(chains, observations, effects, say, known):
+    """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
     if not effects:
-        return []
+        return known
     few, context = thinned(chains, observations, _FEW), _context(observations)
-    found = []
+    found = list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
         trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
@@ -513,12 +521,17 @@ def _may_be_wrong(calibration):
 
 def _with_alternative(observations, edited, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
+    least, effect = found[0]
+    edges = [effect.edge(o) for o in observations]
+    observations = [
+        o if f is None else o.with_mask(np.arange(o.n_frames) == f, "its angle is in no row")
+        for o, f in zip(observations, edges, strict=True)
+    ]
     model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)
     residual = problem.residual(problem.start)
     nominal = Model(problem, Fit(problem.start, float(residual @ residual), False))
-    least, effect = found[0]
     model.added[effect.name] = []
     return nominal, model, [effect, *(o for misfit, o in found[1:] if misfit < _ALIKE * least)]
 

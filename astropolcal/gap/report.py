@@ -21,6 +21,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import plain
 from astropolcal.gap import _numbers, _words, runs
+from astropolcal.gap.effects._laws import Misread
 from astropolcal.gap.planning import plan
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
@@ -35,6 +36,8 @@ _NARROW, _FINE, _TITLE = 4.2, 180, 42
 # pixels of a page to an inch
 _CSS = 96
 _MOST_SCORES = 8
+# a wavelength that has this share of the gap has it alone
+_ALONE = 0.8
 # what the JSON of a diagnosis, of its causes and of their effects has as it is
 _OWN = ("verdict", "seconds", "noise_floor_percent", "gap_p_value", "remainder_p_value")
 _GAPS = ("gap_before_percent", "gap_after_percent")
@@ -87,6 +90,7 @@ def _worked_out(diagnosis):
     crossed, nominal, improved = bool(diagnosis.held_out), diagnosis.nominal, diagnosis.improved
     # a model with the wrong parity is not worth a fit, and so has no prediction
     exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
+    misread = any(isinstance(cause.effect, Misread) for cause in diagnosis.causes)
     same = improved is nominal
     before = _numbers.accuracies(nominal, crossed and not exchanged)
     after = before if same else _numbers.accuracies(improved, crossed)
@@ -110,12 +114,13 @@ def _worked_out(diagnosis):
         "converged": bool(exchanged or nominal.fit.converged),
         "cross_validated": crossed,
         "shrinkage_percent": _shrinkage(diagnosis, exchanged),
-        "double_difference": _double(fitted, before, after),
+        # frames that a misread table pairs are no double difference
+        "double_difference": None if misread else _double(fitted, before, after),
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
-        "where": [*_courses(diagnosis), *locate(nominal)],
-        "where_left": [] if same or noisy else locate(improved),
+        "where": _where(diagnosis),
+        "where_left": [] if same or noisy else _located(improved),
         "left_share": 0.0 if noisy else left,
         "left_share_limit": diagnosis.hidden_share,
         "hidden_percent": diagnosis.hidden_percent,
@@ -133,6 +138,7 @@ def _worked_out(diagnosis):
     names = [o.name for o in improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
+    words += ["Correct the angles in the table, and calibrate with that."] if misread else []
     return plain(content | {"sentences": words})
 
 
@@ -141,6 +147,22 @@ def _nominal(model):
     chains = dict.fromkeys(" | ".join(leaf.name for leaf in leaves(c)) for c in model.chains)
     free = ", ".join(slot.name for slot in model.problem.free.slots)
     return f"{'; '.join(chains)}. Free: {free}"
+
+
+def _where(diagnosis):
+    """Return where the gap lies, behind what may be it unless one wavelength has nearly all."""
+    found = _located(diagnosis.nominal)
+    # what is at one wavelength is no perturbation with a law in wavelength
+    alone = diagnosis.verdict == "unexplained" and found and found[0]["axis"] == "wavelength"
+    return found if alone else [*_courses(diagnosis), *found]
+
+
+def _located(model):
+    """Return where the gap of a model lies, a single wavelength that has nearly all of it first."""
+    nm = [f"{nm:.0f} nm" for nm in 1000 * model.problem.wavelength]
+    found = locate(model)
+    alone = [one for one in found if one["detail"] in nm and one["share"] > _ALONE]
+    return [*alone, *(one for one in found if one not in alone)]
 
 
 def _courses(diagnosis):

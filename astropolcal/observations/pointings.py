@@ -437,13 +437,15 @@ def frame_coordinate(observations, name):
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
     if name in MOVES:
-        angle = observations.position(name.rpartition("_")[0])
+        stage, _, what = name.rpartition("_")
+        angle = observations.position(stage)
         order, out = np.argsort(time, kind="stable"), np.zeros_like(angle)
         steps = np.diff(angle[order], prepend=angle[order[:1]])
         # a stage that stays where it is was last moved as before
         last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
-        # how far, or whether it was backwards
-        out[order] = steps if name.endswith("_move") else steps[last] < 0
+        # whether it was backwards, or how far
+        found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
+        out[order] = found[what]
         return out
     if name.endswith("_rate"):
         stage = name.removesuffix("_rate")

@@ -18,8 +18,11 @@ FLUXES = ("flux", "total_flux", "previous_flux")
 #: By how much an angle changes from one frame to the next.
 RATES = ("parallactic_rate", "derotator_rate")
 
-#: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
-MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
+#: The last move of a stage: 1 where it went backwards, else 0; how far, and how far the next one
+#: goes, in radian.
+MOVES = tuple(
+    f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move", "next")
+)
 
 
 #: What laws of parameters depend on beside the stages, with its unit: the moment as Modified

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Verdicts: on planted effects and cells, on none, on wrong frames and on bad input."""
 
+import warnings
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -13,7 +14,7 @@ from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.chain import insert_optic
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
@@ -175,6 +176,65 @@ def test_a_wrong_sign_is_found(name, effect):
     found = diagnose(setup.nominal, observations, **QUICK)
     assert found.causes[0].effect.kind == "discrete"
     assert effect in names(found.causes[0])
+
+
+@pytest.mark.slow
+def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
+    right = data.observed(flux=1e7)
+    n = right.n_bins
+    late, early = (lambda x: np.r_[x[:n], x[:-n]]), (lambda x: np.r_[x[n:], x[-n:]])
+    mistakes = {
+        "hwp_late": {"hwp": late},
+        "angles_early": {"hwp": early, "derotator": early},
+        "hwp_doubled": {"hwp": lambda x: 2 * x},
+    }
+    for name, columns in mistakes.items():
+        table = right.to_table()
+        for key, change in columns.items():
+            table[key] = change(table[key])
+        wrong = Observations.from_table(table)
+        with warnings.catch_warnings():
+            # one row is lost, and with it a pair of frames
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            found = diagnose(data.chain(), wrong, **QUICK, cells=False)
+        assert found.verdict == "named"
+        assert names(found.causes[0]) == [name]
+        content = to_dict(found)
+        assert content["sentences"][-1].startswith("Correct the angles in the table")
+        # frames that such a table pairs are no double differences
+        assert content["double_difference"] is None
+        edge = {"hwp_late": wrong.n_frames - 1, "angles_early": 0}.get(name)
+        assert [fault.frame for fault in found.frames] == ([] if edge is None else [edge])
+
+
+@pytest.mark.slow
+def test_an_alternative_beside_which_much_is_left_is_not_sure():
+    """Of the beams, exchanged in most of the run, an alternative explains no more than a part."""
+    right = data.observed(flux=1e7)
+    table = right.to_table()
+    late = np.arange(len(table)) > len(table) / 4
+    for key in ("", "_err"):
+        one, other = table[f"flux_right{key}"].copy(), table[f"flux_left{key}"].copy()
+        table[f"flux_right{key}"] = np.where(late, other, one)
+        table[f"flux_left{key}"] = np.where(late, one, other)
+    found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
+    assert found.verdict == "unexplained"
+    assert found.causes[0].effect.kind == "discrete"
+    assert found.causes[0].probability < 0.9
+
+
+def test_a_wavelength_that_has_the_gap_alone_comes_first():
+    rng, table = np.random.default_rng(3), data.observed(flux=1e7).to_table()
+    nm = np.round(table["wavelength"].to_value(u.nm))
+    table["flux_right"] = table["flux_right"] * np.where(
+        nm == nm[3], rng.normal(1, 0.03, len(nm)), 1
+    )
+    found = diagnose(data.chain(), Observations.from_table(table), **QUICK)
+    assert found.verdict == "unexplained"
+    content = to_dict(found)
+    assert content["sentences"][0].endswith(f"lies at {nm[3]:.0f} nm.")
+    # not a perturbation with a law in wavelength
+    assert all(one["axis"] != "course" for one in content["where"])
 
 
 @pytest.mark.slow

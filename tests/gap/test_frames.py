@@ -97,6 +97,20 @@ def test_beam_that_was_off_in_one_frame():
         assert abs(fault.value - factor) < 5 * fault.error
 
 
+def test_datum_of_one_wavelength_that_was_off():
+    right = observed()
+    for frame, k, factor, beam in ((30, 2, 1.1, "right"), (7, 0, 0.97, "left")):
+        table = right.to_table()
+        here = (table["frame"] == frame) & (table["bin"] == right.bin[k])
+        table[f"flux_{beam}"][here] *= factor
+        (fault,) = harmful(found(Observations.from_table(table, name="lamp")))
+        assert (fault.frame, fault.what) == (frame, "one wavelength")
+        assert f"at {right.wavelength[k].to_value(u.nm):.0f} nm" in fault.words
+        # the others of the frame are kept
+        (kept,) = without_frames([right], [fault])
+        assert np.argwhere(kept.mask).tolist() == [[frame, k]]
+
+
 def test_clean_frames_are_not_accused():
     assert not any(found(observed(seed=seed)) for seed in range(6))
 

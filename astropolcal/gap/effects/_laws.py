@@ -403,13 +403,16 @@ class Alternative(Effect):
     #: Function of chain, roles, the optic and the law of its tracking that changes the chain.
     change = None
 
-    def __init__(self, name, title, words, role, change, shows, **settings):
+    def __init__(self, name, title, words, role, change=None, shows=None, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role
         super().__init__(name, title, where, words=words, change=change, shows=shows, **settings)
 
     def cells(self, chains):
         """Return none: an alternative is not a perturbation."""
         return ()
+
+    def edge(self, observations):
+        """Return the index of the frame of which the alternative knows no angle: None."""
 
     def edit(self, chains, context):
         """Return the changed chains; nothing is added that could be fitted."""
@@ -426,6 +429,36 @@ class Alternative(Effect):
                 chain = self.change(chain, own, roles=roles, law=law, label=self.label)
             edited.append(chain)
         return Edit(edited, [])
+
+
+class Misread(Alternative):
+    """Angles of stages that are not those of the table; asked for where no other alternative is."""
+
+    reference = "the writing of tables; no paper is known"
+
+    def __init__(self, name, title, words, role, shows, stages, what, rate):
+        super().__init__(name, title, words, role, shows=shows)
+        #: The stages, what of them their optics are turned by (nothing is their angle, else its
+        #: last or next move), and by how much of it.
+        self.stages, self.what, self.rate = stages, what, rate
+
+    def applies_to(self, roles):
+        """Return whether there are optics on all of the stages."""
+        stages = {leaf.stage for leaf in roles.leaves}
+        return super().applies_to(roles) and stages.issuperset(self.stages)
+
+    def edge(self, observations):
+        """Return the index of the frame whose angle is in no row of its table, or None."""
+        find = {"_move": np.argmin, "_next": np.argmax}.get(self.what)
+        return find and int(find(observations.position("sequence")))
+
+    def change(self, chain, optic, *, roles, label, **_):
+        """Return a chain with all optics on the stages turned."""
+        for leaf in roles.leaves:
+            if leaf.stage in self.stages:
+                rate = self.rate * leaf.stage_sign
+                chain = geared(chain, leaf, leaf.stage + self.what, rate, label)
+        return chain
 
 
 def flipped_before(chain, optic, *, label, **_):
@@ -463,22 +496,27 @@ def turned_by(degrees):
     return change
 
 
+def geared(chain, optic, stage, rate, label):
+    """Return a chain in which an optic is turned by a rate times the position of a stage more."""
+    # rotators before and behind turn the optic without turning the light
+    for side, sign in {"before": 1, "after": -1}.items():
+        turn = optics.DriftRotator(mount=stage, name=f"{label}_{optic.name}_{stage}_{side}")
+        # a whole number of turns included
+        turn.rate.bounds = (None, None)
+        turn.rate = sign * rate * u.rad
+        turn.rate.fixed = True
+        chain = insert_optic(chain, turn, **{side: optic.name})
+    return chain
+
+
 def following(*factors):
     """Return what multiplies the factors of parallactic angle and altitude in a plate's law."""
 
     def change(chain, plate, *, law, label, **_):
         for stage, factor, old in zip(("parallactic", "altitude"), factors, law, strict=True):
             # a law without this angle cannot have its sign wrong
-            if factor * old == old:
-                continue
-            # rotators before and behind turn the plate without turning the light
-            for side, sign in {"before": 1, "after": -1}.items():
-                turn = optics.DriftRotator(mount=stage, name=f"{label}_{stage}_{side}")
-                # a whole number of turns included
-                turn.rate.bounds = (None, None)
-                turn.rate = sign * (factor - 1) * old * u.rad
-                turn.rate.fixed = True
-                chain = insert_optic(chain, turn, **{side: plate.name})
+            if factor * old != old:
+                chain = geared(chain, plate, stage, (factor - 1) * old, label)
         return chain
 
     return change

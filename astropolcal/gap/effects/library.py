@@ -474,6 +474,38 @@ def _followed(name, title, shows, *factors, needs="parallactic"):
     )  # fmt: skip
 
 
+_STAGES = {"hwp": ("half-wave plate", "plate"), "derotator": ("derotator", "derotator")}
+
+
+def _misread(name, title, shows, rate, what, *stages):
+    """Return angles of stages that are not those of the table, but a function of them."""
+    words, role = _STAGES[stages[0]]
+    of = " and ".join(_STAGES[stage][0] for stage in stages)
+    return laws.Misread(
+        name, title.format(of), f"stage of the {words}", role, shows, stages, what, rate
+    )
+
+
+# a table that is a frame ahead has the angle before the last move, a late one that after the next
+_MISREAD = [
+    *(
+        _misread(
+            f"{name}_{when}", f"angle of the {{}} that stands one frame too {when} in the table",
+            "differences of all frames before and after a move", rate, what, *stages,
+        )
+        for name, stages in {"hwp": ["hwp"], "derotator": ["derotator"], "angles": _STAGES}.items()
+        for when, rate, what in (("early", -1.0, "_move"), ("late", 1.0, "_next"))
+    ),
+    *(
+        _misread(
+            f"{stage}_{name}", f"angle of the {{}} that is {words} in the table",
+            "everywhere: the polarization turns at another rate", rate, "", stage,
+        )
+        for name, words, rate in (("doubled", "twice as large", -0.5), ("halved", "halved", 1.0))
+        for stage in _STAGES
+    ),
+]  # fmt: skip
+
 _ALTERNATIVES = [
     laws.Alternative(
         "mirror_flip",
@@ -509,6 +541,7 @@ _ALTERNATIVES = [
               "four times the altitude", 1.0, -1.0, needs="altitude"),
     _followed("hwp_not_tracking", "does not move between the commands",
               "parallactic angle and altitude", 0.0, 0.0),
+    *_MISREAD,
 ]  # fmt: skip
 
 #: All effects, by the place where they act.
