@@ -191,7 +191,7 @@ def _run(argv):
 
     with warnings.catch_warnings():
         # a user has no use for file and line of our code
-        warnings.showwarning = _show_warning
+        warnings.showwarning = partial(_show_warning, set())
         # leap seconds to come: what matters of them is said once, where angles are computed
         warnings.filterwarnings("ignore", message="ERFA function")
         try:
@@ -223,11 +223,15 @@ def _one_line(message):
     return one_line(str(message), None)
 
 
-def _show_warning(message, category, filename, lineno, file=None, line=None):
+def _show_warning(said, message, *_, **__):
     from astropolcal.progress import clear
 
-    clear()
-    print(f"astropolcal: warning: {_one_line(message)}", file=sys.stderr)
+    words = _one_line(message)
+    # several steps of a command read the same table
+    if words not in said:
+        said.add(words)
+        clear()
+        print(f"astropolcal: warning: {words}", file=sys.stderr)
 
 
 if __name__ == "__main__":
