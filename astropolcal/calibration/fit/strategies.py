@@ -227,15 +227,12 @@ def search_branches(problem, vector, origin=None):
     return best, moved
 
 
-def _turned(wavelength, phases, low, high):
-    """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
-    found = np.full(len(phases), np.nan)
-    for i in range(1, len(phases) - 1):
-        beside = np.interp(wavelength[i], wavelength[[i - 1, i + 1]], phases[[i - 1, i + 1]])
-        off = abs(phases[i] - beside)
-        for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
-            if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
-                found[i] = other
+def _turned(beside, phases, low, high):
+    """Return phases with the other sign where those beside them say so, NaN elsewhere."""
+    found, off = np.full(len(phases), np.nan), np.abs(phases - beside)
+    for other in -phases + 2 * np.pi * np.array([[-1], [0], [1]]):
+        good = (off > _STICKS_OUT) & (np.abs(other - beside) < off / 4)
+        found = np.where(good & (low <= other) & (other <= high), other, found)
     return found
 
 
@@ -243,7 +240,7 @@ def undecided_signs(measurement):
     """Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
 
     That is where the other sign, other phases of the wavelength refitted, is less than three
-    standard deviations worse. What fits exactly as well is a mirror solution anyway.
+    standard deviations worse, or better. What fits exactly as well is a mirror solution anyway.
     """
     problem = BinProblem(measurement, measurement.weighting)
     vector, found = measurement.vector(), []
@@ -261,7 +258,8 @@ def undecided_signs(measurement):
         moved = np.abs(np.remainder(trial[places] - vector[places] + np.pi, 2 * np.pi) - np.pi)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = new / costs
-            close = (ratio > 1 + _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
+            # which may as well fit a little better
+            close = (np.abs(ratio - 1) > _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
         bins = np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0))
         for i in bins:
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
@@ -465,34 +463,43 @@ def _descend(measurement, weighting, fitter, search, options, origin, is_searche
         if not moved.any():
             break
         measurement.stand_at(better)
-    return _smoothed(measurement, weighting, fitter, outcome) if search else (outcome, weighting)
+    how = fitter, outcome, origin
+    return _smoothed(measurement, weighting, *how) if search else (outcome, weighting)
 
 
-def _smoothed(measurement, weighting, fitter, outcome):
+def _smoothed(measurement, weighting, fitter, outcome, origin):
     """
     Fit again with single wavelengths in the branch of their neighbours, if nearly as good.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
-    well. Any error of the model then decides between them; their neighbours tell which is true.
+    well. Any error of the model then decides between them; their neighbours tell which is true. At
+    the ends of the spectrum the start does, if the data do not tell.
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
     start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
-    for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
+    lam, inner = measurement.wavelength, slice(1, -1)
+    for row, low, high in problem.main_retardances():
         where = problem.elements[row]
-        turned = _turned(measurement.wavelength, found[where], low, high)
+        beside = origin[where]
+        for i in range(1, problem.n_bins - 1):
+            beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], found[where[[i - 1, i + 1]]])
+        turned = _turned(beside, found[where], low, high)
         start[where] = np.where(np.isfinite(turned), turned, found[where])
         moved |= np.isfinite(turned)
     if not moved.any():
         return outcome, weighting
     before, (start, costs) = problem.costs(found), problem.polish(start)
-    moved &= costs < _FAR_WORSE * before
+    worth = np.exp(_UNDECIDED / problem._present.sum(axis=1))
+    far = worth.copy()
+    worth[inner], far[inner] = _WORTH, _FAR_WORSE
+    moved &= costs < far * before
     if not moved.any():
         return outcome, weighting
     best = found.copy()
     best[problem.elements[:, moved]] = start[problem.elements[:, moved]]
     measurement.stand_at(best)
     again = run(measurement, weighting, fitter)
-    if np.all(problem.costs(measurement.vector())[moved] < _WORTH * before[moved]):
+    if np.all(problem.costs(measurement.vector())[moved] < (worth * before)[moved]):
         return again
     measurement.stand_at(found)
     return outcome, weighting
