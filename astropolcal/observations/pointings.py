@@ -30,7 +30,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import MOVES, PLACES
+from astropolcal.optics.positions import MOVES, PLACES, finite_position
 from astropolcal.units import angle_to_rad, mjd_of, plain_number
 from astropolcal.words import check_choice, check_type
 
@@ -396,16 +396,7 @@ def location_of(site):
 
 def horizontal(altitude, parallactic):
     """Return altitude and parallactic angle in radian, refusing what no star can have."""
-    altitude, parallactic = (
-        angle_to_rad(angle, name)
-        for name, angle in (("altitude", altitude), ("parallactic", parallactic))
-    )
-    # beyond the zenith by a rounding error is allowed
-    bad = ~((altitude > 0) & (altitude <= np.pi / 2 + 1e-9))
-    if np.any(bad):
-        shown = np.rad2deg(np.ravel(altitude)[np.ravel(bad)][0])
-        raise ObservationError(f"altitude = {shown:.4g} deg; allowed is above 0 to 90 deg")
-    return altitude, parallactic
+    return finite_position(altitude, "altitude"), angle_to_rad(parallactic, "parallactic")
 
 
 # ---- other quantities of a frame -----------------------------------------------------------------
