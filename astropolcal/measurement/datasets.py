@@ -290,7 +290,10 @@ def _positions(chain, observations, positions):
 
 
 def _columns(observations, chain):
-    return {stage: observations.position(stage) for stage in stages(chain)}
+    # where the true angle of a stage is known, it is that at which it stands
+    known, found = observations.frames.colnames, stages(chain)
+    true = {stage: f"{stage}_true" for stage in found if f"{stage}_true" in known}
+    return {stage: observations.position(true.get(stage, stage)) for stage in found}
 
 
 def _node_weights(positions, observations):
