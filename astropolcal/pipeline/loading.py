@@ -59,6 +59,9 @@ class SystemMueller:
 
     `LoadedCalibration.system_mueller` makes it. The errors are worked out when they are asked for,
     so that an index, ``matrices[:100]``, gives those of some frames without those of the others.
+    They are those of the calibrated parameters: the error of the model that the summary of a
+    calibration counts (``fit["model_error"]``) is one of q and u, not of an element; ``correct``
+    adds it.
 
     Attributes
     ----------
@@ -393,7 +396,7 @@ class LoadedCalibration:
             was not stated to `load` either, or the instrument has changed in between. Positions
             are taken for what they are, unless a date was stated.
         ObservationError
-            If the header lacks an angle.
+            If the header lacks an angle, or an altitude is not above 0 to 90 deg.
         ChainError, ParameterError
             If a position is missing, the optics in the beam are ambiguous or lacking.
         WavelengthRangeError
