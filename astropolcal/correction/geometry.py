@@ -102,7 +102,7 @@ def _resampled(image, matrix, offset, shape, order):
     image, offset = _cropped(image, matrix, offset, shape)
     flat = image.reshape(-1, *image.shape[-2:])
     bad = ~np.isfinite(flat)
-    filled = np.where(bad, 0.0, flat) if bad.any() else flat
+    filled = _filled(flat, bad, order) if bad.any() else flat
     out = _interpolated(filled, matrix, offset, shape, order)
     if bad.any():
         # planes mostly lack the same pixels
@@ -118,6 +118,23 @@ def _resampled(image, matrix, offset, shape, order):
     ):
         out[:, (place < -slack) | (place > last + slack)] = np.nan
     return out.reshape(*image.shape[:-2], *shape)
+
+
+def _filled(planes, bad, order):
+    """Return planes whose missing pixels continue their neighbours, so that no spline rings."""
+    from scipy.ndimage import gaussian_filter
+
+    def smooth(values):
+        return gaussian_filter(np.where(bad, 0.0, values), [0, 1, 1], mode="constant") / weight
+
+    filled = np.where(bad, 0.0, planes)
+    if order > 1:
+        weight = gaussian_filter((~bad).astype(float), [0, 1, 1], mode="constant")
+        weight = np.where(weight > 0, weight, np.inf)
+        # twice, which is exact also where an image is curved
+        once = smooth(filled)
+        filled = np.where(bad, once + smooth(filled - once), filled)
+    return filled
 
 
 def _interpolated(planes, matrix, offset, shape, order):
