@@ -233,8 +233,8 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
 def _mirrored(calibration):
     """Say which other solutions of the calibration, as good as it, no systematic error counts."""
     mirrors = getattr(getattr(calibration, "identifiability", None), "mirrors", ())
-    told = (words for words in mirrors if "tell the sign" in words)
-    return [f"systematic errors do not count another solution: {words}" for words in told]
+    words = "systematic errors do not count another solution: {}"
+    return [words.format(one) for one in mirrors if "tell the sign" in one]
 
 
 def _chain_at(calibration, frames, chain, **when):

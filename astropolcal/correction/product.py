@@ -112,8 +112,8 @@ def _axes(header, corrected):
         # milliarcsecond to degree
         step = corrected.pixel_scale / 3.6e6
         # offsets from the star, not coordinates on the sky
-        signs = (-1 if corrected.north_up else 1, 1)
-        for axis, name, sign in zip((1, 2), ("XOFFSET", "YOFFSET"), signs, strict=True):
+        to_right = -1 if corrected.north_up else 1
+        for axis, name, sign in ((1, "XOFFSET", to_right), (2, "YOFFSET", 1)):
             header[f"CTYPE{axis}"] = (name, "from the star" + (", to the east" if sign < 0 else ""))
             header[f"CUNIT{axis}"] = "deg"
             # FITS counts pixels from one
@@ -153,8 +153,7 @@ def _errors(corrected):
     if systematic is not None:
         factor = systematic.factor
         # an array of no directions cannot be stored
-        factor = factor if len(factor) else np.zeros((1, *factor.shape[1:]))
-        hdu = _image("SYSFACT", factor)
+        hdu = _image("SYSFACT", factor if len(factor) else np.zeros((1, *factor.shape[1:])))
         hdu.header["COMMENT"] = "Change of the Stokes vector (axis 2) for one sigma along each"
         hdu.header["COMMENT"] = "direction (axis 4), per unit of the true one (axis 1)."
         hdu.header["SYSMETH"] = systematic.method
@@ -215,9 +214,7 @@ def _read(hdus):
     resampling = _stated(header, "RESAMPLE", float) if "RESAMPLE" in header else 1.0
     if not resampling > 0:
         raise ValueError(f"RESAMPLE = {resampling}; a number above zero is needed")
-    place = None
-    if "STARX" in header:
-        place = tuple(_stated(header, key, float) for key in ("STARX", "STARY"))
+    place = tuple(_stated(header, key, float) for key in ("STARX", "STARY") if "STARX" in header)
     return {
         "components": "".join(StokesCoord(codes).symbol),
         "wavelength": np.asarray(table["wavelength"], dtype=float) * table["wavelength"].unit,
@@ -232,7 +229,7 @@ def _read(hdus):
         "observable": _stated(header, "OBSERVBL", str),
         "unit": unit,
         "north_up": _stated(header, "NORTHUP", bool),
-        "centre": place,
+        "centre": place or None,
         "pixel_scale": _stated(header, "PIXSCALE", float) if "PIXSCALE" in header else None,
         "resampling": resampling,
         "provenance": provenance,

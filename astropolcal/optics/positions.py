@@ -53,10 +53,10 @@ def finite_position(value, name, stage=None):
     position = to_unit(value, PLACES.get(stage) if stage in COORDINATES else u.rad, name)
     if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
-    if stage == "altitude":
+    if stage == "altitude" and position.size:
+        worst = position.flat[np.argmax(np.abs(position - np.pi / 4))]
         # beyond the zenith by a rounding error is allowed
-        bad = ~((position > 0) & (position <= np.pi / 2 + 1e-9))
-        if np.any(bad):
-            shown = np.rad2deg(position[bad][0])
-            raise ObservationError(f"altitude = {shown:.4g} deg; allowed is above 0 to 90 deg")
+        if not 0 < worst <= np.pi / 2 + 1e-9:
+            shown = f"altitude = {np.rad2deg(worst):.4g} deg"
+            raise ObservationError(f"{shown}; allowed is above 0 to 90 deg")
     return position

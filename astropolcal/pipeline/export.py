@@ -183,17 +183,15 @@ def _plain(table):
     for beam in _BEAMS:
         value = np.asarray(table[f"mueller_{beam}"])
         errors = np.sqrt(np.diagonal(np.asarray(table[f"cov_{beam}"]), axis1=1, axis2=2))
-        for place in range(16):
-            i, j = divmod(place, 4)
+        for i, j in np.ndindex(4, 4):
             plain[f"{beam}_{i}{j}"] = value[:, i, j]
-            plain[f"{beam}_{i}{j}_err"] = errors[:, place]
+            plain[f"{beam}_{i}{j}_err"] = errors[:, 4 * i + j]
     plain.meta = {key: entry[0] for key, entry in table.meta.items()}
     plain.meta["comments"] = [
         "right_ij, left_ij: element (i, j) of the Mueller matrix of the beam, from incident",
         "Stokes parameter j (0 to 3: I, Q, U, V) to outgoing i; _err: its standard error from",
-        "the calibrated parameters, without the error of the model that the summary of the",
-        "calibration counts; inf where they do not determine the element, nan where they do not",
-        "constrain it",
+        "the calibrated parameters, without the error of the model; inf where the data do not",
+        "determine the element, nan where they do not constrain it",
     ]
     return plain
 

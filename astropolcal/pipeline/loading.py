@@ -110,8 +110,7 @@ class SystemMueller:
             for name, position in self.positions.items()
         }
         matrices = self._matrices.of(np.asarray(self._matrices.which[frames]))
-        given = {"value": self.value[frames], "positions": positions, "_matrices": matrices}
-        return replace(self, **given)
+        return replace(self, value=self.value[frames], positions=positions, _matrices=matrices)
 
     @property
     def factor(self):

@@ -244,8 +244,6 @@ def undecided_signs(measurement):
     """
     problem = BinProblem(measurement, measurement.weighting)
     vector, found = measurement.vector(), []
-    if not problem.slots:
-        return found
     costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
     for row, low, high in problem.main_retardances():
         slot, places = problem.slots[row], problem.elements[row]
@@ -260,8 +258,7 @@ def undecided_signs(measurement):
             ratio = new / costs
             # which may as well fit a little better
             close = (np.abs(ratio - 1) > _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
-        bins = np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0))
-        for i in bins:
+        for i in np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0)):
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
             words = (
                 f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
@@ -477,22 +474,21 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
     start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
-    lam, inner = measurement.wavelength, slice(1, -1)
+    lam, inner = measurement.wavelength, range(1, problem.n_bins - 1)
     for row, low, high in problem.main_retardances():
         where = problem.elements[row]
         beside = origin[where]
-        for i in range(1, problem.n_bins - 1):
+        for i in inner:
             beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], found[where[[i - 1, i + 1]]])
         turned = _turned(beside, found[where], low, high)
         start[where] = np.where(np.isfinite(turned), turned, found[where])
         moved |= np.isfinite(turned)
-    if not moved.any():
-        return outcome, weighting
-    before, (start, costs) = problem.costs(found), problem.polish(start)
-    worth = np.exp(_UNDECIDED / problem._present.sum(axis=1))
-    far = worth.copy()
+    # what the start says counts less than what neighbours say
+    worth, far = np.tile(np.exp(_UNDECIDED / problem._present.sum(axis=1)), (2, 1))
     worth[inner], far[inner] = _WORTH, _FAR_WORSE
-    moved &= costs < far * before
+    if moved.any():
+        before, (start, costs) = problem.costs(found), problem.polish(start)
+        moved &= costs < far * before
     if not moved.any():
         return outcome, weighting
     best = found.copy()
