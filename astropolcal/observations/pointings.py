@@ -133,7 +133,7 @@ def pointing(coord, time, location):
     Return altitude and parallactic angle of a target.
 
     Refraction is left out. The parallactic angle refers to the celestial pole of date, as those of
-    headers mostly do: from the pole of ICRS it is up to 0.25 deg off at a declination of 60 deg, 25
+    headers mostly do: from the pole of ICRS it is up to 0.28 deg off at a declination of 60 deg, 25
     years after 2000. Nothing is downloaded: the tables of the Earth's rotation are those
     that are installed (``astropy-iers-data``), or those that were given to
     `astropy.utils.iers.earth_orientation_table`.
