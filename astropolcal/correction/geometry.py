@@ -281,8 +281,7 @@ def _weights(block, matrix, offset, size, order):
     weights = (by_y[:, :, None] * by_x[:, None, :]).reshape(index.shape)
     # every row of the matrix has the same number of weights, 4 or 16
     ends = np.arange(0, weights.size + 1, weights.shape[1], dtype=np.int32)
-    shape = (len(index), size[0] * size[1])
-    return csr_array((weights.ravel(), index.ravel(), ends), shape=shape)
+    return csr_array((weights.ravel(), index.ravel(), ends), shape=(len(index), size[0] * size[1]))
 
 
 def _taps(place, n, order):

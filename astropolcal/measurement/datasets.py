@@ -195,8 +195,7 @@ class Dataset:
 
     def values(self, sweep):
         """Return the predicted data of a forward sweep, shape (n_data,)."""
-        right, left = self._fluxes(sweep)
-        predicted = self.observable.evaluate(right, left)
+        predicted = self.observable.evaluate(*self._fluxes(sweep))
         return predicted.ravel() if self._all_valid else predicted[self.valid]
 
     def forward(self, vector):

@@ -133,7 +133,7 @@ def pointing(coord, time, location):
     Return altitude and parallactic angle of a target.
 
     Refraction is left out. The parallactic angle refers to the celestial pole of date, as those of
-    headers mostly do: from the pole of ICRS it is up to 0.28 deg off at a declination of 60 deg, 25
+    headers mostly do: from the pole of ICRS it is up to 0.3 deg off at a declination of 60 deg, 25
     years after 2000. Nothing is downloaded: the tables of the Earth's rotation are those
     that are installed (``astropy-iers-data``), or those that were given to
     `astropy.utils.iers.earth_orientation_table`.
@@ -446,8 +446,7 @@ def frame_coordinate(observations, name):
         return np.where(observations.mask.T, 0.0, fluxes)
     if name == "total_flux":
         # both entries alike: what depends on all of the light acts on both beams alike
-        total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
-        return np.stack([total, total])
+        return np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))[None].repeat(2, axis=0)
     # what the frame before leaves behind, of several beams that of the same one; the first has
     # none, and 1 changes nothing there, nor where there is no light
     beams = observations.frames.columns.get("beam", np.zeros(observations.n_frames))

@@ -54,9 +54,8 @@ def finite_position(value, name, stage=None):
     if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
     if stage == "altitude" and position.size:
-        worst = position.flat[np.argmax(np.abs(position - np.pi / 4))]
+        worst = np.rad2deg(position.flat[np.argmax(np.abs(position - np.pi / 4))])
         # beyond the zenith by a rounding error is allowed
-        if not 0 < worst <= np.pi / 2 + 1e-9:
-            shown = f"altitude = {np.rad2deg(worst):.4g} deg"
-            raise ObservationError(f"{shown}; allowed is above 0 to 90 deg")
+        if not 0 < worst <= 90 + 1e-7:
+            raise ObservationError(f"altitude = {worst:.4g} deg; allowed is above 0 to 90 deg")
     return position

@@ -142,8 +142,7 @@ class SystemMueller:
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
-        flags = self._matrices.flags()
-        is_open, is_blind = (each.reshape(*self.value.shape[:-2], 16) for each in flags)
+        is_open, is_blind = (each.reshape(matrix.shape[:-1]) for each in self._matrices.flags())
         unknown = is_open | is_blind
         # no covariance with what has no error, whichever of the two it is
         matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan

@@ -49,6 +49,8 @@ _CLEARLY_BETTER = 0.99
 # a phase so far off its neighbours (radian) is given the other sign if that is four times as near;
 # the bin may be so many times worse before all are fitted again
 _STICKS_OUT, _FAR_WORSE = 1.0, 30.0
+# phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
+_OTHER_SIGN = 0.2
 # a polish ends when no bin gains a thousandth in a step, or is about to
 _STILL_GAINING = 0.999
 _STUCK = 1.0
@@ -227,11 +229,11 @@ def search_branches(problem, vector, origin=None):
     return best, moved
 
 
-def _turned(beside, phases, low, high):
+def _turned(beside, phases, low, high, least):
     """Return phases with the other sign where those beside them say so, NaN elsewhere."""
     found, off = np.full(len(phases), np.nan), np.abs(phases - beside)
     for other in -phases + 2 * np.pi * np.array([[-1], [0], [1]]):
-        good = (off > _STICKS_OUT) & (np.abs(other - beside) < off / 4)
+        good = (off > least) & (np.abs(other - beside) < off / 4)
         found = np.where(good & (low <= other) & (other <= high), other, found)
     return found
 
@@ -258,7 +260,7 @@ def undecided_signs(measurement):
             ratio = new / costs
             # which may as well fit a little better
             close = (np.abs(ratio - 1) > _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
-        for i in np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0)):
+        for i in np.flatnonzero(close & (moved > _OTHER_SIGN) & (costs > 0)):
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
             words = (
                 f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
@@ -469,26 +471,29 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     Fit again with single wavelengths in the branch of their neighbours, if nearly as good.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
-    well. Any error of the model then decides between them; their neighbours tell which is true. At
-    the ends of the spectrum the start does, if the data do not tell.
+    well. Any error of the model then decides between them; their neighbours tell which is true.
+    Where these say nothing the start does, if neither the data nor those of a neighbour refuse.
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
-    start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
-    lam, inner = measurement.wavelength, range(1, problem.n_bins - 1)
+    start, lam = found.copy(), measurement.wavelength
+    told, moved = np.zeros((2, problem.n_bins), dtype=bool)
     for row, low, high in problem.main_retardances():
         where = problem.elements[row]
-        beside = origin[where]
-        for i in inner:
-            beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], found[where[[i - 1, i + 1]]])
-        turned = _turned(beside, found[where], low, high)
-        start[where] = np.where(np.isfinite(turned), turned, found[where])
+        phases, beside = found[where], np.full(problem.n_bins, np.nan)
+        for i in range(1, problem.n_bins - 1):
+            beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], phases[[i - 1, i + 1]])
+        turned = _turned(beside, phases, low, high, _STICKS_OUT)
+        told |= np.isfinite(turned)
+        by_start = _turned(origin[where], phases, low, high, _OTHER_SIGN)
+        turned = np.where(np.isfinite(turned), turned, by_start)
+        start[where] = np.where(np.isfinite(turned), turned, phases)
         moved |= np.isfinite(turned)
-    # what the start says counts less than what neighbours say
-    worth, far = np.tile(np.exp(_UNDECIDED / problem._present.sum(axis=1)), (2, 1))
-    worth[inner], far[inner] = _WORTH, _FAR_WORSE
+    undecided = np.exp(_UNDECIDED / problem._present.sum(axis=1))
+    worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], undecided)
     if moved.any():
         before, (start, costs) = problem.costs(found), problem.polish(start)
-        moved &= costs < far * before
+        refused = moved & (costs >= far * before)
+        moved &= ~refused & (told | (np.convolve(refused, np.ones(3))[1:-1] == 0))
     if not moved.any():
         return outcome, weighting
     best = found.copy()
