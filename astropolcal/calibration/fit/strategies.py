@@ -488,7 +488,7 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
         turned = np.where(np.isfinite(turned), turned, by_start)
         start[where] = np.where(np.isfinite(turned), turned, phases)
         moved |= np.isfinite(turned)
-    undecided = np.exp(_UNDECIDED / problem._present.sum(axis=1))
+    undecided = np.exp(_UNDECIDED / problem._present.sum(axis=1).clip(1))
     worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], undecided)
     if moved.any():
         before, (start, costs) = problem.costs(found), problem.polish(start)
