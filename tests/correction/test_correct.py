@@ -522,6 +522,7 @@ def test_systematic_errors_against_those_of_double_differences(calibration, char
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*unstable lamp")
+@pytest.mark.filterwarnings("ignore:systematic errors do not count another solution")
 def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
     """
     Unpolarized stars are what the fit has found of them, and zero within all errors.
