@@ -192,6 +192,7 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
+    unmeasured += _mirrored(calibration)
     for words in doubts + unmeasured:
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -227,6 +228,13 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     if n_samples:
         return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, **how)
     return linear_systematic(model, solution, **how)
+
+
+def _mirrored(calibration):
+    """Say which other solutions of the calibration, as good as it, no systematic error counts."""
+    mirrors = getattr(getattr(calibration, "identifiability", None), "mirrors", ())
+    words = "systematic errors do not count another solution: {}"
+    return [words.format(one) for one in mirrors if "tell the sign" in one]
 
 
 def _chain_at(calibration, frames, chain, **when):

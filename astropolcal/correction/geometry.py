@@ -102,7 +102,7 @@ def _resampled(image, matrix, offset, shape, order):
     image, offset = _cropped(image, matrix, offset, shape)
     flat = image.reshape(-1, *image.shape[-2:])
     bad = ~np.isfinite(flat)
-    filled = np.where(bad, 0.0, flat) if bad.any() else flat
+    filled = _filled(flat, bad) if bad.any() else flat
     out = _interpolated(filled, matrix, offset, shape, order)
     if bad.any():
         # planes mostly lack the same pixels
@@ -113,11 +113,23 @@ def _resampled(image, matrix, offset, shape, order):
         out[np.broadcast_to(share > _EXACT, out.shape)] = np.nan
     # beyond the middles of the last pixels; rounding of the rotation must not cost those
     slack = 1e-9
-    for place, last in zip(
-        _places(matrix, offset, shape), np.array(flat.shape[1:]) - 1, strict=True
-    ):
-        out[:, (place < -slack) | (place > last + slack)] = np.nan
+    for place, size in zip(_places(matrix, offset, shape), flat.shape[1:], strict=True):
+        out[:, (place < -slack) | (place > size - 1 + slack)] = np.nan
     return out.reshape(*image.shape[:-2], *shape)
+
+
+def _filled(planes, bad):
+    """Return planes whose missing pixels continue their neighbours, so that no spline rings."""
+    from scipy.ndimage import gaussian_filter
+
+    def smooth(values):
+        return gaussian_filter(np.where(bad, 0.0, values), [0, 1, 1], mode="constant") / weight
+
+    weight = gaussian_filter((~bad).astype(float), [0, 1, 1], mode="constant")
+    weight[weight == 0] = np.inf
+    # twice, which is exact also where an image is curved
+    once = smooth(planes)
+    return np.where(bad, once + smooth(planes - once), planes)
 
 
 def _interpolated(planes, matrix, offset, shape, order):
@@ -134,8 +146,7 @@ def _interpolated(planes, matrix, offset, shape, order):
 
 def _cropped(image, matrix, offset, shape):
     """Return the part of the image that has an influence on the result, and the offset in it."""
-    corners = np.array([[0, 0, shape[0] - 1, shape[0] - 1], [0, shape[1] - 1, 0, shape[1] - 1]])
-    places = matrix @ corners + offset[:, None]
+    places = _places(matrix, offset, shape).reshape(2, -1)
     # the window of a frame is small in its cube: most of the filtering would be for nothing
     low = np.floor(places.min(axis=1)).astype(int) - _REACH
     high = np.ceil(places.max(axis=1)).astype(int) + _REACH + 1
@@ -149,10 +160,7 @@ def _cropped(image, matrix, offset, shape):
 
 def _places(matrix, offset, shape):
     """Return y and x in the image of all pixels of the result."""
-    rows, columns = np.indices(shape)
-    y = matrix[0, 0] * rows + matrix[0, 1] * columns + offset[0]
-    x = matrix[1, 0] * rows + matrix[1, 1] * columns + offset[1]
-    return y, x
+    return np.tensordot(matrix, np.indices(shape), axes=1) + offset[:, None, None]
 
 
 def _gain(grid, order):
@@ -273,8 +281,7 @@ def _weights(block, matrix, offset, size, order):
     weights = (by_y[:, :, None] * by_x[:, None, :]).reshape(index.shape)
     # every row of the matrix has the same number of weights, 4 or 16
     ends = np.arange(0, weights.size + 1, weights.shape[1], dtype=np.int32)
-    shape = (len(index), size[0] * size[1])
-    return csr_array((weights.ravel(), index.ravel(), ends), shape=shape)
+    return csr_array((weights.ravel(), index.ravel(), ends), shape=(len(index), size[0] * size[1]))
 
 
 def _taps(place, n, order):

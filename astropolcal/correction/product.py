@@ -61,15 +61,12 @@ def _header(corrected):
     header = fits.Header()
     header["CONTENT"] = (PRODUCT, "what this file is")
     header["CONTVERS"] = (_VERSION, "version of its form")
-    try:
-        header["BUNIT"] = corrected.unit.to_string("fits")
-    except ValueError:
-        # such as electrons, which the standard does not know
-        header["BUNIT"] = corrected.unit.to_string()
+    header["BUNIT"] = _unit(corrected.unit)
     _axes(header, corrected)
     header["POLCONV"] = ("IAU", "angles from north through east")
     header["COMMENT"] = "Q is positive north-south, U from north-east to south-west; the position"
-    header["COMMENT"] = "angle is atan2(U, Q) / 2. V is right minus left."
+    header["COMMENT"] = "angle is atan2(U, Q) / 2. V is right minus left. North is that of the"
+    header["COMMENT"] = "frames' parallactic angles, the pole of date if coordinates gave them."
     header["STOKES"] = (corrected.components, "Stokes parameters along the last axis")
     header["CORRMODE"] = (corrected.mode, "stokes: whole Mueller matrix; ip: offsets only")
     header["OBSERVBL"] = (corrected.observable, "what was fitted")
@@ -91,6 +88,14 @@ def _header(corrected):
     return header
 
 
+def _unit(unit):
+    try:
+        return unit.to_string("fits")
+    except ValueError:
+        # such as electrons, which the standard does not know
+        return unit.to_string()
+
+
 def _printable(text):
     """Return a text in the characters that FITS has, space to tilde; others as Python escapes."""
     return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in str(text))
@@ -107,13 +112,14 @@ def _axes(header, corrected):
         # milliarcsecond to degree
         step = corrected.pixel_scale / 3.6e6
         # offsets from the star, not coordinates on the sky
-        for axis, name, sign in ((1, "XOFFSET", -1), (2, "YOFFSET", 1)):
+        to_right = -1 if corrected.north_up else 1
+        for axis, name, sign in ((1, "XOFFSET", to_right), (2, "YOFFSET", 1)):
             header[f"CTYPE{axis}"] = (name, "from the star" + (", to the east" if sign < 0 else ""))
             header[f"CUNIT{axis}"] = "deg"
             # FITS counts pixels from one
             header[f"CRPIX{axis}"] = corrected.centre[axis - 1] + 1
             header[f"CRVAL{axis}"] = 0.0
-            header[f"CDELT{axis}"] = (sign if corrected.north_up else 1) * step
+            header[f"CDELT{axis}"] = sign * step
     if n == 4 and corrected.centre is not None:
         header["STARX"] = (corrected.centre[0], "place of the star, 0-based pixel")
         header["STARY"] = (corrected.centre[1], "place of the star, 0-based pixel")
@@ -130,8 +136,10 @@ def _wavelengths(corrected):
     return fits.BinTableHDU(table, name="WAVELENGTH")
 
 
-def _image(name, values, *lines):
+def _image(name, values, *lines, unit=None):
     hdu = fits.ImageHDU(values, name=name)
+    if unit is not None:
+        hdu.header["BUNIT"] = _unit(unit)
     for i, line in enumerate(lines):
         hdu.header[f"PLANE{i + 1}"] = line
     return hdu
@@ -139,21 +147,20 @@ def _image(name, values, *lines):
 
 def _errors(corrected):
     names = list(map("".join, combinations_with_replacement(corrected.components, 2)))
-    hdus, systematic = [], corrected.systematic
+    hdus, systematic, unit = [], corrected.systematic, corrected.unit**2
     if corrected.covariance is not None:
-        hdus.append(_image("COVSTAT", corrected.covariance, *names))
+        hdus.append(_image("COVSTAT", corrected.covariance, *names, unit=unit))
     if systematic is not None:
         factor = systematic.factor
         # an array of no directions cannot be stored
-        factor = factor if len(factor) else np.zeros((1, *factor.shape[1:]))
-        hdu = _image("SYSFACT", factor)
+        hdu = _image("SYSFACT", factor if len(factor) else np.zeros((1, *factor.shape[1:])))
         hdu.header["COMMENT"] = "Change of the Stokes vector (axis 2) for one sigma along each"
         hdu.header["COMMENT"] = "direction (axis 4), per unit of the true one (axis 1)."
         hdu.header["SYSMETH"] = systematic.method
         known = corrected.covariances("systematic")
         planes = np.stack([known[pair] for pair in covariance_index(len(known))])
         hdus += [hdu, _image("SYSOPEN", systematic.open.astype(np.uint8))]
-        hdus.append(_image("COVSYST", planes, *names))
+        hdus.append(_image("COVSYST", planes, *names, unit=unit))
     return hdus
 
 
@@ -163,11 +170,10 @@ def _maps(corrected):
     order = ("dolp", "dolp_debiased", "s_p_statistical", "s_p_systematic")
     hdus = [_image("DOLP", np.stack([found[name] for name in order]), *order)]
     order = ("aolp", "s_chi_statistical", "s_chi_systematic")
-    hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order))
-    hdus[-1].header["BUNIT"] = "deg"
+    hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order, unit=u.deg))
     if corrected.stokes.ndim == 4:
         found = corrected.azimuthal()
-        hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
+        hdus.append(_image("QPHI", np.stack(list(found.values())), *found, unit=corrected.unit))
         if not corrected.north_up:
             hdus[-1].header["COMMENT"] = "as if north were up, which is not known (NORTHUP = F)"
     return hdus
@@ -208,9 +214,7 @@ def _read(hdus):
     resampling = _stated(header, "RESAMPLE", float) if "RESAMPLE" in header else 1.0
     if not resampling > 0:
         raise ValueError(f"RESAMPLE = {resampling}; a number above zero is needed")
-    place = None
-    if "STARX" in header:
-        place = tuple(_stated(header, key, float) for key in ("STARX", "STARY"))
+    place = tuple(_stated(header, key, float) for key in ("STARX", "STARY") if "STARX" in header)
     return {
         "components": "".join(StokesCoord(codes).symbol),
         "wavelength": np.asarray(table["wavelength"], dtype=float) * table["wavelength"].unit,
@@ -225,7 +229,7 @@ def _read(hdus):
         "observable": _stated(header, "OBSERVBL", str),
         "unit": unit,
         "north_up": _stated(header, "NORTHUP", bool),
-        "centre": place,
+        "centre": place or None,
         "pixel_scale": _stated(header, "PIXSCALE", float) if "PIXSCALE" in header else None,
         "resampling": resampling,
         "provenance": provenance,

@@ -133,11 +133,8 @@ class Dataset:
     def _observe(self, columns):
         obs = self.observations
         # the table is (n_frames, n_wavelengths), an observable wants the frames of a datum first
-        right, left = (self._grouped(f[columns].T) for f in (obs.flux_right, obs.flux_left))
-        errors = [
-            self._grouped(v[columns].T)
-            for v in (obs.variance_right, obs.variance_left, obs.covariance)
-        ]
+        known = obs.flux_right, obs.flux_left, obs.variance_right, obs.variance_left, obs.covariance
+        right, left, *errors = (self._grouped(values[columns].T) for values in known)
         # one masked frame spoils the whole difference
         bad = self._grouped(obs.mask[columns].T).any(axis=0)
         groups = obs.brightness_groups[self.frames[:, 0]]
@@ -151,10 +148,8 @@ class Dataset:
         self.sigma = np.sqrt(variance[self.valid])
         self.n_data = int(self.valid.sum())
         self._all_valid = bool(self.valid.all())
-        every_bin = np.broadcast_to(self.bins[:, None], self.valid.shape)
-        self.bin_of_datum = every_bin[self.valid]
-        every_group = np.broadcast_to(np.arange(self.frames.shape[0]), self.valid.shape)
-        self.group_of_datum = every_group[self.valid]
+        places, self.group_of_datum = np.nonzero(self.valid)
+        self.bin_of_datum = self.bins[places]
 
     def _grouped(self, array):
         """Turn (n_wavelengths, columns) into (frames_per_datum, n_wavelengths, n_groups)."""
@@ -196,13 +191,11 @@ class Dataset:
     def n_parameters_per_wavelength(self):
         """Number of free parameters that act on the data of one wavelength."""
         # one start a slot: a follower shares that of its source, and one free number counts once
-        starts = {int(np.min(where)) if np.ndim(where) else where for _, where, *_ in self._live}
-        return len(starts)
+        return len({int(np.min(where)) for _, where, *_ in self._live})
 
     def values(self, sweep):
         """Return the predicted data of a forward sweep, shape (n_data,)."""
-        right, left = self._fluxes(sweep)
-        predicted = self.observable.evaluate(right, left)
+        predicted = self.observable.evaluate(*self._fluxes(sweep))
         return predicted.ravel() if self._all_valid else predicted[self.valid]
 
     def forward(self, vector):
@@ -290,7 +283,10 @@ def _positions(chain, observations, positions):
 
 
 def _columns(observations, chain):
-    return {stage: observations.position(stage) for stage in stages(chain)}
+    # where the true angle of a stage is known, it is that at which it stands
+    known, found = observations.frames.colnames, stages(chain)
+    true = {stage: f"{stage}_true" for stage in found if f"{stage}_true" in known}
+    return {stage: observations.position(true.get(stage, stage)) for stage in found}
 
 
 def _node_weights(positions, observations):

@@ -6,7 +6,7 @@ Positions at which a frame was taken: angles of stages, and what else optics and
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.units import mjd_of, to_unit
 
 __all__ = ["COORDINATES"]
@@ -49,11 +49,16 @@ COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *F
 
 
 def finite_position(value, name, stage=None):
-    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
+    """Return the position of a stage in radian, or a number; refuse what cannot be."""
     stage = stage or name
     if stage == "time":
         return mjd_of(value, name)
     position = to_unit(value, PLACES.get(stage) if stage in COORDINATES else u.rad, name)
     if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
+    if stage == "altitude" and position.size:
+        worst = np.rad2deg(position.flat[np.argmax(np.abs(position - np.pi / 4))])
+        # beyond the zenith by a rounding error is allowed
+        if not 0 < worst <= 90 + 1e-7:
+            raise ObservationError(f"altitude = {worst:.4g} deg; allowed is above 0 to 90 deg")
     return position

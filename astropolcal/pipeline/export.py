@@ -31,14 +31,16 @@ _COLUMNS = {
 # lines of at most 72 characters, as a card of FITS has
 _WORDS = """\
 Each Mueller matrix turns the incident Stokes vector (I, Q, U, V) into
-that downstream of the beam splitter; its first row, elements (0, j), gives the
-flux of the beam for incident Stokes parameter j.
+that downstream of the beam splitter; its first row, elements (0, j),
+gives the flux of the beam for incident Stokes parameter j.
 MUELLER columns have 4 x 4 numbers: the index that varies fastest, the
 first of TDIM and of arrays in IDL and Fortran, is the incident Stokes
 parameter j, the other one the outgoing i.
 COV columns have 16 x 16 numbers over the elements 4 i + j: errors of
-the calibration alone, to first order. Infinite: the data of the
-calibration do not determine the element; NaN: they do not constrain it."""
+the calibrated parameters, to first order, without the error of the
+model that the summary of the calibration counts. Infinite: the data of
+the calibration do not determine the element; NaN: they do not
+constrain it."""
 
 
 def mueller_table(calibration, header=None, *, positions=None, light="sky", wavelength=None):
@@ -181,16 +183,15 @@ def _plain(table):
     for beam in _BEAMS:
         value = np.asarray(table[f"mueller_{beam}"])
         errors = np.sqrt(np.diagonal(np.asarray(table[f"cov_{beam}"]), axis1=1, axis2=2))
-        for place in range(16):
-            i, j = divmod(place, 4)
+        for i, j in np.ndindex(4, 4):
             plain[f"{beam}_{i}{j}"] = value[:, i, j]
-            plain[f"{beam}_{i}{j}_err"] = errors[:, place]
+            plain[f"{beam}_{i}{j}_err"] = errors[:, 4 * i + j]
     plain.meta = {key: entry[0] for key, entry in table.meta.items()}
     plain.meta["comments"] = [
         "right_ij, left_ij: element (i, j) of the Mueller matrix of the beam, from incident",
         "Stokes parameter j (0 to 3: I, Q, U, V) to outgoing i; _err: its standard error from",
-        "the calibration, inf where it does not determine the element, nan where it does not",
-        "constrain it",
+        "the calibrated parameters, without the error of the model; inf where the data do not",
+        "determine the element, nan where they do not constrain it",
     ]
     return plain
 

@@ -59,6 +59,9 @@ class SystemMueller:
 
     `LoadedCalibration.system_mueller` makes it. The errors are worked out when they are asked for,
     so that an index, ``matrices[:100]``, gives those of some frames without those of the others.
+    They are those of the calibrated parameters: the error of the model that the summary of a
+    calibration counts (``fit["model_error"]``) is one of q and u, not of an element; ``correct``
+    adds it.
 
     Attributes
     ----------
@@ -107,8 +110,7 @@ class SystemMueller:
             for name, position in self.positions.items()
         }
         matrices = self._matrices.of(np.asarray(self._matrices.which[frames]))
-        given = {"value": self.value[frames], "positions": positions, "_matrices": matrices}
-        return replace(self, **given)
+        return replace(self, value=self.value[frames], positions=positions, _matrices=matrices)
 
     @property
     def factor(self):
@@ -140,8 +142,7 @@ class SystemMueller:
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
-        flags = self._matrices.flags()
-        is_open, is_blind = (each.reshape(*self.value.shape[:-2], 16) for each in flags)
+        is_open, is_blind = (each.reshape(matrix.shape[:-1]) for each in self._matrices.flags())
         unknown = is_open | is_blind
         # no covariance with what has no error, whichever of the two it is
         matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
@@ -393,7 +394,7 @@ class LoadedCalibration:
             was not stated to `load` either, or the instrument has changed in between. Positions
             are taken for what they are, unless a date was stated.
         ObservationError
-            If the header lacks an angle.
+            If the header lacks an angle, or an altitude is not above 0 to 90 deg.
         ChainError, ParameterError
             If a position is missing, the optics in the beam are ambiguous or lacking.
         WavelengthRangeError

@@ -371,3 +371,34 @@ def test_a_sign_that_faint_light_does_not_tell_is_named():
         assert len(words) == named, (flux, words)
         assert all(one.startswith("derotator.retardance at 2200.0 nm") for one in words)
         assert ("1 but for the sign" in cal.summary()) == bool(named)
+
+
+@pytest.mark.slow
+def test_a_sign_that_no_datum_tells_stays_that_of_the_start_and_is_named():
+    """Either sign may fit a little better; of two wavelengths neither has neighbours that tell."""
+    irdis, sources = instruments.get("irdis"), ("polarized", "unpolarized standard star")
+    wavelength = irdis.wavelength[:2]
+    start, truth = ([irdis.chain(s, wavelength=wavelength) for s in sources] for _ in range(2))
+    for chain in truth:
+        chain["hwp"].theta = -0.726 * u.deg
+        chain["hwp"].retardance = [186.892, 175.273] * u.deg
+        chain["derotator"].theta = 0.258 * u.deg
+        chain["derotator"].retardance = [127.126, 156.221] * u.deg
+    truth[1]["ut"].diattenuation = [-0.0078, -0.0078]
+    lamp = half_wave_plate_cycles(derotator=np.arange(0, 180, 20) * u.deg)
+    night = half_wave_plate_cycles([0, 45, 22.5, 67.5] * u.deg, np.zeros(12) * u.deg)
+    night["parallactic"] = np.repeat(np.linspace(-60, 67, 12), 4) * u.deg
+    night["altitude"] = np.repeat(np.linspace(45, 71, 12), 4) * u.deg
+    night["derotator"] = (night["altitude"] - night["parallactic"]) / 2 + 20 * u.deg
+    night["hwp_true"] = night["hwp"] - night["parallactic"] + night["altitude"]
+    for seed in range(4):
+        tables = []
+        for i, source in enumerate(sources):
+            given = {"seed": seed + 9 * i, "meta": {"instrument": "irdis", "source": source}}
+            tables.append(simulate(truth[i], wavelength, (lamp, night)[i], flux=1e6, **given))
+        held = {"hwp.theta": -0.726 * u.deg}
+        cal = calibrate(start, tables, instrument="irdis", fix=held, cross_validate=False)
+        np.testing.assert_allclose(cal.chain["derotator"].retardance.value, [127.1, 156.2], atol=1)
+        named = [one for one in cal.identifiability.mirrors if "tell the sign" in one]
+        assert any(one.startswith("derotator.retardance at 1043.0 nm") for one in named), seed
+        assert f"{len(named)} but for the sign" in cal.summary(), seed

@@ -87,7 +87,7 @@ def test_light_that_no_source_has_does_not_settle():
         | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
         | optics.WollastonPrism(name="wollaston")
     )
-    positions = {"hwp": HWP * u.deg, "altitude": np.repeat([0.0, 90.0], 4) * u.deg}
+    positions = {"hwp": HWP * u.deg, "altitude": np.repeat([1e-6, 90.0], 4) * u.deg}
     rows = measurement_rows(chain, positions, LAM[:1])
     q = np.tile([2.5, -2.5, 0.0, 0.0], 2)[:, None]
     with pytest.raises(ObservationError, match="brightness of the frames does not settle"):

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A disk and a star through the real chain: exact without noise, pulls of one with it."""
 
+import copy
 import dataclasses
 from types import SimpleNamespace
 
@@ -521,6 +522,7 @@ def test_systematic_errors_against_those_of_double_differences(calibration, char
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*unstable lamp")
+@pytest.mark.filterwarnings("ignore:systematic errors do not count another solution")
 def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
     """
     Unpolarized stars are what the fit has found of them, and zero within all errors.
@@ -602,3 +604,15 @@ def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
         star = correct(chain, frames, brightness="given").aperture(9)
         claimed = star.error("Q").mean()
         assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera
+
+
+def test_a_sign_that_the_calibration_does_not_tell_is_said(calibration, disk_frames, charis):
+    words = "derotator.retardance at 2200.0 nm: with the other sign: the data do not tell the sign"
+    finding = dataclasses.replace(calibration.identifiability, mirrors=[words, "of no effect"])
+    other = copy.copy(calibration)
+    other.identifiability = finding
+    with pytest.warns(AstropolcalWarning) as caught:
+        correct(other, frames_of(disk_frames, charis))
+    told = [str(one.message) for one in caught]
+    assert f"systematic errors do not count another solution: {words}" in told
+    assert not any("of no effect" in one for one in told)

@@ -45,6 +45,7 @@ def path(corrected, tmp_path):
 def test_the_header_states_its_conventions(path, corrected):
     header = fits.getheader(path)
     assert header["POLCONV"] == "IAU"
+    assert "the pole of date if coordinates gave them" in " ".join(header["COMMENT"])
     assert header["CTYPE4"] == "STOKES"
     assert (header["CRVAL4"], header["CDELT4"], header["CRPIX4"]) == (1, 1, 1)
     assert header["STOKES"] == "IQU"
@@ -59,7 +60,10 @@ def test_the_header_states_its_conventions(path, corrected):
         names = [hdu.name for hdu in hdus]
         assert hdus["FRAMES"].data["frame"][3] == "CRSA00000003_cube.fits"
         assert hdus["COVSYST"].header["PLANE2"] == "IQ"
-        assert hdus["AOLP"].header["BUNIT"] == "deg"
+        units = {"COVSTAT": "adu2", "COVSYST": "adu2", "AOLP": "deg", "QPHI": "adu"}
+        assert {name: u.Unit(hdus[name].header["BUNIT"]) for name in units} == {
+            name: u.Unit(unit) for name, unit in units.items()
+        }
     assert names[1:] == [
         "WAVELENGTH", "COVSTAT", "SYSFACT", "SYSOPEN", "COVSYST", "DOLP", "AOLP", "QPHI", "FRAMES",
     ]  # fmt: skip
@@ -71,12 +75,13 @@ def test_the_header_states_its_conventions(path, corrected):
         np.testing.assert_array_equal(hdus["QPHI"].data[0], corrected.azimuthal()["q_phi"])
 
 
-def test_q_phi_says_where_north_is_not_known_to_be_up(corrected, tmp_path):
+def test_files_say_where_north_is_not_known_to_be_up(corrected, tmp_path):
     for up in (True, False):
         path = tmp_path / f"{up}.fits"
         dataclasses.replace(corrected, north_up=up).write(path)
         with fits.open(path) as hdus:
             assert ("as if north were up" in str(hdus["QPHI"].header.get("COMMENT", ""))) != up
+            assert ("to the east" in hdus[0].header.comments["CTYPE1"]) == up
 
 
 def test_astropy_reads_the_stokes_axis(path):

@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from astropy.utils.masked import Masked
 
 from astropolcal import calibrate, load, optics
@@ -14,6 +15,7 @@ from astropolcal.correction.rows import RowModel, sky_chain
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
+    ObservationError,
     ParameterError,
     WavelengthRangeError,
 )
@@ -215,3 +217,18 @@ def test_optics_of_one_dataset_are_no_part_of_the_chain(charis):
         observable="normalized_single_difference",
     )
     assert not any(leaf.name.startswith("beam_gain") for leaf in leaves(sky_chain(cal)))
+
+
+@pytest.mark.filterwarnings("ignore:.*m3 not calibrated")
+def test_no_star_is_below_the_horizon_or_beyond_the_zenith(calibration, sky, charis, track):
+    _, positions = track(1)
+    uses = (
+        lambda at: measurement_rows(sky, at, charis.wavelength),
+        lambda at: load(calibration).system_mueller(positions=at),
+        lambda at: simulate(sky, charis.wavelength, QTable(at)),
+    )
+    for use in uses:
+        for altitude in (-70, 0, 100):
+            at = positions | {"altitude": [70, altitude, 70, 70] * u.deg}
+            with pytest.raises(ObservationError, match="allowed is above 0 to 90 deg"):
+                use(at)

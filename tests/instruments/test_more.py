@@ -131,7 +131,7 @@ def test_nirc2_turns_q_and_u_as_its_pipeline_says():
         chain[name].retardance = [180] * u.deg
     chain["m3"].diattenuation = [0]
     cycle = np.array([0, 45, 22.5, 67.5])
-    for parallactic, altitude, obrt, offset in ((0, 0, 0, 0), (13, 40, 25, 3), (-70, 66, 110, -8)):
+    for parallactic, altitude, obrt, offset in ((0, 1, 0, 0), (13, 40, 25, 3), (-70, 66, 110, -8)):
         positions = {"hwp": cycle - offset} | {
             "parallactic": [parallactic] * 4,
             "altitude": [altitude] * 4,

@@ -298,3 +298,13 @@ def test_priors_that_are_none():
         with pytest.raises(ParameterError, match=words) as caught:
             bind_prior(prior, "hwp.theta", u.deg, (-5, 5))
         assert "hwp.theta" in str(caught.value), (prior, words)
+
+
+def test_a_true_angle_goes_before_the_commanded_one():
+    """As in simulations; of an instrument that is known its own law is asked."""
+    chain = optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+    chain = optics.LinearPolarizer(name="polarizer") | chain | optics.WollastonPrism(name="prism")
+    frames = half_wave_plate_cycles()
+    frames["hwp_true"] = frames["hwp"] + np.linspace(1, 8, len(frames)) * u.deg
+    measurement = Measurement(chain, simulate(chain, WAVELENGTH, frames, noise=False))
+    assert np.abs(measurement.residuals()).max() < 1e-12

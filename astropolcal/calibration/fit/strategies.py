@@ -49,6 +49,8 @@ _CLEARLY_BETTER = 0.99
 # a phase so far off its neighbours (radian) is given the other sign if that is four times as near;
 # the bin may be so many times worse before all are fitted again
 _STICKS_OUT, _FAR_WORSE = 1.0, 30.0
+# phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
+_OTHER_SIGN = 0.2
 # a polish ends when no bin gains a thousandth in a step, or is about to
 _STILL_GAINING = 0.999
 _STUCK = 1.0
@@ -227,15 +229,12 @@ def search_branches(problem, vector, origin=None):
     return best, moved
 
 
-def _turned(wavelength, phases, low, high):
-    """Return phases with the other sign where the neighbours say so, NaN elsewhere."""
-    found = np.full(len(phases), np.nan)
-    for i in range(1, len(phases) - 1):
-        beside = np.interp(wavelength[i], wavelength[[i - 1, i + 1]], phases[[i - 1, i + 1]])
-        off = abs(phases[i] - beside)
-        for other in -phases[i] + 2 * np.pi * np.arange(-1, 2):
-            if off > _STICKS_OUT and abs(other - beside) < off / 4 and low <= other <= high:
-                found[i] = other
+def _turned(beside, phases, low, high, least):
+    """Return phases with the other sign where those beside them say so, NaN elsewhere."""
+    found, off = np.full(len(phases), np.nan), np.abs(phases - beside)
+    for other in -phases + 2 * np.pi * np.array([[-1], [0], [1]]):
+        good = (off > least) & (np.abs(other - beside) < off / 4)
+        found = np.where(good & (low <= other) & (other <= high), other, found)
     return found
 
 
@@ -243,12 +242,10 @@ def undecided_signs(measurement):
     """Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
 
     That is where the other sign, other phases of the wavelength refitted, is less than three
-    standard deviations worse. What fits exactly as well is a mirror solution anyway.
+    standard deviations worse, or better. What fits exactly as well is a mirror solution anyway.
     """
     problem = BinProblem(measurement, measurement.weighting)
     vector, found = measurement.vector(), []
-    if not problem.slots:
-        return found
     costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
     for row, low, high in problem.main_retardances():
         slot, places = problem.slots[row], problem.elements[row]
@@ -261,9 +258,9 @@ def undecided_signs(measurement):
         moved = np.abs(np.remainder(trial[places] - vector[places] + np.pi, 2 * np.pi) - np.pi)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = new / costs
-            close = (ratio > 1 + _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
-        bins = np.flatnonzero(close & (moved > _STICKS_OUT) & (costs > 0))
-        for i in bins:
+            # which may as well fit a little better
+            close = (np.abs(ratio - 1) > _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
+        for i in np.flatnonzero(close & (moved > _OTHER_SIGN) & (costs > 0)):
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
             words = (
                 f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
@@ -465,34 +462,45 @@ def _descend(measurement, weighting, fitter, search, options, origin, is_searche
         if not moved.any():
             break
         measurement.stand_at(better)
-    return _smoothed(measurement, weighting, fitter, outcome) if search else (outcome, weighting)
+    how = fitter, outcome, origin
+    return _smoothed(measurement, weighting, *how) if search else (outcome, weighting)
 
 
-def _smoothed(measurement, weighting, fitter, outcome):
+def _smoothed(measurement, weighting, fitter, outcome, origin):
     """
     Fit again with single wavelengths in the branch of their neighbours, if nearly as good.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
     well. Any error of the model then decides between them; their neighbours tell which is true.
+    Where these say nothing the start does, if neither the data nor those of a neighbour refuse.
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
-    start, moved = found.copy(), np.zeros(problem.n_bins, dtype=bool)
-    for row, low, high in problem.main_retardances() if problem.n_bins > 2 else ():
+    start, lam = found.copy(), measurement.wavelength
+    told, moved = np.zeros((2, problem.n_bins), dtype=bool)
+    for row, low, high in problem.main_retardances():
         where = problem.elements[row]
-        turned = _turned(measurement.wavelength, found[where], low, high)
-        start[where] = np.where(np.isfinite(turned), turned, found[where])
+        phases, beside = found[where], np.full(problem.n_bins, np.nan)
+        for i in range(1, problem.n_bins - 1):
+            beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], phases[[i - 1, i + 1]])
+        turned = _turned(beside, phases, low, high, _STICKS_OUT)
+        told |= np.isfinite(turned)
+        by_start = _turned(origin[where], phases, low, high, _OTHER_SIGN)
+        turned = np.where(np.isfinite(turned), turned, by_start)
+        start[where] = np.where(np.isfinite(turned), turned, phases)
         moved |= np.isfinite(turned)
-    if not moved.any():
-        return outcome, weighting
-    before, (start, costs) = problem.costs(found), problem.polish(start)
-    moved &= costs < _FAR_WORSE * before
+    undecided = np.exp(_UNDECIDED / problem._present.sum(axis=1).clip(1))
+    worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], undecided)
+    if moved.any():
+        before, (start, costs) = problem.costs(found), problem.polish(start)
+        refused = moved & (costs >= far * before)
+        moved &= ~refused & (told | (np.convolve(refused, np.ones(3))[1:-1] == 0))
     if not moved.any():
         return outcome, weighting
     best = found.copy()
     best[problem.elements[:, moved]] = start[problem.elements[:, moved]]
     measurement.stand_at(best)
     again = run(measurement, weighting, fitter)
-    if np.all(problem.costs(measurement.vector())[moved] < _WORTH * before[moved]):
+    if np.all(problem.costs(measurement.vector())[moved] < (worth * before)[moved]):
         return again
     measurement.stand_at(found)
     return outcome, weighting
