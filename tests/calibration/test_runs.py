@@ -148,6 +148,22 @@ def test_own_values_are_those_of_calibrate():
         assert abs(value - known[name]["value"]) < 0.5 * std
 
 
+def test_own_values_at_a_bound_are_held_there():
+    """As in the fit of all: what is shared follows, and what is at the bound has no error."""
+    tables, chain = make_runs([0.2] * 2), make_chain()
+    chain["wollaston"].efficiency.bounds = (0, 0.973)
+    chain["wollaston"].efficiency = [0.97, 0.97, 0.97]
+    own, errors = ["wollaston.efficiency"], "white"
+    runs = calibrate_runs(chain, tables, vary=None, own=own, errors=errors)
+    one = calibrate(chain, tables, own=own, errors=errors, cross_validate=False)
+    known = one.parameter_values()
+    for name in ("hwp.theta", "hwp.w_sio2", "derotator.retardance"):
+        value, std = elements(runs, name)
+        assert np.abs((value - known[name]["value"]) / std).max() < 0.1, name
+    stuck = np.isnan(elements(runs, "wollaston.efficiency")[1])
+    np.testing.assert_array_equal(stuck, known["wollaston.efficiency"]["at_bound"])
+
+
 def test_courses_that_the_user_wants():
     angles = 0.3 * (np.arange(5) > 2)
     tables, chain = make_runs(angles), make_chain()
@@ -175,6 +191,13 @@ def test_a_run_is_a_calibration(tmp_path):
     one.write(tmp_path / "one.asdf")
     assert Calibration.read(tmp_path / "one.asdf").covariance == one.covariance
     assert "likelihood of 5 runs" in one.fit["message"]
+
+
+def test_what_other_runs_determine_of_a_run_is_determined():
+    short = make_runs([0.1] * 3)
+    pairs = short[0].select(np.arange(short[0].n_frames) < 8)
+    one = calibrate_runs(make_chain(), [pairs, *short[1:]], vary=None).calibration(0)
+    assert set(one.parameters["status"]) == {"determined"}
 
 
 def test_an_interrupted_call_goes_on(tmp_path):

@@ -431,6 +431,9 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     residuals, weighting = measurement.residuals(vector), measurement.weighting
     view = view_of_measurement(measurement, vector, settings["instrument"])
     finding = complete(measurement, whitened, weighting.level, view)
+    if covariance is not None and not measurement.free.priors:
+        # by the data of all runs, too
+        finding.identifiable |= np.isfinite(covariance.stds)
     finding.branches += undecided_signs(measurement)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
