@@ -304,7 +304,7 @@ class FreeParameters:
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
         # those of the first dataset count, and what another says would be lost
-        for what, told in (("bounds", limits), ("prior", _told)) if not first.fixed else ():
+        for what, told in (("bounds", limits), ("prior", told_prior)) if not first.fixed else ():
             if any(told(getattr(p, what)) != told(getattr(first, what)) for p in parameters[1:]):
                 raise ParameterError(
                     f"{name} differs between datasets in its {what}; give all chains the same"
@@ -368,8 +368,8 @@ class FreeParameters:
     def check_priors(self):
         """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
         for name, (slot, factor, offset) in self._followers.items():
-            own, lead = (_told(self._table[key][0].prior) for key in (name, slot.name))
-            if own != _told(None) and (own != lead or factor != 1 or offset.any()):
+            own, lead = (told_prior(self._table[key][0].prior) for key in (name, slot.name))
+            if own != told_prior(None) and (own != lead or factor != 1 or offset.any()):
                 raise ParameterError(
                     f"{name} is tied to {slot.name}, and its own prior would be lost; give the "
                     f"prior to {slot.name}, or set that of {name} to None"
@@ -607,7 +607,7 @@ class BoundPrior:
         return (self.residual(up) - self.residual(down)) / (up - down)
 
 
-def _told(prior):
+def told_prior(prior):
     """Return what a prior says, as text; scipy's frozen ones know no equality."""
     return repr((prior.dist.name, prior.args, prior.kwds) if hasattr(prior, "dist") else prior)
 

@@ -211,6 +211,14 @@ def test_an_interrupted_call_goes_on(tmp_path):
     again = calibrate_runs(chain, tables, checkpoint=path)
     for a, b in zip(elements(whole, "hwp.w_sio2"), elements(again, "hwp.w_sio2"), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
+    # a fit within other bounds is another fit
+    chain["hwp"].theta.bounds = (0.2, 1)
+    chain["hwp"].theta = 0.5 * u.deg
+    narrow = calibrate_runs(chain, tables, checkpoint=path)
+    chain["hwp"].theta.bounds = (-1, 1)
+    again = calibrate_runs(chain, tables, checkpoint=path)
+    assert narrow.runs["rms_alone"][0] > 1.05 * whole.runs["rms_alone"][0]
+    np.testing.assert_allclose(again.runs["rms_alone"], whole.runs["rms_alone"], rtol=1e-3)
     for content in ("", "{}", '{"fits": 3}', '{"fits": {"x": [NaN]}}'):
         path.write_text(content)
         with pytest.raises(AstropolcalError, match="is not a checkpoint"):

@@ -44,6 +44,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
+from astropolcal.measurement.parameters import told_prior
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import stated_date
 from astropolcal.progress import in_one_thread, stage, steps
@@ -189,13 +190,12 @@ def _dates(parts, needed):
 
 
 def _fingerprint(chains, tables, observable):
-    """Return a text that is another where tables or starting values are."""
-    values = [
-        [leaf.name, key, np.ravel(getattr(leaf, key).value).tolist(), getattr(leaf, key).fixed]
-        for chain in chains
-        for leaf in leaves(chain)
-        for key in leaf.param_names
-    ]
+    """Return a text that is another where tables, optics or what is known of them are."""
+    values = []
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        values.append(leaf.fingerprint())
+        for p in (getattr(leaf, key) for key in leaf.param_names):
+            values.append([np.ravel(p.value).tolist(), p.fixed, str(p.bounds), told_prior(p.prior)])
     known = [table.content_hash for table in tables], str(observable), values
     return uuid.uuid5(uuid.NAMESPACE_OID, json.dumps(known)).hex
 
