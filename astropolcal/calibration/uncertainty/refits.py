@@ -340,6 +340,8 @@ class Resampled:
 def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     """
     Refit resampled data, drawn in blocks of frames with replacement.
+    The peaks of priors are drawn too, each from its own prior.
+
 
     Parameters
     ----------
@@ -408,7 +410,9 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
             often = np.concatenate(often).astype(float)
             seen = _singular_values(refit, np.sqrt(often))[: wanted.size]
             if np.all(seen >= _LOST * wanted):
-                vector, _, found = refit.fit(refit.solution, often)
+                # a prior is a datum too, and may have come out otherwise
+                peaks = rng.normal(size=measurement.n_priors)
+                vector, _, found = refit.fit(refit.solution, often, drawn=peaks)
                 if found.success:
                     samples.append(vector)
                     add()
