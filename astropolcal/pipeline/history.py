@@ -3,9 +3,10 @@
 Calibrations over the years: parameters against date, what changed, and how surely.
 
 A difference between calibrations is judged in the directions that the data of all of them
-determine, with the full covariance of each. Calibrations that share data are refused, because their
-errors are not independent. `restart` refits what changed since a calibration, and holds the rest;
-as the errors of the rest are not in its own, there is a warning where it is compared.
+determine, without priors, which are alike whatever has changed, with the full covariance of each.
+Calibrations that share data are refused, because their errors are not independent. `restart` refits
+what changed since a calibration, and holds the rest; as the errors of the rest are not in its own,
+there is a warning where it is compared.
 """
 
 import warnings
@@ -159,7 +160,8 @@ class Change:
     left_out : list of str
         Elements at a bound, which have no error.
     n_open : int
-        Directions that are open in one of the calibrations, which do not count.
+        Directions that the data of one of the calibrations leave open, also where a prior closes
+        them; they do not count.
 
     Examples
     --------
@@ -228,8 +230,8 @@ def significance(calibrations, parameters=None):
     chi2 = float(np.einsum("ni,nij,nj->", apart, found.weights, apart))
     dof = apart.shape[1] * (len(named) - 1)
     p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
-    labels = [name for name, _ in named]
-    return Change(labels, found.names, chi2, dof, p, found.left_out, found.n_open)
+    told = found.names, chi2, dof, p, found.left_out, found.n_open
+    return Change([name for name, _ in named], *told)
 
 
 @dataclass
@@ -274,7 +276,8 @@ def compared(named, parameters=None):
     places = [[space.names.index(name) for name in names] for space in spaces]
     # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
     # open in any of them
-    basis = _determined([a.open[:, p] for a, p in zip(axes, places, strict=True)], len(names))
+    opens = [_left_open(calibration, a) for (_, calibration), a in zip(named, axes, strict=True)]
+    basis = _determined([o[:, p] for o, p in zip(opens, places, strict=True)], len(names))
     steps = axes[0].steps[places[0]]
     values = [_values(calibration, names) for _, calibration in named]
     # another turn is no change
@@ -339,6 +342,17 @@ def _values(calibration, names):
 
 
 def _determined(opens, size):
+def _left_open(calibration, axes):
+    """Return what the data leave open beside what is at a bound, also where a prior closes it."""
+    names = calibration.covariance.names
+    null = np.reshape(calibration.identifiability.null_vectors, (-1, len(names)))
+    if calibration.settings.get("strategy") == "runs" or not len(null):
+        # its own data tell less than those of all runs do
+        return axes.open
+    held = np.isin(names, calibration.at_bound)
+    return np.concatenate([axes.open, _determined([null[:, held].T], len(null)) @ null])
+
+
     """Return an orthonormal basis of the directions that none of the open ones moves."""
     rows = np.concatenate(opens) if opens else np.zeros((0, size))
     if not size or not len(rows):
