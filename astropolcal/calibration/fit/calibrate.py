@@ -113,7 +113,8 @@ def calibrate(
     strategy : {"joint", "two-step", "sequential"}
         All parameters at once; or the paper's procedure for the polarized source; or
         the paper's order of datasets: polarized source, unpolarized source, stars, each
-        step holding what the ones before have found.
+        step holding what the ones before have found. Steps do not end at the minimum of all
+        parameters, to which errors belong; the verdict says which is how far off.
     observable : str or Observable, optional
         What is fitted; see `astropolcal.observations.OBSERVABLES`. By default normalized double
         differences, of tables without a column ``hwp`` single ones, and of single beams the
@@ -322,6 +323,8 @@ _SETTLED = 1e-4
 # longest step along an open direction, in the same units: the surface of solutions is curved
 _LONGEST = 2.0
 # the solution is left alone if a move spoils it by more than this share
+# residuals below this are rounding, of data without noise
+_ROUNDED = 1e-6
 _SPOILT = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
@@ -465,6 +468,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "astropolcal": version,
             "astropy": astropy.__version__,
+    if covariance is None:
+        fit["off_minimum"] = _off_minimum(measurement, whitened, own)
             "numpy": np.__version__,
             "scipy": installed("scipy"),
             "python": platform.python_version(),
@@ -475,6 +480,19 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     # the pairs of frames at odds with the fit, for summary, JSON and file
+def _off_minimum(measurement, whitened, covariance):
+    """Return which parameter is farthest from the minimum nearby, and by how many errors."""
+    problem, free = Problem(measurement, measurement.weighting), measurement.free
+    vector, factor = measurement.vector(), whitened.factor()
+    # a step of Newton's; of data without noise residuals are rounding
+    pull = problem.jacobian(vector).T @ problem.residuals(vector) * whitened.scale
+    step = np.abs(factor.T @ (factor @ pull)) * whitened.scale / free.factors()
+    known = (covariance.stds > 0) & (rms(measurement.residuals()) > _ROUNDED)
+    times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
+    worst = int(np.argmax(times))
+    return {"parameter": free.names[worst], "errors": float(times[worst])}
+
+
     outliers = columns(outlying_data(calibration))
     rows = zip(*outliers.values(), strict=True)
     fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
