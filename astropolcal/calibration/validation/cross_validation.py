@@ -528,7 +528,8 @@ def predicted_chain(calibration, chain, observations, sources=False):
 
     At the wavelengths of the observations; polarized sources stay free if ``sources``.
     """
-    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
+    # ascending, whatever the order of the table
+    rows = np.sort(bins_on_grid(observations, calibration.wavelength.to_value(u.um)))
     # reversed, so that of optics in several chains the first dataset's counts
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
@@ -558,6 +559,8 @@ def predicted_chain(calibration, chain, observations, sources=False):
             getattr(new, key).prior = None
         train.append(new)
     if unknown:
+            if parameter.grid is not None:
+                getattr(new, key).wavelength = calibration.wavelength[rows]
         raise FitError(
             f"{observations.name}: nothing determines {', '.join(unknown)}: the calibration has no "
             "such optics; hold them at known values"
