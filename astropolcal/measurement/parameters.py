@@ -217,6 +217,11 @@ def with_own(chains, names, own, ties=None):
     return [join(train) for train in trains], ties, copies
 
 
+def ties_among(ties, names):
+    """Return the ties of which both ends are among some parameters."""
+    return {name: tie for name, tie in ties.items() if {name, tie.source} <= set(names)}
+
+
 class FreeParameters:
     """
     The free parameters of chains that share optics by name, one chain per dataset.

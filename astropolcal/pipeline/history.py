@@ -26,6 +26,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement import parameter_table
+from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.headers import date_of
@@ -487,11 +488,8 @@ def restart(calibration, observations, free, *, chain=None, **options):
         options["positions"] = [instrument.positions(*pair) for pair in pairs]
     table = parameter_table(chains)
     # those of which the leading parameter is free
-    start["ties"] = {
-        name: tie
-        for name, tie in old.ties.items()
-        if name in table and tie.source in table and not table[tie.source][0].fixed
-    }
+    ties = ties_among(old.ties, table := parameter_table(chains))
+    start["ties"] = {n: tie for n, tie in ties.items() if not table[tie.source][0].fixed}
     new = calibrate(chains, datasets, **(start | options))
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     return new

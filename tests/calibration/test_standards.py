@@ -9,6 +9,7 @@ import pytest
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration.result.summary import summary, to_dict
+from astropolcal.calibration.uncertainty import derived_data
 from astropolcal.calibration.validation.cross_validation import (
     add_standard,
     refuse_fitted,
@@ -17,8 +18,8 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, Tie
-
 from astropolcal.observations import Observations
+
 LAM = [1.2, 1.6, 2.2] * u.um
 META = {"source": "polarized"}
 
@@ -110,7 +111,6 @@ def test_some_of_the_wavelengths_will_do(make, chain, calibrated):
             np.testing.assert_allclose(table["s_cv"], calibrated.accuracy["s_cv"][rows])
 
 
-def test_masked_wavelength_has_no_error(calibrated, chain, standard):
 def test_order_of_the_wavelengths_does_not_matter(calibrated, chain, standard):
     down = standard.to_table()
     down["bin"] = 2 - down["bin"]
@@ -139,6 +139,7 @@ def test_tables_of_a_group_with_values_of_its_own(make, chain, observations):
     np.testing.assert_allclose(one.std, whole.std[cal.measurement.segments[1]], rtol=1e-6)
 
 
+def test_masked_wavelength_has_no_error(calibrated, chain, standard):
     mask = np.zeros((standard.n_frames, 3), dtype=bool)
     mask[:, 1] = True
     mask[0, 0] = True

@@ -38,7 +38,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.measurement.parameters import are_outside, ties_among
 from astropolcal.progress import stage, steps
 
 __all__ = []
@@ -600,7 +600,7 @@ def _step_of(measurement, chains, held, options, rows=None):
     copies = [chains[i].copy() for i in rows]
     table = parameter_table(copies)
     # a tie needs a source that is free in this step
-    live = {n: tie for n, tie in ties.items() if {n, tie.source} <= set(table) - held}
+    live = ties_among(ties, set(table) - held)
     for name in (held | set(ties) - set(live)) & set(table):
         for parameter in table[name]:
             parameter.fixed = True

@@ -30,7 +30,8 @@ from astropolcal.exceptions import (
     CalibrationFileError,
     ObservationError,
 )
-from astropolcal.measurement import Measurement
+from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date
@@ -269,7 +270,7 @@ class Calibration:
             observations,
             observable=self.settings["observable"],
             positions=None if positions is None else [positions],
-            ties=self.ties,
+            ties=ties_among(self.ties, parameter_table([self.chains[dataset]])),
             wavelength=self.wavelength,
         )
 

@@ -525,9 +525,10 @@ def derived_data(calibration, observations=None, dataset=0):
     jacobian = measurement.jacobian(vector).T * measurement.free.factors()
     free = free_of(calibration)
     slopes = np.zeros((measurement.n_data, free.size))
-    columns = {name: i for i, name in enumerate(free.names)}
-    # a dataset's chain may have fewer parameters than the whole calibration
-    slopes[:, [columns[name] for name in measurement.free.names]] = jacobian
+    for slot in measurement.free.slots:
+        # what leads a parameter need not be in the dataset's own chain
+        own, factor, _ = free.lookup(slot.name)
+        slopes[:, own.slice] += jacobian[slot.slice].T * factor * own.factor
     return derive(calibration, free, measurement.predict(vector).copy(), slopes)
 
 

@@ -9,7 +9,7 @@ from astropolcal import standards, stokes
 from astropolcal.calibration.validation.cross_validation import (
     add_percent,
     keep,
-    predicted_chain,
+    predicted_measurement,
     refuse_fitted,
 )
 from astropolcal.calibration.validation.targets import target_accuracies
@@ -91,13 +91,7 @@ def star_stokes(calibration, chain, observations, positions=None):
     if not isinstance(first, PolarizedSource):
         raise ChainError("the chain of a star begins with a PolarizedSource")
     chain = join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
-    predicted = predicted_chain(calibration, chain, observations, sources=True)
-    measurement = Measurement(
-        predicted,
-        observations,
-        observable=calibration.settings["observable"],
-        positions=None if positions is None else [positions],
-    )
+    measurement = predicted_measurement(calibration, chain, observations, positions, sources=True)
     vector, (part,) = measurement.vector(), measurement.datasets
     # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
     name = leaves(measurement.chains[0])[0].name
