@@ -33,8 +33,8 @@ __all__ = ["Normal", "Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
-#: Share of a value, or of one, by which rounding alone may take it beyond a bound.
-ROUNDING = 1e-9
+# share of a value, or of one, by which rounding alone may take it beyond a bound
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -164,11 +164,11 @@ def parameter_table(chains):
     return table
 
 
-def is_outside(value, bounds):
-    """Return whether a value, or one of several, is beyond its bounds by more than rounding."""
-    low, high = limits(bounds)
-    slack = ROUNDING * np.maximum(1.0, np.abs(value))
-    return bool(np.any((value < low - slack) | (value > high + slack)))
+def are_outside(values, low, high):
+    """Return which values are beyond their bounds by more than rounding."""
+    slack = _ROUNDING * np.maximum(1.0, np.abs(values))
+    # written so that NaN is outside
+    return ~((values >= low - slack) & (values <= high + slack))
 
 
 def with_own(chains, names, own, ties=None):
@@ -433,9 +433,8 @@ class FreeParameters:
             # follower is `factor` times the source's
             canonical = factor * np.asarray(vector)[slot.slice] + offset
             for parameter in parameters:
-                shape = np.shape(parameter.value)
                 value = canonical / canonical_factor(parameter.unit)
-                parameter.value = value.reshape(shape)
+                parameter.value = value.reshape(np.shape(parameter.value))
 
     def put_stds(self, stds):
         """Write standard deviations, in the units of the parameters, into the chains; or None."""
@@ -459,10 +458,6 @@ class FreeParameters:
                         "optic.resampled(wavelength) interpolates them"
                     )
 
-    def put_wavelengths(self, wavelength):
-        """Tell parameters with one value per wavelength (um) which these are."""
-        for parameters in self._table.values():
-            for parameter in parameters:
     def check_order(self, table):
         """Refuse values that differ, where nobody has said at which wavelength each is."""
         given = [(name, p.value) for name, several in self._table.items() for p in several]
@@ -475,6 +470,10 @@ class FreeParameters:
                     f"has its values; set {name}.wavelength, ascending"
                 )
 
+    def put_wavelengths(self, wavelength):
+        """Tell parameters with one value per wavelength (um) which these are."""
+        for parameters in self._table.values():
+            for parameter in parameters:
                 if parameter.shape == wavelength.shape and parameter.grid is None:
                     parameter.wavelength = wavelength * u.um
 

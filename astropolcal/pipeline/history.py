@@ -342,7 +342,6 @@ def _values(calibration, names):
     return np.array([elements.get(n, elements.get(f"{n}[0]")) for n in names], dtype=float)
 
 
-def _determined(opens, size):
 def _left_open(calibration, axes):
     """Return what the data leave open beside what is at a bound, also where a prior closes it."""
     names = calibration.covariance.names
@@ -354,6 +353,7 @@ def _left_open(calibration, axes):
     return np.concatenate([axes.open, _determined([null[:, held].T], len(null)) @ null])
 
 
+def _determined(opens, size):
     """Return an orthonormal basis of the directions that none of the open ones moves."""
     rows = np.concatenate(opens) if opens else np.zeros((0, size))
     if not size or not len(rows):
@@ -486,7 +486,6 @@ def restart(calibration, observations, free, *, chain=None, **options):
     if options.get("positions") is None and instrument is not None:
         pairs = zip(datasets, chains, strict=True)
         options["positions"] = [instrument.positions(*pair) for pair in pairs]
-    table = parameter_table(chains)
     # those of which the leading parameter is free
     ties = ties_among(old.ties, table := parameter_table(chains))
     start["ties"] = {n: tie for n, tie in ties.items() if not table[tie.source][0].fixed}

@@ -15,10 +15,8 @@ user names another gauge by holding parameters (``fix=``) or by a prior.
 import platform
 import time
 import warnings
-from datetime import UTC, datetime
 from importlib.metadata import version as installed
 
-import astropy
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
@@ -36,7 +34,7 @@ from astropolcal.calibration.fit.strategies import (
 )
 from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
-from astropolcal.calibration.noise.estimates import noise_as_given
+from astropolcal.calibration.noise.estimates import noise_as_given, rms
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     GIVEN,
@@ -57,13 +55,12 @@ from astropolcal.calibration.validation.cross_validation import accuracy_table, 
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
-from astropolcal.files import columns
+from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.version import version
 from astropolcal.words import check_choice
 
 __all__ = ["calibrate"]
@@ -323,11 +320,11 @@ _SETTLED = 1e-4
 # longest step along an open direction, in the same units: the surface of solutions is curved
 _LONGEST = 2.0
 # the solution is left alone if a move spoils it by more than this share
-# residuals below this are rounding, of data without noise
-_ROUNDED = 1e-6
 _SPOILT = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
+# residuals below this are rounding, of data without noise
+_ROUNDED = 1e-6
 
 
 def _at_gauge(measurement, weighting, origin, gauge):
@@ -464,22 +461,25 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         ties=dict(measurement.free.ties),
         stages=stages,
         measurement=measurement,
-        provenance={
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "astropolcal": version,
-            "astropy": astropy.__version__,
-    if covariance is None:
-        fit["off_minimum"] = _off_minimum(measurement, whitened, own)
-            "numpy": np.__version__,
-            "scipy": installed("scipy"),
-            "python": platform.python_version(),
-        },
+        provenance=provenance()
+        | {"scipy": installed("scipy"), "python": platform.python_version()},
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     fit["masked"] = [dict(each.mask_reasons) for each in observations]
     fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
+    if covariance is None:
+        fit["off_minimum"] = _off_minimum(measurement, whitened, own)
     # the pairs of frames at odds with the fit, for summary, JSON and file
+    outliers = columns(outlying_data(calibration))
+    rows = zip(*outliers.values(), strict=True)
+    fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
+    fit["model_error"] = lacking
+    keep_sky_accuracy(calibration, view)
+    stage("cross-validation")
+    return calibration.cross_validate() if cross_validate else calibration
+
+
 def _off_minimum(measurement, whitened, covariance):
     """Return which parameter is farthest from the minimum nearby, and by how many errors."""
     problem, free = Problem(measurement, measurement.weighting), measurement.free
@@ -491,15 +491,6 @@ def _off_minimum(measurement, whitened, covariance):
     times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
     worst = int(np.argmax(times))
     return {"parameter": free.names[worst], "errors": float(times[worst])}
-
-
-    outliers = columns(outlying_data(calibration))
-    rows = zip(*outliers.values(), strict=True)
-    fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
-    fit["model_error"] = lacking
-    keep_sky_accuracy(calibration, view)
-    stage("cross-validation")
-    return calibration.cross_validate() if cross_validate else calibration
 
 
 def _lack_of_fit(calibration, whitened):
@@ -532,12 +523,10 @@ def _lack_of_fit(calibration, whitened):
 
 def _record(measurement, i, residuals):
     observations = measurement.datasets[i].observations
+    keys = ("name", "source", "content_hash", "n_frames")
     return DatasetRecord(
-        name=observations.name,
-        source=observations.source,
-        content_hash=observations.content_hash,
+        **{key: getattr(observations, key) for key in keys},
         meta=dict(observations.meta),
-        n_frames=observations.n_frames,
         n_masked=int(observations.mask.sum()),
         accuracy=accuracy_table(measurement, i, residuals),
     )

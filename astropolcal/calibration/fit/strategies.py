@@ -370,11 +370,8 @@ def fit_once(measurement, weighting, fitter):
 
 def outside_bounds(measurement):
     """Return the names of parameters that a fitter without bounds left outside of theirs."""
-    low, high = measurement.free.bounds()
-    vector = measurement.vector()
     # a fitter that minds the bounds ends on them only as exactly as rounding allows
-    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
-    outside = (vector < low - slack) | (vector > high + slack)
+    outside = are_outside(measurement.vector(), *measurement.free.bounds())
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 
 

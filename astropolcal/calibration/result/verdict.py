@@ -12,7 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.measurement.parameters import is_outside
+from astropolcal.measurement.parameters import are_outside, limits
 from astropolcal.words import HEIGHT, WIDTH, counted, p_words, shortened
 
 __all__ = ["Verdict"]
@@ -122,7 +122,8 @@ def verdict(calibration, targets=TARGETS):
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
-        beyond = [n for n, e in known.items() if e["tied"] and is_outside(e["value"], e["bounds"])]
+        tied = {name: entry for name, entry in known.items() if entry["tied"]}
+        beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
         if any("disagree with the priors" in test["words"] for test in tests):
             cautions.append("data and priors disagree")
