@@ -3,7 +3,7 @@
 Calibrations over the years: parameters against date, what changed, and how surely.
 
 A difference between calibrations is judged in the directions that the data of all of them
-determine, without priors, which are alike whatever has changed, with the full covariance of each.
+determine, without priors, which stay alike when something changes, with each full covariance.
 Calibrations that share data are refused, because their errors are not independent. `restart` refits
 what changed since a calibration, and holds the rest; as the errors of the rest are not in its own,
 there is a warning where it is compared.
@@ -161,8 +161,8 @@ class Change:
     left_out : list of str
         Elements at a bound, which have no error.
     n_open : int
-        Directions that the data of one of the calibrations leave open, also where a prior closes
-        them; they do not count.
+        Directions that the data of one of the calibrations do not determine, also where a prior
+        does; they do not count.
 
     Examples
     --------
@@ -343,7 +343,7 @@ def _values(calibration, names):
 
 
 def _left_open(calibration, axes):
-    """Return what the data leave open beside what is at a bound, also where a prior closes it."""
+    """Return what the data do not determine beside what is at a bound, also where a prior does."""
     names = calibration.covariance.names
     null = np.reshape(calibration.identifiability.null_vectors, (-1, len(names)))
     if calibration.settings.get("strategy") == "runs" or not len(null):
