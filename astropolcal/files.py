@@ -20,6 +20,7 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import astropy
 import astropy.units as u
 import numpy as np
 from astropy.time import Time
@@ -325,6 +326,14 @@ def plain(value, where="value"):
 
 
 _COLUMN_UNITS = {"percent": u.percent, "deg": u.deg, "nm": u.nm}
+
+
+def provenance():
+    """Return the time, and the versions of what made a result."""
+    from astropolcal.version import version
+
+    made = {"created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
+    return made | {"astropolcal": version, "astropy": astropy.__version__, "numpy": np.__version__}
 
 
 def columns(table, *keys):

@@ -38,7 +38,7 @@ from astropolcal.converters.nodes import (
 )
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
-from astropolcal.measurement.parameters import ROUNDING, FreeParameters, Tie, parameter_table
+from astropolcal.measurement.parameters import FreeParameters, Tie, are_outside, parameter_table
 from astropolcal.observations.reading import stated_date
 from astropolcal.version import version
 
@@ -304,9 +304,7 @@ def _check_optics(calibration, free):
             low = min(-_LARGEST if low is None else low for low, _ in bounds)
             high = max(_LARGEST if high is None else high for _, high in bounds)
             value = np.asarray(parameter.value, dtype=float)
-            slack = ROUNDING * np.maximum(np.abs(value), 1.0)
-            # written so that NaN is refused
-            if not np.all((value >= low - slack) & (value <= high + slack)):
+            if are_outside(value, low, high).any():
                 raise CalibrationFileError(
                     f"{name} = {one_line(parameter.value)} is outside of its bounds, "
                     f"{low:g} to {high:g}"

@@ -3,7 +3,6 @@
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
@@ -21,6 +20,7 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
+from astropolcal.files import provenance
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames
 from astropolcal.pipeline.tasks import ended_tasks
@@ -313,21 +313,13 @@ def _rows(model, rows, frames, mode):
 
 
 def _provenance(calibration, frames, systematic, given):
-    import astropy
-
-    from astropolcal.version import version
-
     known = {
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "astropolcal": version,
-        "astropy": astropy.__version__,
-        "numpy": np.__version__,
         "instrument": getattr(calibration, "instrument", None) or "",
         "systematic": "none" if systematic is None else systematic.method,
         "held": [] if systematic is None else list(systematic.held),
         "frames": [str(name) for name in frames.names],
     }
-    return known | dict(frames.meta) | dict(given or {})
+    return provenance() | known | dict(frames.meta) | dict(given or {})
 
 
 # ---- the sum over frames, in bounded memory ------------------------------------------------------

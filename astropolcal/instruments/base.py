@@ -463,6 +463,9 @@ class Instrument(ABC):
             self.chain(source, optics_in, wavelength=grid, **own, **options)
             for (source, optics_in), own in zip(setups, particulars, strict=True)
         ]
+        for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+            for parameter in (getattr(leaf, key) for key in leaf.param_names):
+                parameter.wavelength = grid if parameter.shape == grid.shape else None
         return add_nuisance(map(as_exact, chains) if exact else chains, datasets, nuisance)
 
     def telescope_optics(self, behind, **options):

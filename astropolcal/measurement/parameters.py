@@ -33,8 +33,8 @@ __all__ = ["Normal", "Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
-#: Share of a value, or of one, by which rounding alone may take it beyond a bound.
-ROUNDING = 1e-9
+# share of a value, or of one, by which rounding alone may take it beyond a bound
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -164,11 +164,11 @@ def parameter_table(chains):
     return table
 
 
-def is_outside(value, bounds):
-    """Return whether a value, or one of several, is beyond its bounds by more than rounding."""
-    low, high = limits(bounds)
-    slack = ROUNDING * np.maximum(1.0, np.abs(value))
-    return bool(np.any((value < low - slack) | (value > high + slack)))
+def are_outside(values, low, high):
+    """Return which values are beyond their bounds by more than rounding."""
+    slack = _ROUNDING * np.maximum(1.0, np.abs(values))
+    # written so that NaN is outside
+    return ~((values >= low - slack) & (values <= high + slack))
 
 
 def with_own(chains, names, own, ties=None):
@@ -215,6 +215,11 @@ def with_own(chains, names, own, ties=None):
                         ties[f"{leaf.name}.{key}"] = ties.get(f"{optic}.{key}", Tie(lead))
         copies |= {f"{optic}.{k}": [x for (o, _), x in first.items() if o == k] for k in keys}
     return [join(train) for train in trains], ties, copies
+
+
+def ties_among(ties, names):
+    """Return the ties of which both ends are among some parameters."""
+    return {name: tie for name, tie in ties.items() if {name, tie.source} <= set(names)}
 
 
 class FreeParameters:
@@ -304,7 +309,7 @@ class FreeParameters:
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
         # those of the first dataset count, and what another says would be lost
-        for what, told in (("bounds", limits), ("prior", _told)) if not first.fixed else ():
+        for what, told in (("bounds", limits), ("prior", told_prior)) if not first.fixed else ():
             if any(told(getattr(p, what)) != told(getattr(first, what)) for p in parameters[1:]):
                 raise ParameterError(
                     f"{name} differs between datasets in its {what}; give all chains the same"
@@ -368,8 +373,8 @@ class FreeParameters:
     def check_priors(self):
         """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
         for name, (slot, factor, offset) in self._followers.items():
-            own, lead = (_told(self._table[key][0].prior) for key in (name, slot.name))
-            if own != _told(None) and (own != lead or factor != 1 or offset.any()):
+            own, lead = (told_prior(self._table[key][0].prior) for key in (name, slot.name))
+            if own != told_prior(None) and (own != lead or factor != 1 or offset.any()):
                 raise ParameterError(
                     f"{name} is tied to {slot.name}, and its own prior would be lost; give the "
                     f"prior to {slot.name}, or set that of {name} to None"
@@ -428,9 +433,8 @@ class FreeParameters:
             # follower is `factor` times the source's
             canonical = factor * np.asarray(vector)[slot.slice] + offset
             for parameter in parameters:
-                shape = np.shape(parameter.value)
                 value = canonical / canonical_factor(parameter.unit)
-                parameter.value = value.reshape(shape)
+                parameter.value = value.reshape(np.shape(parameter.value))
 
     def put_stds(self, stds):
         """Write standard deviations, in the units of the parameters, into the chains; or None."""
@@ -453,6 +457,18 @@ class FreeParameters:
                         f"{grid[-1]:g} um, which are not the {wavelength.size} of the data; "
                         "optic.resampled(wavelength) interpolates them"
                     )
+
+    def check_order(self, table):
+        """Refuse values that differ, where nobody has said at which wavelength each is."""
+        given = [(name, p.value) for name, several in self._table.items() for p in several]
+        given += [(slot.name, prior.mode + prior.width) for slot, prior in self.priors]
+        given += [(name, offset) for name, (_, _, offset) in self._followers.items()]
+        for name, value in given:
+            if np.ptp(value) > 0 and self._table[name][0].grid is None:
+                raise ParameterError(
+                    f"{table}: the wavelengths do not ascend, and nobody has said at which {name} "
+                    f"has its values; set {name}.wavelength, ascending"
+                )
 
     def put_wavelengths(self, wavelength):
         """Tell parameters with one value per wavelength (um) which these are."""
@@ -607,7 +623,7 @@ class BoundPrior:
         return (self.residual(up) - self.residual(down)) / (up - down)
 
 
-def _told(prior):
+def told_prior(prior):
     """Return what a prior says, as text; scipy's frozen ones know no equality."""
     return repr((prior.dist.name, prior.args, prior.kwds) if hasattr(prior, "dist") else prior)
 

@@ -146,6 +146,13 @@ def stated_date(meta, label, error=ObservationError):
     return iso_date(value, f"{label}: date in the meta", error, months=True)
 
 
+def dates_of(tables, error=ObservationError):
+    """Return the dates of tables that state one, the oldest first."""
+    dates = (stated_date(table.meta, table.name, error) for table in tables)
+    # a month alone begins on its first day
+    return sorted(f"{d}-01" if len(d) == len("2025-10") else d for d in dates if d is not None)
+
+
 def complete_table(table, label):
     """
     Return a table of single differences and sums as one of beam fluxes.

@@ -751,6 +751,13 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         own = {key: getattr(self, key) for key in self._declared_settings}
         return {"name": self.name, "mount": self.mount} | own
 
+    def fingerprint(self):
+        """Return plain texts that are others where the same values would be another optic."""
+        own = self._settings().items()
+        own = [f"{key} = {value}" for key, value in own if isinstance(value, (str, int, float))]
+        laws = [f"{key}: {law.fingerprint}" for key, law in self._follows.items()]
+        return [type(self).__name__, *own, *laws]
+
 
 class _LinearOptic(Optic):
     """An optic whose matrix is a constant, with elements in proportion to its parameters."""

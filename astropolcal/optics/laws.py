@@ -63,6 +63,12 @@ class Law:
         told = f"{kind} of {', '.join(self.of)}{since}"
         return f"{told}, calibrated for {where}" if where else told
 
+    @property
+    def fingerprint(self):
+        """Text that is another where the same coefficients would mean something else."""
+        found = self.model.evaluate(*np.full(len(self.of), 0.7), *np.arange(1.0, self.size + 1))
+        return f"{replace(self, known={})} in {self.unit}: {np.ravel(found).tolist()}"
+
     def names(self, key):
         """Return the names of the coefficients among the parameters of an optic."""
         return tuple(f"{key}_{name}" for name in self.model.param_names)

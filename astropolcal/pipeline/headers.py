@@ -12,7 +12,6 @@ from astropy.time import Time
 from astropolcal import instruments
 from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.result.calibration import (
-    _dates,
     _moment,
     beam_words,
     folded,
@@ -35,7 +34,7 @@ from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
-from astropolcal.observations.reading import numeric_column
+from astropolcal.observations.reading import dates_of, numeric_column
 from astropolcal.optics.positions import PLACES
 
 __all__ = []
@@ -268,7 +267,8 @@ def told_beam(headers, instrument, labels=None):
 def days_of(calibration):
     """Return the dates of a calibration's data, or else the start of its validity, oldest first."""
     start = validity_of(calibration).valid_from
-    return _dates(calibration) or ([] if start is None else [start])
+    dates = dates_of(calibration.datasets, CalibrationFileError)
+    return dates or ([] if start is None else [start])
 
 
 def date_of(calibration):

@@ -3,9 +3,10 @@
 Calibrations over the years: parameters against date, what changed, and how surely.
 
 A difference between calibrations is judged in the directions that the data of all of them
-determine, with the full covariance of each. Calibrations that share data are refused, because their
-errors are not independent. `restart` refits what changed since a calibration, and holds the rest;
-as the errors of the rest are not in its own, there is a warning where it is compared.
+determine, without priors, which stay alike when something changes, with each full covariance.
+Calibrations that share data are refused, because their errors are not independent. `restart` refits
+what changed since a calibration, and holds the rest; as the errors of the rest are not in its own,
+there is a warning where it is compared.
 """
 
 import warnings
@@ -25,6 +26,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement import parameter_table
+from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.headers import date_of
@@ -159,7 +161,8 @@ class Change:
     left_out : list of str
         Elements at a bound, which have no error.
     n_open : int
-        Directions that are open in one of the calibrations, which do not count.
+        Directions that the data of one of the calibrations do not determine, also where a prior
+        does; they do not count.
 
     Examples
     --------
@@ -228,8 +231,8 @@ def significance(calibrations, parameters=None):
     chi2 = float(np.einsum("ni,nij,nj->", apart, found.weights, apart))
     dof = apart.shape[1] * (len(named) - 1)
     p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
-    labels = [name for name, _ in named]
-    return Change(labels, found.names, chi2, dof, p, found.left_out, found.n_open)
+    told = found.names, chi2, dof, p, found.left_out, found.n_open
+    return Change([name for name, _ in named], *told)
 
 
 @dataclass
@@ -274,7 +277,8 @@ def compared(named, parameters=None):
     places = [[space.names.index(name) for name in names] for space in spaces]
     # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
     # open in any of them
-    basis = _determined([a.open[:, p] for a, p in zip(axes, places, strict=True)], len(names))
+    opens = [_left_open(calibration, a) for (_, calibration), a in zip(named, axes, strict=True)]
+    basis = _determined([o[:, p] for o, p in zip(opens, places, strict=True)], len(names))
     steps = axes[0].steps[places[0]]
     values = [_values(calibration, names) for _, calibration in named]
     # another turn is no change
@@ -336,6 +340,17 @@ def _values(calibration, names):
         elements |= {key: flat[0]} if one else {f"{key}[{i}]": v for i, v in enumerate(flat)}
     # a parameter given per wavelength on a grid of one goes by its plain name
     return np.array([elements.get(n, elements.get(f"{n}[0]")) for n in names], dtype=float)
+
+
+def _left_open(calibration, axes):
+    """Return what the data do not determine beside what is at a bound, also where a prior does."""
+    names = calibration.covariance.names
+    null = np.reshape(calibration.identifiability.null_vectors, (-1, len(names)))
+    if calibration.settings.get("strategy") == "runs" or not len(null):
+        # its own data tell less than those of all runs do
+        return axes.open
+    held = np.isin(names, calibration.at_bound)
+    return np.concatenate([axes.open, _determined([null[:, held].T], len(null)) @ null])
 
 
 def _determined(opens, size):
@@ -471,13 +486,9 @@ def restart(calibration, observations, free, *, chain=None, **options):
     if options.get("positions") is None and instrument is not None:
         pairs = zip(datasets, chains, strict=True)
         options["positions"] = [instrument.positions(*pair) for pair in pairs]
-    table = parameter_table(chains)
     # those of which the leading parameter is free
-    start["ties"] = {
-        name: tie
-        for name, tie in old.ties.items()
-        if name in table and tie.source in table and not table[tie.source][0].fixed
-    }
+    ties = ties_among(old.ties, table := parameter_table(chains))
+    start["ties"] = {n: tie for n, tie in ties.items() if not table[tie.source][0].fixed}
     new = calibrate(chains, datasets, **(start | options))
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     return new

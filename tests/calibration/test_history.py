@@ -19,7 +19,7 @@ from astropolcal.exceptions import (
     InstrumentError,
     ParameterError,
 )
-from astropolcal.measurement import Tie
+from astropolcal.measurement import Normal, Tie
 from astropolcal.pipeline.history import (
     Change,
     _log_p,
@@ -172,6 +172,25 @@ def test_open_directions_do_not_count():
     alone = significance([first, second], ["hwp.theta"])
     assert (alone.dof, alone.p_value, alone.sigma) == (0, 1.0, 0.0)
     assert "nothing that is determined" in str(alone)
+
+
+def test_what_a_prior_closes_does_not_count():
+    """All optics turned by a degree: only the prior says where they are, and always the same."""
+    found = []
+    for i, turn in enumerate((0.0, 1.0)):
+        truth, start = make_chain(), make_chain()
+        for name in ("calibration_polarizer", "hwp", "derotator", "wollaston"):
+            truth[name].theta = truth[name].theta.quantity + turn * u.deg
+            start[name].theta.fixed = False
+        start["wollaston"].theta.bounds = (-5, 5)
+        start["wollaston"].theta.prior = Normal(0 * u.deg, 0.5 * u.deg)
+        data = simulate(truth, WAVELENGTH, FRAMES, seed=i, name=f"run{i}")
+        found.append(calibrate(start, data, search=False, cross_validate=False))
+    assert "by priors" in found[0].parameters["status"]
+    told = significance(found, ["calibration_polarizer.theta"])
+    assert (told.dof, told.n_open) == (0, 1)
+    assert significance(found).n_open == 1
+    assert significance(found, ["hwp"]).dof == 2
 
 
 def test_probability_far_in_the_tail():

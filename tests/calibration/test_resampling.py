@@ -146,6 +146,18 @@ def test_undetermined_parameters_have_no_spread(make):
     assert np.isnan(made.interval()[0][~known]).all()
 
 
+def test_priors_are_drawn_too(make):
+    """What rests on a prior alone spreads as this does."""
+    start = make.truth(make.chain("linear", fixed=False, wavelength=LAM))
+    start["wollaston"].theta.fixed = False
+    start["wollaston"].theta.prior = Normal(0 * u.deg, 0.5 * u.deg)
+    data = make.observe(start, make.frames(MANY[::4]), LAM, seed=1)
+    cal = calibrate(start, data, search=False, errors="white", cross_validate=False)
+    i = cal.covariance.names.index("wollaston.theta")
+    assert cal.parameters["status"][i] == "by priors"
+    assert 0.3 < bootstrap(cal, n=30, seed=1).stds[i] < 0.7
+
+
 def test_every_dataset_keeps_its_number_of_blocks(make):
     truth = make.truth(make.chain("linear", wavelength=LAM))
     one = make.observe(truth, make.frames([45, 80, 110] * u.deg), LAM, seed=1)
@@ -215,7 +227,7 @@ def test_blocks_that_do_not_determine_the_model_are_refused(make, monkeypatch):
     """If hardly any resample can be fitted there is an error, not an endless loop."""
     cal = calibrated(make, angles=[45, 60, 80] * u.deg)
     failed = (cal.measurement.vector(), 0.0, SimpleNamespace(success=False))
-    monkeypatch.setattr(Problem, "fit", lambda *arguments: failed)
+    monkeypatch.setattr(Problem, "fit", lambda *arguments, **options: failed)
     with pytest.raises(FitError, match="too few blocks"), pytest.warns(match="3 derotator blocks"):
         bootstrap(cal, 3, seed=1)
 

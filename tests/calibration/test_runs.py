@@ -148,6 +148,22 @@ def test_own_values_are_those_of_calibrate():
         assert abs(value - known[name]["value"]) < 0.5 * std
 
 
+def test_own_values_at_a_bound_are_held_there():
+    """As in the fit of all: what is shared follows, and what is at the bound has no error."""
+    tables, chain = make_runs([0.2] * 2), make_chain()
+    chain["wollaston"].efficiency.bounds = (0, 0.973)
+    chain["wollaston"].efficiency = [0.97, 0.97, 0.97]
+    own, errors = ["wollaston.efficiency"], "white"
+    runs = calibrate_runs(chain, tables, vary=None, own=own, errors=errors)
+    one = calibrate(chain, tables, own=own, errors=errors, cross_validate=False)
+    known = one.parameter_values()
+    for name in ("hwp.theta", "hwp.w_sio2", "derotator.retardance"):
+        value, std = elements(runs, name)
+        assert np.abs((value - known[name]["value"]) / std).max() < 0.1, name
+    stuck = np.isnan(elements(runs, "wollaston.efficiency")[1])
+    np.testing.assert_array_equal(stuck, known["wollaston.efficiency"]["at_bound"])
+
+
 def test_courses_that_the_user_wants():
     angles = 0.3 * (np.arange(5) > 2)
     tables, chain = make_runs(angles), make_chain()
@@ -177,6 +193,13 @@ def test_a_run_is_a_calibration(tmp_path):
     assert "likelihood of 5 runs" in one.fit["message"]
 
 
+def test_what_other_runs_determine_of_a_run_is_determined():
+    short = make_runs([0.1] * 3)
+    pairs = short[0].select(np.arange(short[0].n_frames) < 8)
+    one = calibrate_runs(make_chain(), [pairs, *short[1:]], vary=None).calibration(0)
+    assert set(one.parameters["status"]) == {"determined"}
+
+
 def test_an_interrupted_call_goes_on(tmp_path):
     tables, chain, path = make_runs([0.1] * 3), make_chain(), tmp_path / "fits.json"
     whole = calibrate_runs(chain, tables, checkpoint=path)
@@ -188,6 +211,14 @@ def test_an_interrupted_call_goes_on(tmp_path):
     again = calibrate_runs(chain, tables, checkpoint=path)
     for a, b in zip(elements(whole, "hwp.w_sio2"), elements(again, "hwp.w_sio2"), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
+    # a fit within other bounds is another fit
+    chain["hwp"].theta.bounds = (0.2, 1)
+    chain["hwp"].theta = 0.5 * u.deg
+    narrow = calibrate_runs(chain, tables, checkpoint=path)
+    chain["hwp"].theta.bounds = (-1, 1)
+    again = calibrate_runs(chain, tables, checkpoint=path)
+    assert narrow.runs["rms_alone"][0] > 1.05 * whole.runs["rms_alone"][0]
+    np.testing.assert_allclose(again.runs["rms_alone"], whole.runs["rms_alone"], rtol=1e-3)
     for content in ("", "{}", '{"fits": 3}', '{"fits": {"x": [NaN]}}'):
         path.write_text(content)
         with pytest.raises(AstropolcalError, match="is not a checkpoint"):

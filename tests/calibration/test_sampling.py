@@ -11,12 +11,14 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.models import Polynomial1D
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration import sample
 from astropolcal.calibration.noise.weighting import Problem, Weighting, noise_of
 from astropolcal.calibration.posterior import LogPosterior, Posterior
 from astropolcal.calibration.posterior import checkpoint as checkpoint_module
+from astropolcal.chain import follow
 from astropolcal.exceptions import (
     AstropolcalError,
     AstropolcalWarning,
@@ -465,6 +467,26 @@ def test_checkpoint_with_other_values_of_held_parameters(small, tmp_path):
     other = make_calibration()
     other.measurement.hwp_retardance.value += 6e-3
     with pytest.raises(FitError, match="differs in values of the parameters held"):
+        quiet_sample(other, **options)
+
+
+def test_checkpoint_of_another_law(tmp_path):
+    """Its coefficients have the same names, and mean something else."""
+    data = simulate(make_chain(), WAVELENGTH, FRAMES, flux=1e4, seed=1)
+    options = RUN | {"n_steps": 4, "checkpoint": tmp_path / "chain.h5"}
+    first, other = (
+        calibrate(
+            follow(make_chain(), "hwp.retardance", Polynomial1D(1, **ends), "wavelength"),
+            data,
+            weights="errors",
+            search=False,
+            cross_validate=False,
+        )
+        for ends in ({}, {"domain": [1.2, 1.6], "window": [-1, 1]})
+    )
+    quiet_sample(first, **options)
+    assert first.covariance.names == other.covariance.names
+    with pytest.raises(FitError, match="differs in model"):
         quiet_sample(other, **options)
 
 

@@ -162,6 +162,7 @@ def test_a_file_of_before_knows_one_degree_of_polarization():
     for turn, gain, words in [
         ((0, 0), (0, 0), "on sky nothing changes"),
         ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, regardless"),
+        ((99.8, 0), (0, 0), "up to 100 deg"),
         ((0.004, -0.004), (-300, 1), "less than 0.01 deg and the DoLP by up to 300 % of"),
     ]:
         sky = {"aolp_deg": list(turn), "dolp_percent": list(gain)}
@@ -287,13 +288,17 @@ def test_where_the_telescope_comes_from(alone):
         assert words in table.meta["words"]
     # coefficients of four filters, and a date that nobody states
     irdis = instruments.get("irdis")
-    live = Measurement(
-        irdis.published(),
-        simulate(
-            irdis.published(), irdis.wavelength, half_wave_plate_cycles(derotator=[20, 60] * u.deg)
-        ),
-    )
-    assert view_of_measurement(live, live.vector(), "irdis").telescope == PUBLISHED
+    chain, frames = irdis.published(), half_wave_plate_cycles(derotator=[20, 60] * u.deg)
+    plates = {}
+    for mode in (None, "field", "pupil"):
+        meta = {} if mode is None else {"tracking": mode}
+        live = Measurement(chain, simulate(chain, irdis.wavelength, frames, meta=meta))
+        view = view_of_measurement(live, live.vector(), "irdis")
+        assert view.telescope == PUBLISHED
+        plates[mode] = view.placed["hwp"]
+    # the plate follows the sky as the tables state it; else as the first mode does
+    np.testing.assert_array_equal(plates[None], plates["field"])
+    assert np.abs(plates["pupil"] - plates["field"]).max() > 0.1
 
 
 def test_what_is_open_is_infinite_and_what_it_leaves_alone_is_not(alone):

@@ -9,6 +9,7 @@ import pytest
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration.result.summary import summary, to_dict
+from astropolcal.calibration.uncertainty import derived_data
 from astropolcal.calibration.validation.cross_validation import (
     add_standard,
     refuse_fitted,
@@ -17,6 +18,7 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, Tie
+from astropolcal.observations import Observations
 
 LAM = [1.2, 1.6, 2.2] * u.um
 META = {"source": "polarized"}
@@ -107,6 +109,34 @@ def test_some_of_the_wavelengths_will_do(make, chain, calibrated):
         for table in (own, whole):
             np.testing.assert_allclose(percent(table["s_standard"]), rms)
             np.testing.assert_allclose(table["s_cv"], calibrated.accuracy["s_cv"][rows])
+
+
+def test_order_of_the_wavelengths_does_not_matter(calibrated, chain, standard):
+    down = standard.to_table()
+    down["bin"] = 2 - down["bin"]
+    down = Observations.from_table(down, name="down")
+    chain = chain.copy()
+    for optic, key in (("derotator", "retardance"), ("wollaston", "efficiency")):
+        getattr(chain[optic], key).wavelength = LAM
+    tables = [standard_accuracy(calibrated, chain, table) for table in (standard, down)]
+    for key in ("wavelength", "s_standard", "s_cv"):
+        np.testing.assert_allclose(tables[0][key], tables[1][key][::-1], err_msg=key)
+
+
+def test_tables_of_a_group_with_values_of_its_own(make, chain, observations):
+    """What leads its parameters is in the chain of another group."""
+    later = chain.copy()
+    later["hwp"].theta = chain["hwp"].theta.quantity + 0.5 * u.deg
+    tables = [make.observe(later, wavelength=LAM, seed=i, name=f"later {i}") for i in (5, 6)]
+    start = make.chain(wavelength=LAM, fixed=False)
+    cal = calibrate(start, [observations, tables[0]], own=["hwp.theta"], cross_validate=False)
+    residuals = [cal.measurement_of(tables[1], i).residuals().std() for i in (0, 1)]
+    assert residuals[1] < 0.1 * residuals[0]
+    table = add_standard(cal, cal.chains[1], tables[1])
+    assert percent(table["s_standard"]).max() < 0.1
+    # errors are those of all parameters, wherever they lead from
+    whole, one = derived_data(cal), derived_data(cal, tables[0], 1)
+    np.testing.assert_allclose(one.std, whole.std[cal.measurement.segments[1]], rtol=1e-6)
 
 
 def test_masked_wavelength_has_no_error(calibrated, chain, standard):

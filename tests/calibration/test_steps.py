@@ -125,6 +125,23 @@ def test_later_steps_hold_what_came_before(data, fitted):
         np.testing.assert_allclose(*(v[name]["value"] for v in both), atol=1e-5)
 
 
+def test_fits_in_steps_say_how_far_off_the_minimum_they_are(data):
+    start, observations = data
+    joint, steps = (
+        calibrate(start[0], observations[0], strategy=s, search=True, cross_validate=False)
+        for s in ("joint", "two-step")
+    )
+    assert joint.fit["off_minimum"]["errors"] < 0.1
+    off = [cal.measurement.vector() / cal.measurement.free.factors() for cal in (joint, steps)]
+    off = np.abs(off[1] - off[0]) / steps.covariance.stds
+    told, i = steps.fit["off_minimum"], np.argmax(off)
+    assert told["parameter"] == steps.covariance.names[i]
+    assert told["errors"] == pytest.approx(off[i], rel=0.2)
+    cautions = "; ".join(steps.verdict().cautions)
+    assert (f"{told['parameter']} is {told['errors']:.2g} errors off" in cautions) == (off[i] > 0.5)
+    assert "off the minimum" not in str(joint.verdict().cautions)
+
+
 def test_order_of_the_datasets_does_not_matter(data, fitted):
     start, observations = data
     turned = calibrate(start[::-1], observations[::-1], strategy="sequential", cross_validate=False)

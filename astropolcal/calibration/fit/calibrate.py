@@ -15,10 +15,8 @@ user names another gauge by holding parameters (``fix=``) or by a prior.
 import platform
 import time
 import warnings
-from datetime import UTC, datetime
 from importlib.metadata import version as installed
 
-import astropy
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
@@ -36,7 +34,7 @@ from astropolcal.calibration.fit.strategies import (
 )
 from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
-from astropolcal.calibration.noise.estimates import noise_as_given
+from astropolcal.calibration.noise.estimates import noise_as_given, rms
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     GIVEN,
@@ -57,13 +55,12 @@ from astropolcal.calibration.validation.cross_validation import accuracy_table, 
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
-from astropolcal.files import columns
+from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.version import version
 from astropolcal.words import check_choice
 
 __all__ = ["calibrate"]
@@ -113,7 +110,8 @@ def calibrate(
     strategy : {"joint", "two-step", "sequential"}
         All parameters at once; or the paper's procedure for the polarized source; or
         the paper's order of datasets: polarized source, unpolarized source, stars, each
-        step holding what the ones before have found.
+        step holding what the ones before have found. Steps do not end at the minimum of all
+        parameters, to which errors belong; the verdict says which is how far off.
     observable : str or Observable, optional
         What is fitted; see `astropolcal.observations.OBSERVABLES`. By default normalized double
         differences, of tables without a column ``hwp`` single ones, and of single beams the
@@ -325,6 +323,8 @@ _LONGEST = 2.0
 _SPOILT = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
+# residuals below this are rounding, of data without noise
+_ROUNDED = 1e-6
 
 
 def _at_gauge(measurement, weighting, origin, gauge):
@@ -431,6 +431,9 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     residuals, weighting = measurement.residuals(vector), measurement.weighting
     view = view_of_measurement(measurement, vector, settings["instrument"])
     finding = complete(measurement, whitened, weighting.level, view)
+    if covariance is not None and not measurement.free.priors:
+        # by the data of all runs, too
+        finding.identifiable |= np.isfinite(covariance.stds)
     finding.branches += undecided_signs(measurement)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
@@ -458,19 +461,15 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         ties=dict(measurement.free.ties),
         stages=stages,
         measurement=measurement,
-        provenance={
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "astropolcal": version,
-            "astropy": astropy.__version__,
-            "numpy": np.__version__,
-            "scipy": installed("scipy"),
-            "python": platform.python_version(),
-        },
+        provenance=provenance()
+        | {"scipy": installed("scipy"), "python": platform.python_version()},
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     fit["masked"] = [dict(each.mask_reasons) for each in observations]
     fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
+    if covariance is None:
+        fit["off_minimum"] = _off_minimum(measurement, whitened, own)
     # the pairs of frames at odds with the fit, for summary, JSON and file
     outliers = columns(outlying_data(calibration))
     rows = zip(*outliers.values(), strict=True)
@@ -479,6 +478,19 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     keep_sky_accuracy(calibration, view)
     stage("cross-validation")
     return calibration.cross_validate() if cross_validate else calibration
+
+
+def _off_minimum(measurement, whitened, covariance):
+    """Return which parameter is farthest from the minimum nearby, and by how many errors."""
+    problem, free = Problem(measurement, measurement.weighting), measurement.free
+    vector, factor = measurement.vector(), whitened.factor()
+    # a step of Newton's; of data without noise residuals are rounding
+    pull = problem.jacobian(vector).T @ problem.residuals(vector) * whitened.scale
+    step = np.abs(factor.T @ (factor @ pull)) * whitened.scale / free.factors()
+    known = (covariance.stds > 0) & (rms(measurement.residuals()) > _ROUNDED)
+    times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
+    worst = int(np.argmax(times))
+    return {"parameter": free.names[worst], "errors": float(times[worst])}
 
 
 def _lack_of_fit(calibration, whitened):
@@ -511,12 +523,10 @@ def _lack_of_fit(calibration, whitened):
 
 def _record(measurement, i, residuals):
     observations = measurement.datasets[i].observations
+    keys = ("name", "source", "content_hash", "n_frames")
     return DatasetRecord(
-        name=observations.name,
-        source=observations.source,
-        content_hash=observations.content_hash,
+        **{key: getattr(observations, key) for key in keys},
         meta=dict(observations.meta),
-        n_frames=observations.n_frames,
         n_masked=int(observations.mask.sum()),
         accuracy=accuracy_table(measurement, i, residuals),
     )

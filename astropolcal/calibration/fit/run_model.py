@@ -92,6 +92,8 @@ class Model:
         for free, vector, scale, mine, columns in reversed(list(parts)):
             self.limits[:, columns] = (np.array(free.bounds()) / scale)[:, ~mine]
             self.value[columns] = (vector / scale)[~mine]
+        #: What is a run's own and pushed against a bound, where it stays.
+        self.stuck = [np.zeros_like(mine) for mine in self.own]
         self.chances = None
         if dates is not None:
             # one change in all runs is thought as probable as in a few
@@ -130,8 +132,9 @@ class Model:
 
     def _split(self, i):
         """Return a run's rows with what is its own projected out, and their targets."""
-        rows, targets = self._with_priors(i)
-        basis = orthonormal(rows[:, self.own[i]])
+        (rows, targets), stuck = self._with_priors(i), self.stuck[i]
+        targets = targets - rows[:, stuck] @ (self.vectors[i] / self.scales[i])[stuck]
+        basis = orthonormal(rows[:, self.own[i] & ~stuck])
         targets = targets - basis @ (basis.T @ targets)
         rows = rows - basis @ (basis.T @ rows)
         rows[:, self.own[i]] = 0.0
@@ -211,7 +214,7 @@ class Model:
         for i, mine in enumerate(self.own):
             theta = self._shares(i) @ value
             theta[mine] = (self.vectors[i] / self.scales[i])[mine]
-            rows, targets = self._with_priors(i)
+            (rows, targets), mine = self._with_priors(i), mine & ~self.stuck[i]
             theta[mine] += np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (targets - rows @ theta)
             bounds = self.work.shapes[i].free.bounds()
             out.append(np.clip(theta * self.scales[i], *bounds))
@@ -230,6 +233,11 @@ class Model:
             if sum(one.chi2 for one in rows) <= _SHORTER * cost or k == _HALVINGS - 1:
                 break
         self.value, self.vectors, self.rows = trial, vectors, rows
+        for i, vector in enumerate(vectors):
+            rows, targets = self._with_priors(i)
+            pull = rows.T @ (targets - rows @ (vector / self.scales[i]))
+            low, high = self.work.shapes[i].free.bounds()
+            self.stuck[i] = self.own[i] & np.where(pull < 0, vector <= low, vector >= high)
         return old
 
     def settle(self):
@@ -398,7 +406,7 @@ class Model:
     def errors_of(self, i):
         """Return determined and open directions of a run's parameters, in steps."""
         _, found = self._solved()
-        mine, (rows, _) = self.own[i], self._with_priors(i)
+        mine, (rows, _) = self.own[i] & ~self.stuck[i], self._with_priors(i)
         # how the run's parameters follow the coefficients
         follow = self._shares(i)
         follow[mine] = -np.linalg.pinv(rows[:, mine], rcond=_PINV) @ (rows @ follow)

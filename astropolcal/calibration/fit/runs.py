@@ -44,8 +44,9 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
+from astropolcal.measurement.parameters import told_prior
 from astropolcal.observations import Observations
-from astropolcal.observations.reading import stated_date
+from astropolcal.observations.reading import dates_of
 from astropolcal.progress import in_one_thread, stage, steps
 from astropolcal.words import check_choice, counted
 
@@ -173,8 +174,7 @@ def _dates(parts, needed):
     """Return the date of each run; None where it is not needed and one has none."""
     told = []
     for i, (_, tables) in enumerate(parts):
-        days = [stated_date(o.meta, o.name, ParameterError) for o in tables]
-        days = sorted(f"{day}-01" if len(day) == 7 else day for day in days if day)
+        days = dates_of(tables, ParameterError)
         told.append(days[0] if days else None)
         if needed and not days:
             raise ParameterError(f"run {i + 1} ({tables[0].name}) has no date in its meta")
@@ -189,13 +189,12 @@ def _dates(parts, needed):
 
 
 def _fingerprint(chains, tables, observable):
-    """Return a text that is another where tables or starting values are."""
-    values = [
-        [leaf.name, key, np.ravel(getattr(leaf, key).value).tolist(), getattr(leaf, key).fixed]
-        for chain in chains
-        for leaf in leaves(chain)
-        for key in leaf.param_names
-    ]
+    """Return a text that is another where tables, optics or what is known of them are."""
+    values = []
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        values.append(leaf.fingerprint())
+        for p in (getattr(leaf, key) for key in leaf.param_names):
+            values.append([np.ravel(p.value).tolist(), p.fixed, str(p.bounds), told_prior(p.prior)])
     known = [table.content_hash for table in tables], str(observable), values
     return uuid.uuid5(uuid.NAMESPACE_OID, json.dumps(known)).hex
 
@@ -331,9 +330,8 @@ class _Work:
         self.parts, self.token = parts, uuid.uuid4().hex
         self._map = map if executor is None else executor.map
         self.shapes = [Measurement(*part, **options) for part in parts]
-        lengths = {shape.wavelength.size for shape in self.shapes}
-        first = self.shapes[0].wavelength
-        if len(lengths) > 1 or any(not np.allclose(s.wavelength, first) for s in self.shapes):
+        first, *others = (shape.wavelength for shape in self.shapes)
+        if any(w.shape != first.shape or not np.allclose(w, first) for w in others):
             raise FitError("the runs have different wavelengths; select or resample them first")
         jobs = [(self.token, i, part, options, errors) for i, part in enumerate(parts)]
         stage("fitting the first run")
@@ -403,8 +401,11 @@ class RunsCalibration:
         return len(self._model.rows)
 
     def __repr__(self):
-        varying = [row["what"] for row in self.courses if row["course"] != "constant"]
+        varying = self._varying()
         return f"<RunsCalibration of {len(self)} runs, varying: {', '.join(varying) or 'nothing'}>"
+
+    def _varying(self):
+        return {row["what"]: row["course"] for row in self.courses if row["course"] != "constant"}
 
     def _courses(self):
         model, rows = self._model, []
@@ -514,9 +515,6 @@ class RunsCalibration:
         whitened = Problem(measurement, measurement.weighting).around()
         covariance = self._covariance(run)
         told = {"converged": self.converged, "message": f"one likelihood of {len(self)} runs"}
-        varying = {
-            row["what"]: row["course"] for row in self.courses if row["course"] != "constant"
-        }
         return _result(
             measurement,
             whitened,
@@ -527,7 +525,7 @@ class RunsCalibration:
                 "loss": "linear",
                 "errors": "scatter" if one.scatter is not None else "white",
                 "gauge": "least change from the first run",
-                "runs": {"count": len(self), "varying": varying},
+                "runs": {"count": len(self), "varying": self._varying()},
             },
             fit=told | {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0},
             stages=[],

@@ -38,7 +38,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.measurement.parameters import are_outside, ties_among
 from astropolcal.progress import stage, steps
 
 __all__ = []
@@ -367,11 +367,8 @@ def fit_once(measurement, weighting, fitter):
 
 def outside_bounds(measurement):
     """Return the names of parameters that a fitter without bounds left outside of theirs."""
-    low, high = measurement.free.bounds()
-    vector = measurement.vector()
     # a fitter that minds the bounds ends on them only as exactly as rounding allows
-    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
-    outside = (vector < low - slack) | (vector > high + slack)
+    outside = are_outside(measurement.vector(), *measurement.free.bounds())
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 
 
@@ -608,7 +605,7 @@ def _step_of(measurement, chains, held, options, rows=None):
     copies = [chains[i].copy() for i in rows]
     table = parameter_table(copies)
     # a tie needs a source that is free in this step
-    live = {n: tie for n, tie in ties.items() if {n, tie.source} <= set(table) - held}
+    live = ties_among(ties, set(table) - held)
     for name in (held | set(ties) - set(live)) & set(table):
         for parameter in table[name]:
             parameter.fixed = True

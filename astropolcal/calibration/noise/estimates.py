@@ -525,20 +525,22 @@ def noise_from_roughness(measurement, vector=None):
             variance = _SINGLE.variance(*(x[None] for x in (*fluxes, *errors)))
             difference = _SINGLE.evaluate(*(x[None] for x in fluxes))
             residual = difference - _predicted_differences(part, vector).T
-        frames = SimpleNamespace(variance=variance[None], valid=np.isfinite(residual))
+        # neighbours are those along the wavelengths, whatever the order of the table
+        valid, order = np.isfinite(residual), np.argsort(part.bins)
+        frames = SimpleNamespace(variance=variance[None, order], valid=valid[order])
         angles = {}
         for stage, angle in part.positions.items():
             angles[stage] = np.zeros(obs.n_frames)
             angles[stage][part.frames.T] = angle
-        residual = np.where(frames.valid, residual, 0.0)
-        (sigma,) = frame_noise(frames, residual[None], angles)
+        (sigma,) = frame_noise(frames, np.where(valid, residual, 0.0)[None, order], angles)
+        sigma = sigma[np.argsort(order)]
         of_data = np.mean(sigma[:, part.frames] ** 2, axis=-1)[part.valid]
         sigmas.append(np.sqrt(of_data / part.observable.frames_per_datum))
-        known = np.isfinite(variance) & (variance > 0) & frames.valid
+        known = np.isfinite(variance) & (variance > 0) & valid
         stands = np.allclose(sigma[known], np.sqrt(variance[known])) and known.any()
         # with stated errors one number is estimated, without those of a few wavelengths each
         share = 1.0 if known.any() else _FEWEST_ROUGH / obs.n_bins
-        freedom += [np.inf if stands else share * _TELLS * frames.valid.sum()] * len(part.bins)
+        freedom += [np.inf if stands else share * _TELLS * valid.sum()] * len(part.bins)
     words = (
         "the stated errors, or more where single frames are rough along the wavelengths: photon "
         "and read noise, and what else is sharp in wavelength; not flicker that neighbouring "

@@ -226,10 +226,10 @@ class Problem:
         self.noise = weighting.level
         self._low, self._high = measurement.free.bounds()
 
-    def residuals(self, vector, weights=None):
+    def residuals(self, vector, weights=None, drawn=0.0):
         """Return weighted residuals of data and priors, model minus observed."""
         data = self.measurement.predict(vector) - self.measurement.observed
-        priors = self.noise * self.measurement.free.prior_residuals(vector)
+        priors = self.noise * (self.measurement.free.prior_residuals(vector) - drawn)
         return np.concatenate([data * (self.weights if weights is None else weights), priors])
 
     def jacobian(self, vector, weights=None):
@@ -246,11 +246,12 @@ class Problem:
         priors = free.prior_jacobian(vector, for_errors=True) * self.noise
         return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
 
-    def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS):
+    def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
         """Return the vector, chi-square, and what scipy says of the fit.
 
-        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are, and
-        ``evaluations`` after how many the fit ends, where it has not arrived.
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are,
+        ``evaluations`` after how many the fit ends, where it has not arrived, and ``drawn`` the
+        residuals at which priors have their peaks.
         """
         # a calibration is read where there is no scipy
         from scipy.optimize import least_squares
@@ -268,7 +269,7 @@ class Problem:
         size = np.linalg.norm(self.jacobian(start, weights), axis=0)[live]
 
         def residuals(part):
-            return self.residuals(place(part), weights)
+            return self.residuals(place(part), weights, drawn)
 
         def slopes(part):
             return self.jacobian(place(part), weights)[:, live]
@@ -468,6 +469,8 @@ def given_noise(measurement, noise):
     if not np.all(np.isfinite(noise) & (noise > 0)):
         raise ParameterError(f"noise must be positive and finite; the least is {np.min(noise)}")
     if noise.shape == measurement.wavelength.shape:
+        if np.ptp(noise) > 0 and any(dataset.descends for dataset in measurement.datasets):
+            raise ParameterError("noise: the wavelengths do not ascend; give one per datum")
         return noise[measurement.bins]
     if noise.shape not in ((), (measurement.n_data,)):
         raise ParameterError(

@@ -27,6 +27,7 @@ from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.calibration.uncertainty.covariance import widening
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.measurement.parameters import told_prior
 from astropolcal.progress import in_one_thread, shown, steps
 from astropolcal.units import check_seed
 from astropolcal.words import check_type, did_you_mean
@@ -145,12 +146,8 @@ class LogPosterior:
 
     def _chi2(self, vector):
         # not through Measurement.predict, which keeps its last sweep for the fitters
-        chi2, measurement = 0.0, self.measurement
-        for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
-            residual = dataset.observed - dataset.values(dataset.forward(vector))
-            residual /= self.sigma[segment]
-            chi2 += residual @ residual
-        return chi2
+        parts = [d.values(d.forward(vector)) for d in self.measurement.datasets]
+        return np.sum(((self.measurement.observed - np.concatenate(parts)) / self.sigma) ** 2)
 
     def whitened_jacobian(self):
         """Return derivatives of data and priors over their noise, (n, n_data + n_priors)."""
@@ -574,10 +571,7 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
         "ties": [[name, t.source, t.factor, str(t.offset)] for name, t in free.ties.items()],
         "data": [dataset.observations.content_hash for dataset in measurement.datasets],
         "observable": measurement.observable.name,
-        "priors": [
-            [slot.name, (f := p.distribution).dist.name, repr(f.args), repr(sorted(f.kwds.items()))]
-            for slot, p in free.priors
-        ],
+        "priors": [[slot.name, told_prior(prior.distribution)] for slot, prior in free.priors],
         "n_walkers": int(n_walkers),
         "thin": int(thin),
         "moves": move_names(moves),
@@ -593,13 +587,9 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
 
 
 def _optic(leaf):
-    """Return class, name and stage of an optic, and the values of what is fixed."""
-    fixed = {
-        key: np.asarray(getattr(leaf, key).value).tolist()
-        for key in leaf.param_names
-        if getattr(leaf, key).fixed
-    }
-    return [type(leaf).__name__, leaf.name, leaf.mount, fixed]
+    """Return what an optic is, and the values of what is fixed."""
+    held = (getattr(leaf, key) for key in leaf.param_names if getattr(leaf, key).fixed)
+    return [*leaf.fingerprint(), {p.name: np.asarray(p.value).tolist() for p in held}]
 
 
 def _settings(log_posterior, moves, weights, version):

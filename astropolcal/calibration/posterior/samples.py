@@ -4,6 +4,7 @@
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property, partial
 from importlib import import_module
+from inspect import signature
 
 import astropy.units as u
 import numpy as np
@@ -212,19 +213,6 @@ def _extreme(values, names, largest):
 DRAWS = 4000
 # steps left out at the start, in autocorrelation times
 _BURN_IN = 5
-_KEYS = (
-    "names",
-    "units",
-    "chain",
-    "log_prob",
-    "acceptance",
-    "fitted",
-    "thin",
-    "seed",
-    "settings",
-    "burn_in",
-    "convergence",
-)
 
 
 class Posterior:
@@ -661,3 +649,7 @@ class Posterior:
             raise ParameterError(f"posterior with missing or unknown {', '.join(odd)}")
         found = parts["convergence"]
         return cls(**(parts | {"convergence": None if found is None else Convergence(**found)}))
+
+
+# all that makes a posterior
+_KEYS = tuple(signature(Posterior).parameters)

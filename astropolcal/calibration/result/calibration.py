@@ -30,9 +30,10 @@ from astropolcal.exceptions import (
     CalibrationFileError,
     ObservationError,
 )
-from astropolcal.measurement import Measurement
+from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations import Observations
-from astropolcal.observations.reading import stated_date
+from astropolcal.observations.reading import dates_of
 from astropolcal.units import iso_date
 from astropolcal.words import html
 
@@ -269,7 +270,7 @@ class Calibration:
             observations,
             observable=self.settings["observable"],
             positions=None if positions is None else [positions],
-            ties=self.ties,
+            ties=ties_among(self.ties, parameter_table([self.chains[dataset]])),
             wavelength=self.wavelength,
         )
 
@@ -719,7 +720,7 @@ def validity_of(calibration):
     stated = calibration.settings.get("validity") or {}
     if not isinstance(stated, dict) or set(stated) - set(_STATED):
         raise CalibrationFileError(f"validity = {stated!r}; allowed are {', '.join(_STATED)}")
-    records, dates = calibration.datasets, _dates(calibration)
+    records, dates = calibration.datasets, dates_of(calibration.datasets, CalibrationFileError)
     # of several modes none is that of the calibration
     modes = {record.meta.get("mode") for record in records}
     mode = modes.pop() if len(modes) == 1 else None
@@ -733,13 +734,6 @@ def validity_of(calibration):
             instrument = instruments.get(calibration.instrument)
             derived["optics_in"] = [list(instrument.setup(record)[1]) for record in records]
     return Validity(calibration.instrument, **(derived | stated))
-
-
-def _dates(calibration):
-    """Return the dates of a calibration's data, the oldest first."""
-    dates = (stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets)
-    # a month alone begins on its first day
-    return sorted(f"{d}-01" if len(d) == len("2025-10") else d for d in dates if d is not None)
 
 
 def with_validity(calibration, **stated):

@@ -352,18 +352,14 @@ def to_dict(calibration, targets=TARGETS):
     content = {
         "verdict": verdict(calibration, targets).to_dict(),
         "instrument": calibration.instrument,
-        "observable": settings["observable"],
-        "fitter": settings["fitter"],
-        "strategy": settings["strategy"],
-        "weights": settings["weights"],
+        **{key: settings[key] for key in ("observable", "fitter", "strategy", "weights")},
         "gauge": settings.get("gauge"),
         "seconds": fit["seconds"],
         "converged": calibration.converged,
         "n_data": fit["n_data"],
         "n_free": len(calibration.covariance),
         "rank": calibration.identifiability.rank,
-        "lack_of_fit": fit.get("lack_of_fit") or [],
-        "outliers": fit.get("outliers") or [],
+        **{key: fit.get(key) or [] for key in ("lack_of_fit", "outliers")},
         "datasets": [
             _dataset(record) | {"masked": reasons}
             for record, reasons in zip(calibration.datasets, _masked(calibration), strict=True)

@@ -12,7 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.measurement.parameters import is_outside
+from astropolcal.measurement.parameters import are_outside, limits
 from astropolcal.words import HEIGHT, WIDTH, counted, p_words, shortened
 
 __all__ = ["Verdict"]
@@ -31,6 +31,8 @@ _MISFIT = 2 * u.percent
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
 _CLEARLY = 2
+# values farther from the minimum, in units of the errors there, have larger errors
+_OFF = 0.5
 # errors that rest on fewer numbers are themselves known to a third or worse
 _FEW_FREEDOM, _FEW_SETTINGS = 5, 6
 
@@ -115,9 +117,13 @@ def verdict(calibration, targets=TARGETS):
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         cautions += [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
+        off = calibration.fit.get("off_minimum") or {"errors": 0.0}
+        if off["errors"] > _OFF:
+            cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
-        beyond = [n for n, e in known.items() if e["tied"] and is_outside(e["value"], e["bounds"])]
+        tied = {name: entry for name, entry in known.items() if entry["tied"]}
+        beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
         if any("disagree with the priors" in test["words"] for test in tests):
             cautions.append("data and priors disagree")

@@ -368,16 +368,11 @@ def widening(problem, with_scatter):
 def white_covariance(measurement, whitened, weighting):
     """Return the covariance of independent data with the noise that the fit assumed."""
     free, level = measurement.free, weighting.level
-    if weighting.follows is not None:
+    if np.isfinite(level):
         middle = level**2 * np.eye(whitened.errors.rank)
         return sandwich(measurement, whitened, weighting, middle)
-    # canonical to declared units: one factor for the row and one for the column
-    declared = 1 / free.factors()
-    matrix = whitened.covariance() * level**2 * np.outer(declared, declared)
-    per_unit = whitened.scale / free.factors()
-    factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
-    null = whitened.null() * per_unit
-    return Covariance(free.names, free.units, matrix, factor=factor, null=null)
+    unknown, null = np.full((free.size,) * 2, np.nan), whitened.null() * whitened.scale
+    return Covariance(free.names, free.units, unknown, null=null / free.factors())
 
 
 def sandwich(measurement, whitened, weighting, middle, slack=None):

@@ -190,9 +190,7 @@ def propagate(calibration, function, derivatives=None):
 
     axes = full_covariance(calibration)._axes()
     parts = [
-        np.stack([slope(row) for row in rows], axis=1)
-        if len(rows)
-        else np.zeros((np.size(value), 0))
+        np.array([slope(row) for row in rows]).reshape(len(rows), np.size(value)).T
         for rows in (axes.known, axes.open, axes.blind)
     ]
     return _package(free, axes, value, parts)
@@ -521,13 +519,13 @@ def derived_data(calibration, observations=None, dataset=0):
     else:
         measurement = calibration.measurement_of(observations, dataset)
     vector = measurement.vector()
+    jacobian, free = measurement.jacobian(vector), free_of(calibration)
     # per declared unit, (n_data, n_free)
-    jacobian = measurement.jacobian(vector).T * measurement.free.factors()
-    free = free_of(calibration)
     slopes = np.zeros((measurement.n_data, free.size))
-    columns = {name: i for i, name in enumerate(free.names)}
-    # a dataset's chain may have fewer parameters than the whole calibration
-    slopes[:, [columns[name] for name in measurement.free.names]] = jacobian
+    for slot in measurement.free.slots:
+        # what leads a parameter need not be in the dataset's own chain
+        own, factor, _ = free.lookup(slot.name)
+        slopes[:, own.slice] += jacobian[slot.slice].T * factor * own.factor
     return derive(calibration, free, measurement.predict(vector).copy(), slopes)
 
 

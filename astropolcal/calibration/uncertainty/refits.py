@@ -28,7 +28,6 @@ from astropolcal.calibration.identifiability.linearized import (
     STILL,
     Whitened,
     declared_step,
-    decompose,
 )
 from astropolcal.calibration.noise.scatter import labels_of
 from astropolcal.calibration.noise.weighting import problem_of
@@ -341,6 +340,8 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     """
     Refit resampled data, drawn in blocks of frames with replacement.
 
+    The peaks of priors are drawn too, each from its own prior.
+
     Parameters
     ----------
     calibration : Calibration
@@ -408,7 +409,9 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
             often = np.concatenate(often).astype(float)
             seen = _singular_values(refit, np.sqrt(often))[: wanted.size]
             if np.all(seen >= _LOST * wanted):
-                vector, _, found = refit.fit(refit.solution, often)
+                # a prior is a datum too, and may have come out otherwise
+                peaks = rng.normal(size=measurement.n_priors)
+                vector, _, found = refit.fit(refit.solution, often, drawn=peaks)
                 if found.success:
                     samples.append(vector)
                     add()
@@ -659,12 +662,9 @@ def _per_wavelength(calibration):
         own = np.array([j for j in own if names[j] not in at_bound], dtype=int)
         rows = measurement.bins == i
         if own.size and rows.sum() > own.size:
-            scale = physical_scale(free)[own]
-            found = decompose(jacobian[np.ix_(own, np.flatnonzero(rows))].T * scale)
             # no number for what the data leave open
-            half = np.linalg.norm(found.half, axis=0)
-            unit_noise = np.where(found.determined, half, np.nan) * scale
+            found = Whitened(jacobian[own][:, rows], physical_scale(free)[own]).covariance()
             # the common parameters count as known, so that only a wavelength's own take freedom
             variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
-            stds[own] = np.sqrt(variance) * unit_noise
+            stds[own] = np.sqrt(variance * np.diag(found))
     return stds / free.factors()

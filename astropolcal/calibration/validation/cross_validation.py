@@ -21,10 +21,12 @@ from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
 from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
+from astropolcal.calibration.system import free_of
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError
 from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations.reading import SAME_WAVELENGTH, bins_on_grid
 from astropolcal.optics import PolarizedSource
 from astropolcal.progress import steps
@@ -79,9 +81,9 @@ def held_out_residuals(calibration, groups=None):
     ``groups`` may be a word, see `groups_by`.
     """
     live = calibration.live_measurement()
-    equal = calibration.settings.get("weights") is None
     groups = groups_by(live, groups) if isinstance(groups, str) else groups
-    weights = None if equal else weighting_of(calibration).weight
+    # of equal weights there are none
+    weights = weighting_of(calibration).weight if calibration.settings.get("weights") else None
     return cross_validated_residuals(live, weights, groups)
 
 
@@ -482,16 +484,8 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     """
     refuse_fitted(calibration, observations)
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
-    predicted = predicted_chain(calibration, chain, observations)
-    known = parameter_table([predicted])
     fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
-    measurement = Measurement(
-        predicted,
-        observations,
-        observable=calibration.settings["observable"],
-        positions=None if positions is None else [positions],
-        ties={k: t for k, t in calibration.ties.items() if k in known and t.source in known},
-    )
+    measurement = predicted_measurement(calibration, chain, observations, positions)
     table = _errors(measurement)
     same = [record for record in calibration.datasets if record.source == observations.source]
     # s_cv over the data of the same source, or over all
@@ -500,17 +494,14 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     table["s_cv"] = _pooled(calibration.wavelength.to_value(u.nm), found)[rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         table["chi"] = (table["s_standard"] / table["s_cv"]).to_value(u.one)
-    finding, free = calibration.identifiability, measurement.free
-    place = {name: i for i, name in enumerate(finding.names)}
-    # columns of the finding that belong to the standard's free parameters, at its wavelengths
-    columns = []
-    for slot in free.slots:
-        single = slot.name in place
-        names = [slot.name] if single else [f"{slot.name}[{row}]" for row in rows]
-        columns += [place[name] for name in names]
-    # open directions of the calibration, as far as the standard's chain has the parameters
-    null = np.asarray(finding.null_vectors).reshape(-1, len(place))[:, columns]
-    moved = (null * physical_scale(free)) @ measurement.jacobian(measurement.vector())
+    # open directions of the calibration, as far as the standard's chain follows them
+    free, moved = free_of(calibration), np.zeros((1, measurement.n_data))
+    null = np.reshape(calibration.identifiability.null_vectors, (-1, free.size))
+    null, jacobian = null * physical_scale(free), measurement.jacobian(measurement.vector())
+    for slot in measurement.free.slots:
+        own, factor, _ = free.lookup(slot.name)
+        columns = own.start + (np.sort(rows) if own.per_wavelength else np.zeros(1, dtype=int))
+        moved = moved + factor * null[:, columns] @ jacobian[slot.slice]
     table.meta |= {
         "name": observations.name,
         "source": observations.source,
@@ -523,12 +514,25 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     return table
 
 
-def predicted_chain(calibration, chain, observations, sources=False):
+def predicted_measurement(calibration, chain, observations, positions=None, sources=False):
+    """Return the measurement of a standard with the values of a calibration."""
+    predicted = _predicted_chain(calibration, chain, observations, sources)
+    return Measurement(
+        predicted,
+        observations,
+        observable=calibration.settings["observable"],
+        positions=None if positions is None else [positions],
+        ties=ties_among(calibration.ties, parameter_table([predicted])),
+    )
+
+
+def _predicted_chain(calibration, chain, observations, sources):
     """Return the chain with the calibration's values where it has the optic, and its flags.
 
     At the wavelengths of the observations; polarized sources stay free if ``sources``.
     """
-    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
+    # ascending, whatever the order of the table
+    rows = np.sort(bins_on_grid(observations, calibration.wavelength.to_value(u.um)))
     # reversed, so that of optics in several chains the first dataset's counts
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
@@ -555,6 +559,8 @@ def predicted_chain(calibration, chain, observations, sources=False):
             # catalogue knows stays as it is
             getattr(new, key).fixed = parameter.fixed or is_new
             getattr(new, key).bounds = parameter.bounds
+            if parameter.grid is not None:
+                getattr(new, key).wavelength = calibration.wavelength[rows]
             getattr(new, key).prior = None
         train.append(new)
     if unknown:
@@ -669,10 +675,8 @@ def add_standard(calibration, chain, observations, positions=None):
     True
     """
     table = standard_accuracy(calibration, chain, observations, positions)
-    entry = {key: table.meta[key] for key in ("name", "source", "content_hash", "n_frames")}
-    entry |= columns(table, "wavelength", "n", "s_standard", "bias", "scatter", "s_cv", "chi")
-    entry |= {key: table.meta[key] for key in ("open_percent", "not_calibrated", "words")}
-    keep(calibration, "standards", entry)
+    keys = ("wavelength", "n", "s_standard", "bias", "scatter", "s_cv", "chi")
+    keep(calibration, "standards", columns(table, *keys) | dict(table.meta))
     for record in (r for r in calibration.datasets if r.accuracy is not None):
         same = (s for s in calibration.fit["standards"] if s["source"] == record.source)
         found = [(s["wavelength_nm"], s["s_standard_percent"], s["n"]) for s in same]

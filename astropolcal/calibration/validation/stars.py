@@ -9,7 +9,7 @@ from astropolcal import standards, stokes
 from astropolcal.calibration.validation.cross_validation import (
     add_percent,
     keep,
-    predicted_chain,
+    predicted_measurement,
     refuse_fitted,
 )
 from astropolcal.calibration.validation.targets import target_accuracies
@@ -21,7 +21,6 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.files import columns
-from astropolcal.measurement import Measurement
 from astropolcal.observations.grid import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
@@ -91,19 +90,13 @@ def star_stokes(calibration, chain, observations, positions=None):
     if not isinstance(first, PolarizedSource):
         raise ChainError("the chain of a star begins with a PolarizedSource")
     chain = join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
-    predicted = predicted_chain(calibration, chain, observations, sources=True)
-    measurement = Measurement(
-        predicted,
-        observations,
-        observable=calibration.settings["observable"],
-        positions=None if positions is None else [positions],
-    )
+    measurement = predicted_measurement(calibration, chain, observations, positions, sources=True)
     vector, (part,) = measurement.vector(), measurement.datasets
     # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
-    name = leaves(measurement.chains[0])[0].name
     jacobian = measurement.jacobian(vector)
     residuals = measurement.residuals(vector)
-    slopes = np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
+    slots = (measurement.free.by_name[f"{first.name}.{key}"] for key in "qu")
+    slopes = np.stack([jacobian[slot.start] for slot in slots])
     cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
     labels = np.unique(cycle)
     found = np.full((2, len(part.bins), len(labels)), np.nan)
@@ -433,8 +426,7 @@ def _words(table):
 def add_star_check(calibration, chain, observations, positions=None):
     """Check a calibration with a star, as `star_check`, and keep the result in ``fit["stars"]``."""
     table = star_check(calibration, chain, observations, positions)
-    entry = {key: table.meta[key] for key in ("name", "star", "words")}
-    entry["content_hash"] = observations.content_hash
-    entry |= columns(table, "wavelength", "n_cycles", *_KEPT)
+    entry = {"content_hash": observations.content_hash}
+    entry |= table.meta | columns(table, "wavelength", "n_cycles", *_KEPT)
     keep(calibration, "stars", entry)
     return table
