@@ -108,7 +108,8 @@ def _axes(header, corrected):
         step = corrected.pixel_scale / 3.6e6
         # offsets from the star, not coordinates on the sky
         for axis, name, sign in ((1, "XOFFSET", -1), (2, "YOFFSET", 1)):
-            header[f"CTYPE{axis}"] = (name, "from the star" + (", to the east" if sign < 0 else ""))
+            east = ", to the east" * (sign < 0 and corrected.north_up)
+            header[f"CTYPE{axis}"] = (name, f"from the star{east}")
             header[f"CUNIT{axis}"] = "deg"
             # FITS counts pixels from one
             header[f"CRPIX{axis}"] = corrected.centre[axis - 1] + 1

@@ -77,6 +77,7 @@ def test_q_phi_says_where_north_is_not_known_to_be_up(corrected, tmp_path):
         dataclasses.replace(corrected, north_up=up).write(path)
         with fits.open(path) as hdus:
             assert ("as if north were up" in str(hdus["QPHI"].header.get("COMMENT", ""))) != up
+            assert ("east" in hdus[0].header.comments["CTYPE1"]) == up
 
 
 def test_astropy_reads_the_stokes_axis(path):
