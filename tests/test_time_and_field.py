@@ -452,7 +452,7 @@ def test_own_parameters_that_cannot_be(still, nights):
     for own, message in [
         (["plate.theta"], "own = 'plate.theta'; allowed are polarizer.theta"),
         (["hwp.theta"], "own: hwp.theta is fixed"),
-        ({"polarizer.theta": [1, 2]}, "own: polarizer.theta has 2 groups; there are 3 datasets"),
+        ({"polarizer.theta": [1, 2]}, "own: polarizer.theta has 2 groups for 3 datasets"),
     ]:
         with pytest.raises(ParameterError, match=message):
             calibrate(still, nights, own=own, **ARRAY)

@@ -449,7 +449,7 @@ def text(content, frames=(), written=()):
 def short(content, ends):
     """Return the lines of a terminal: what is found and its causes, then the given ones."""
     causes, room = content["causes"], _SUMMARY - 2 - len(ends)
-    for most in (len(causes), _NAMED, 1):
+    for most in (len(causes), _NAMED, 1, 0):
         lines = _joined([content["sentences"], _table_lines(causes, most)]).split("\n")
         if len(lines) <= room:
             break
@@ -476,7 +476,7 @@ def _wrapped(lines):
 
 def _table_lines(causes, most):
     """Return a line per cause: rank, probability, what it explains, what double differences see."""
-    if not causes:
+    if not causes[:most]:
         return []
     more = [f"and {len(causes) - most} more"] if len(causes) > most else []
     rows = [("", "probability", "explains", "in double diff.", "cause")]

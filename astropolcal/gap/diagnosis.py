@@ -117,7 +117,7 @@ class Diagnosis:
     nominal, improved : Model
         The model before, and with all causes in it.
     causes : list of Cause
-        Largest first.
+        In the order in which they were found.
     scan : Scan
         Evidence for all causes beside the nominal model.
     held_out : list of HeldOut

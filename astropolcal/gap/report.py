@@ -422,6 +422,9 @@ def _narrow(figure):
     places = [axes.get_subplotspec() for axes in panels]
     size, title = tuple(figure.get_size_inches()), figure.get_suptitle()
     ticks = [axis.get_tick_params() for axes in panels for axis in (axes.xaxis, axes.yaxis)]
+    # names of groups of frames, which stand side by side; those of columns are turned already
+    named = [axes for axes in panels if axes.xaxis.get_tick_params().get("length") == 0]
+    named = [axes for axes in named if axes.get_xticklabels()[0].get_rotation() == 0]
     own = list(dict.fromkeys(places))
     rows = max((place.get_gridspec().nrows for place in own), default=1)
     if len(own) > rows:
@@ -432,9 +435,13 @@ def _narrow(figure):
             axes.tick_params(labelbottom=True, labelleft=True)
     figure.set_size_inches(min(_NARROW, size[0]), size[1] * max(len(own), 1) / rows)
     _title(figure, "\n".join(part for line in title.split("\n") for part in wrap(line, _TITLE)))
+    for axes in named:
+        axes.tick_params(axis="x", rotation=90)
     try:
         yield
     finally:
+        for axes in named:
+            axes.tick_params(axis="x", rotation=0)
         for axes, place, x, y in zip(panels, places, ticks[::2], ticks[1::2], strict=True):
             axes.set_subplotspec(place)
             axes.tick_params(labelbottom=x["labelbottom"], labelleft=y["labelleft"])

@@ -27,7 +27,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, counted
 
 __all__ = ["Normal", "Tie", "parameter_table"]
 
@@ -185,18 +185,14 @@ def with_own(chains, names, own, ties=None):
     table, ties, optics = parameter_table(chains), dict(ties or {}), {}
     for name, groups in own.items():
         groups = list(map(str, groups))
-        count = len(chains)
         check_choice("own", name, table, ParameterError)
-        if len(groups) != count:
-            raise ParameterError(
-                f"own: {name} has {len(groups)} groups; there are {count} datasets"
-            )
+        if len(groups) != len(chains):
+            given, needed = counted(len(groups), "group"), counted(len(chains), "dataset")
+            raise ParameterError(f"own: {name} has {given} for {needed}; give a name for each")
         if table[name][0].fixed:
             raise ParameterError(f"own: {name} is fixed; what has several values has to be free")
         if name in ties or any(tie.source == name for tie in ties.values()):
-            raise ParameterError(
-                f"own: {name} is part of a tie; allowed are parameters that are not"
-            )
+            raise ParameterError(f"own: {name} is part of a tie; allowed are those that are not")
         optic, key = name.split(".")
         optics.setdefault(optic, {})[key] = groups
     trains, copies = [leaves(chain.copy()) for chain in chains], {}

@@ -12,6 +12,7 @@ import io
 import re
 import textwrap
 import warnings
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -47,7 +48,13 @@ def read_ecsv(path):
         _check_header(path, text)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # doubtful units and types are errors below
-            table = QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
+            try:
+                table = QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
+            except ValueError:
+                # astropy does not say which row it is; without a header there are no columns
+                with suppress(AttributeError):
+                    _check_numbers(path, text)
+                raise
             if _ODD_NUMBERS.search(text):
                 _check_numbers(path, text)
         return table
@@ -77,10 +84,11 @@ def _check_header(path, text):
 
 
 def _check_numbers(path, text):
-    """Refuse what astropy reads as numbers, as Python does, though no program writes them so."""
+    """Refuse what is not a number, or is one to Python although no program writes it so."""
     reader = ascii.get_reader(ascii.Ecsv)
-    reader.read(text)
-    for column in (c for c in reader.cols if c.data.dtype.kind in "iuf" and c.data.ndim == 1):
+    with suppress(ValueError):
+        reader.read(text)
+    for column in (c for c in reader.cols if c.dtype.startswith(("int", "uint", "float"))):
         for row, cell in enumerate(column.str_vals):
             try:
                 plain_number(cell)

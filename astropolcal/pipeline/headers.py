@@ -370,5 +370,5 @@ def _max_age(max_age, held, instrument):
     except (TypeError, u.UnitConversionError):
         days = np.nan
     if not days >= 0:
-        raise ParameterError(f"max_age = {max_age!r}; a time is needed, such as 1 yr")
+        raise ParameterError(f"max_age = {max_age}; a time from zero is needed, such as 1 yr")
     return days

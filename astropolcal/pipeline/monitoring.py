@@ -115,7 +115,7 @@ def _positive(name, value, unit):
     except (TypeError, u.UnitConversionError):
         number = np.nan
     if not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r}; allowed are numbers of {unit} above zero")
+        raise ParameterError(f"{name} = {value}; allowed are numbers of {unit} above zero")
     return number
 
 

@@ -114,7 +114,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
 def _draw_panels(panels, calibration, records, standards, others, curves):
     """Draw the accuracies of the datasets, then of what was not fitted, over the wavelength."""
     for axes, record in zip(panels, records, strict=False):
-        name = f"{record.name}: " if len(panels) > 1 else ""
+        name = f"{record.name}\n" if len(panels) > 1 else ""
         counts = f"n = {_span(record.accuracy['n'])} data per wavelength"
         axes.set_title(f"{name}{counts}, k = {np.max(record.accuracy['k'])} free parameters")
         lam = st.nanometres(record.accuracy["wavelength"])
@@ -133,7 +133,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
             look["label"] = _PREDICTED.format(entry["name"])
             st.draw_line(axes, entry["wavelength_nm"], entry["s_standard_percent"], **look)
     for axes, entry in zip(panels[len(records) :], others, strict=True):
-        axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data per wavelength, predicted")
+        axes.set_title(f"{entry['name']}\nn = {_span(entry['n'])} data per wavelength, predicted")
         look = {"color": st.GREEN, "alpha": 0.6, "label": _COMPARED}
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
@@ -293,7 +293,11 @@ def _draw_targets(axes, tables, key):
         look |= {"markerfacecolor": "none"} if below else {}
         lines.append(st.draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
         values.append(value)
-    st.scale_axis(axes, np.concatenate(values))
+    if not np.isfinite(values).any():
+        axes.set_yticks([])
+        st.note(axes, "open: the data of the calibration do not determine it")
+    else:
+        st.scale_axis(axes, np.concatenate(values))
     return lines
 
 

@@ -101,7 +101,7 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
         # optics before the analyzer may add polarization of their own
         ax.set(xlabel="derotator offset (deg)", ylabel=_SHARE)
         ax.set(ylim=(-0.02, 1.02 * max(1.0, np.max(table["mean"]))))
-        ax.set_title(f"{best.law} still; over all times and wavelengths")
+        ax.set_title(f"{best.law} stabilized; over all times and wavelengths")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
         fig.suptitle(title or "Polarimetric efficiency of an observation")
     return fig

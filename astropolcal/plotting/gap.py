@@ -172,13 +172,13 @@ def plot_gap_frames(diagnosis, *, figure=None):
                 axes.plot(x, old - new, color=st.BLACK, linewidth=1, label="what the causes do")
                 axes.plot(x, new, "o", color=st.BLUE, markersize=4, label="after")
             of = nm[third]
-            axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
+            axes.set_title(f"{name}\n{of.min():.0f} to {of.max():.0f} nm", loc="left")
             axes.set_ylabel(f"observed {st.MINUS} model (%)")
             _frame_axis(axes, observations)
         for axes, (i, frames) in zip(panels[len(datasets) :], told, strict=True):
             name, observations, *_ = datasets[i]
             _course_panel(axes, course, i, frames, 1000 * diagnosis.nominal.problem.wavelength)
-            axes.set_title(f"{name}: {course.place}, {course.kind}, any course", loc="left")
+            axes.set_title(f"{name}\n{course.place}, {course.kind}, any course", loc="left")
             axes.set_xlim(panels[i].get_xlim())
             _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
@@ -245,7 +245,7 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
         for row, pair, (name, observations, nm, *_) in zip(panels, gaps, datasets, strict=True):
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
                 drawn = st.draw_map(axes, gap, nm, limit)
-                axes.set_title(f"{name}, {when}: rms {st.rms(gap):.2g} %", loc="left")
+                axes.set_title(f"{name}\n{when}: rms {st.rms(gap):.2g} %", loc="left")
                 _frame_axis(axes, observations)
             row[1].set_ylabel("")
         st.color_bar(figure, drawn, panels, clipped)

@@ -282,7 +282,7 @@ def _write(axes, x, y, value, sign="-"):
     """Write a number into its cell, in white on dark ground."""
     color = "white" if abs(value) > _PALE else "black"
     text = f"{value:{sign}.2f}".replace("-", st.MINUS)
-    axes.text(x, y, text, color=color, ha="center", va="center")
+    axes.text(x, y, text, color=color, ha="center", va="center", fontsize=9)
 
 
 # ---- (c) half-wave-plate angles ---------------------------------------------------------------
@@ -303,7 +303,9 @@ def _angles(calibration, hwp):
 def _draw_conditions(axes, finding, angles):
     axes.set_title("(c) half-wave-plate angles")
     if angles is None:
-        lines = [line for text in finding.sampling for line in textwrap.wrap(text, 40)]
+        # stars that would help have no room here
+        own = [text for text in finding.sampling if text.startswith("half-wave-plate angles")]
+        lines = [line for text in own for line in textwrap.wrap(text, 40)]
         _say(axes, "\n".join(lines) or "half-wave-plate angles are not known")
         return
     found = harmonic_conditions(angles)

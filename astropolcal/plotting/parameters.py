@@ -627,7 +627,8 @@ def draw_accuracies(group, goal=None, *, figure=None):
             ("s_res_percent", st.VERMILION, "s", "residuals of the fit (s_res)"),
         ):
             values = np.array([one[key] for one in dated], dtype=float)
-            ax.plot(dates, values, color=color, marker=marker, lw=1, label=label)
+            if np.isfinite(values).any():
+                ax.plot(dates, values, color=color, marker=marker, lw=1, label=label)
         if goal is not None:
             ax.axhline(goal, color=st.BLACK, ls="--", lw=1, label="goal")
         for one in group["events"]:

@@ -41,8 +41,8 @@ folders FOLDER *  of the cases, and of the answers
 --derotator-angles N int =8  default: 8
 --checkpoint FILE Continued  append each outcome of a run to this file, and go on from it
 --workers N int =1  processes; default: 1
---figure FILE Output  draw the rates (PNG, PDF or SVG)
---reliability FILE Output  draw how many causes are right against their probability (PNG, PDF or
+--figure FILE Drawing  draw the rates (PNG, PDF or SVG)
+--reliability FILE Drawing  draw how many causes are right against their probability (PNG, PDF or
     SVG)
 @ json quiet
 """
@@ -65,7 +65,6 @@ def run(arguments):
         raise GapError(
             f"challenge {action} takes {counted(wanted, 'folder')}, {len(folders)} given"
         )
-    result = None
     if action == "score":
         result = score_cases(*folders)
     else:
@@ -82,15 +81,12 @@ def run(arguments):
         }
         # processes are started once for all challenges
         with _workers(arguments.workers) as client:
-            if action == "run":
-                checkpoint = arguments.checkpoint
-                result = run_challenge(**options, client=client, checkpoint=checkpoint)
-            else:
+            if action == "make":
                 key = make_cases(folders[0], **options, client=client)
-    if result is None:
-        words = f"{counted(len(key), 'case')} and key.json written to {folders[0]}"
-        common.say(arguments, words)
-        return
+                words = f"{counted(len(key), 'case')} and key.json written to {folders[0]}"
+                common.say(arguments, words)
+                return
+            result = run_challenge(**options, client=client, checkpoint=arguments.checkpoint)
     figures = {arguments.figure: result.plot, arguments.reliability: result.plot_reliability}
     for path, draw in figures.items():
         if path:

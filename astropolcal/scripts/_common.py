@@ -12,6 +12,7 @@ import textwrap
 import warnings
 from contextlib import suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import astropy.units as u
@@ -48,6 +49,8 @@ _NO_TABLES = {
 
 # endings of a page
 PAGES = (".html", ".htm")
+# those of figures that matplotlib writes
+_FIGURES = "png pdf svg svgz jpg jpeg webp avif gif tif tiff eps ps pgf raw rgba".split()
 
 # ---- files that are named -------------------------------------------------------------------
 
@@ -72,6 +75,10 @@ class Continued(Output):
     """Type of an argument: a file that is read, if it exists, and written further."""
 
 
+class Drawing(Output):
+    """Type of an argument: a file in which matplotlib draws a figure."""
+
+
 class Folder(Output):
     """Type of an argument: a folder in which files of some kinds are written."""
 
@@ -88,8 +95,10 @@ def check_paths(arguments):
     for _, path in [*inputs, *_named(arguments, Continued)]:
         _seen(path, path, "read", os.listdir if os.path.isdir(path) else os.stat)
         check_kind(path)
-    for _, path in outputs:
+    for option, path in outputs:
         _check_output(path)
+        if isinstance(path, Drawing):
+            check_suffix(_label(option), path, *(f".{kind}" for kind in _FIGURES))
     inputs += [(o, left) for o, path in _named(arguments, Frames) for left in _left_files(path)]
     replaced = getattr(arguments, "may_replace", {})
     for number, (option, path) in enumerate(outputs):
@@ -272,8 +281,7 @@ MODEL = ("derotator", "bounds", "m3", "plate")
 
 def stated_model(arguments):
     """Return the options of an instrument's chains that were typed."""
-    stated = {key: getattr(arguments, key) for key in MODEL}
-    return {key: value for key, value in stated.items() if value is not None}
+    return {key: value for key in MODEL if (value := getattr(arguments, key)) is not None}
 
 
 #: Options that several commands have, by name; ``online`` is obeyed by `astropolcal.scripts.main`.
@@ -353,7 +361,7 @@ def number_or(*words, kind=float):
 
 
 _TYPES = {"float": float, "int": int, "angles": numbers_type("a list of angles in degree")}
-_TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Folder)}
+_TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Drawing, Folder)}
 
 
 # ---- outputs --------------------------------------------------------------------------------
@@ -544,7 +552,9 @@ def follow_laws(chains, texts, tables):
             )
         name, _, degree, of, since = match.groups()
         law, of = model(int(degree)), of.split(",")
-        if "time" in of and since is None and dated:
+        if "time" in of and not dated:
+            raise ParameterError(f"--follow {text}: no table has a column time")
+        if "time" in of and since is None:
             since = np.floor(min(one.min() for one in dated))
         add = partial(follow, name=name, model=law, of=of, since=since)
         chains = _changed(chains, name.rpartition(".")[0], add)
@@ -562,17 +572,15 @@ def _changed(chains, optic, change):
 
 def _check_fixed(fix, free, prior):
     """Refuse to hold what is named as free, or given a prior, as well."""
-    for held in (text.partition("=")[0] for text in fix):
-        for option, texts in (("free", free), ("prior", prior)):
-            for text in texts:
-                name = text.partition("=")[0]
-                # an optic and one of its parameters: the parameter is the exception, if edited last
-                inside = option == "free" and name.startswith(f"{held}.")
-                if name == held or inside:
-                    raise ParameterError(
-                        f"--{option} {text} cannot be combined with --fix {held}: a parameter is "
-                        "either held or free"
-                    )
+    named = [*(("free", text) for text in free), *(("prior", text) for text in prior)]
+    for held, (option, text) in product((text.partition("=")[0] for text in fix), named):
+        name = text.partition("=")[0]
+        # an optic and one of its parameters: the parameter is the exception, if edited last
+        if name == held or (option == "free" and name.startswith(f"{held}.")):
+            raise ParameterError(
+                f"--{option} {text} cannot be combined with --fix {held}: a parameter is either "
+                "held or free"
+            )
 
 
 def _parameters(chains, name):

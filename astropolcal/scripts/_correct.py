@@ -77,7 +77,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --seed N int  of the random numbers of --samples
 --spectrum OUT.ecsv Output  table of the star in an aperture
 --radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
---plot FILE Output  figure of the result
+--plot FILE Drawing  figure of the result
 --workers N int  threads; with --archive: processes (default: one per processor)
 --cluster ADDRESS  scheduler of dask.distributed, in place of these
 @ full json online quiet

@@ -59,7 +59,7 @@ file CAL.asdf ? Input  calibration
 --night START/END  times in UTC, with --target
 --law MODE  what the derotator stabilizes, such as field (default: pupil)
 --date DATE  of the telescope's mirrors, where that matters
--o --output FILE Output  save the figure (PNG, PDF, SVG); with --target that of the derotator
+-o --output FILE Drawing  save the figure (PNG, PDF, SVG); with --target that of the derotator
     offsets
 @ json online quiet
 """
@@ -259,20 +259,17 @@ def _best(arguments, instrument, chain, grid):
         "parallactic_deg": [turned.min(), turned.max()],
     }
     (low, high), (east, west) = found["altitude_deg"], found["parallactic_deg"]
-    return (
-        best,
-        found,
-        [
-            f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
-            f"{west:z.1f} deg",
-            f"Best derotator offset of {instrument.name}, {best.law} still: "
-            f"{found['offset_deg']:zg} deg",
-            "  efficiency over times, wavelengths and angles of polarization: least "
-            f"{found['least']:z.3f},",
-            f"  mean {found['mean']:z.3f}; with the worst offset the least is "
-            f"{found['least_of_any_offset']:z.3f}",
-        ],
-    )
+    words = [
+        f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
+        f"{west:z.1f} deg",
+        f"Best derotator offset of {instrument.name}, {best.law} stabilized: "
+        f"{found['offset_deg']:zg} deg",
+        "  efficiency over times, wavelengths and angles of polarization: least "
+        f"{found['least']:z.3f},",
+        f"  mean {found['mean']:z.3f}; with the worst offset the least is "
+        f"{found['least_of_any_offset']:z.3f}",
+    ]
+    return best, found, words
 
 
 def _times(text):

@@ -120,8 +120,7 @@ def run(arguments):
     if arguments.cubes:
         response = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
         detector = DetectorModel(noise=not arguments.no_noise, **response)
-        cubes = {"image": image, "detector": detector, "flux": arguments.flux}
-        cubes["seed"] = arguments.seed
+        cubes = {"image": image, "detector": detector} | {k: given[k] for k in ("flux", "seed")}
         paths = simulate_cubes(arguments.cubes, chain, instrument, frames, **cubes, **scene)
         written.append(f"{one_line(arguments.cubes, None)} ({counted(len(paths), 'cube')})")
     if arguments.output:
@@ -176,6 +175,8 @@ def _truth(arguments, instrument):
     if arguments.source == "star":
         chain = _behind_telescope(chain, instrument, wavelength)
         meta |= {"source": "star"}
+    elif "parallactic" in stages(chain):
+        raise AstropolcalError("the chain begins on sky; give --source star and where it points")
     return chain, wavelength, meta
 
 

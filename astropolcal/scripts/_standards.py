@@ -24,17 +24,18 @@ name NAME ?  a star, such as 'HD 293396'
 --kind {polarized,unpolarized}  only stars of this kind
 --band BAND  magnitude and polarization in this band, such as H; the magnitude in V where the
     catalogue has none in it
---magnitude LO,HI  brightest and faintest magnitude, in --band, or in V where the catalogue has none
-    in it
+--magnitude LO,HI pair  brightest and faintest magnitude, in --band, or in V where the catalogue has
+    none in it
 --near RA,DEC  degrees, or 05:26:06,+16:42:00
 --radius DEG float  goes with --near (default: 15)
 --site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
 --night YYYY-MM-DD  date of the evening at the site
 --min-altitude DEG float =30  lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
---plot FILE Output  draw altitude and parallactic angle over the night
+--plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
 """
+TYPES = {"pair": common.numbers_type("2 numbers with a comma between them", 2)}
 # R, J, H and K, for what a calibration assumes of a star
 _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 # more stars than this make a figure unreadable
@@ -171,12 +172,6 @@ def _pair(value, form, error=math.nan):
 
 def _many(arguments):
     site = None if arguments.site is None else _site(arguments.site)
-    try:
-        given = arguments.magnitude
-        magnitude = None if given is None else common.numbers(given, 2)
-    except ValueError:
-        words = f"--magnitude {arguments.magnitude}: give 2 numbers with a comma between them"
-        raise ParameterError(words) from None
     radius = 15.0 if arguments.radius is None else arguments.radius
     near = {}
     if arguments.near:
@@ -185,7 +180,7 @@ def _many(arguments):
         **near,
         kind=arguments.kind,
         band=arguments.band,
-        magnitude=magnitude,
+        magnitude=arguments.magnitude,
         site=site,
         night=arguments.night,
         min_altitude=arguments.min_altitude * u.deg,

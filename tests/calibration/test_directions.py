@@ -359,6 +359,8 @@ def test_open_mirrors_of_the_telescope_are_told_what_would_help():
     assert len(telescope_words(_finding("window.diattenuation"), _sky_measurement())) == 1
     bare = _sky_measurement(with_plate=False)
     assert telescope_words(_finding("window.diattenuation"), bare) == []
+    # its orientation turns with all others, which the directions say
+    assert telescope_words(_finding("m3.theta", "hwp.theta"), _sky_measurement()) == []
 
 
 def test_what_ran_to_its_bound_counts_as_open():

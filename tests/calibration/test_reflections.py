@@ -2,13 +2,14 @@
 """Mirrors beside metals, and stars against the catalogue."""
 
 import json
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 import pytest
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
-from astropolcal import Calibration, calibrate, standards
+from astropolcal import Calibration, calibrate, instruments, standards
 from astropolcal.calibration import star_check
 from astropolcal.calibration.result.summary import summary, to_dict
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
@@ -105,6 +106,16 @@ def test_metals_are_bare_mirrors(free):
     np.testing.assert_allclose(
         table["diattenuation_silver"].value, 100 * silver.diattenuation(free[0].wavelength)
     )
+
+
+def test_plates_derotators_and_relays_are_not_mirrors():
+    for name, source, mirrors in (
+        ("irdis", "star", ["ut", "m4"]),
+        ("vampires", "unpolarized", ["fold_mirror"]),
+        ("charis", "star", ["m3"]),
+    ):
+        chains = [instruments.get(name).chain(source)]
+        assert mirror_names(SimpleNamespace(chains=chains)) == mirrors, name
 
 
 def test_unknown_mirror_is_refused(free):

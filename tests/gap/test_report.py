@@ -315,13 +315,25 @@ class Page(HTMLParser):
 @pytest.mark.slow
 def test_page_is_self_contained_and_complete(found, content, tmp_path):
     figure = Figure(figsize=(3, 2))
-    figure.subplots().plot([1, 2])
+    axes = figure.subplots()
+    axes.set_xticks(range(8), labels=[f"10{i}.5" for i in range(8)])
+    axes.tick_params(axis="x", length=0)
     path = tmp_path / "gap.html"
     figure.suptitle("a title")
-    before = figure.get_size_inches().tolist(), figure.axes[0].get_subplotspec()
+    drawn = []
+
+    def look():
+        turned = {label.get_rotation() for label in axes.get_xticklabels()}
+        return turned, figure.get_size_inches().tolist()
+
+    figure.savefig = lambda *args, **options: drawn.append(look())
+    before = look(), axes.get_subplotspec()
+    write_html(found, path, figures={"Gap": figure})
+    assert (look(), axes.get_subplotspec()) == before, "the figures are the caller's"
+    # on a telephone names of groups of frames do not stand in each other
+    assert [turned for turned, _ in drawn] == [{0}, {90}]
+    del figure.savefig
     write_html(found, path, figures={"Gap <of> the run": figure, MAP: figure})
-    after = figure.get_size_inches().tolist(), figure.axes[0].get_subplotspec()
-    assert after == before, "the figures are the caller's"
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     for sentence in content["sentences"]:

@@ -233,6 +233,16 @@ def test_long_groups_are_told_shortly():
     assert words.startswith("The model lacks one of several things (97 %)")
 
 
+def test_a_terminal_shows_no_table_of_which_only_the_head_fits():
+    content = {"causes": [entry(), entry(cell("source"))]}
+    for n_sentences, head in ((3, True), (15, False)):
+        content["sentences"] = ["Word " * 15] * n_sentences
+        lines = _words.short(content, ["end"] * 6)
+        assert len(lines) <= 24
+        assert any("probability" in line for line in lines) == head, n_sentences
+        assert not any("more line" in line for line in lines)
+
+
 def test_an_alias_that_is_a_cause_itself_is_no_alternative():
     words = said(entry(aliases=[named("tilt")]), {"beam_gain": 1, "tilt": 2})
     assert "It resembles cause 2: the data ask for both" in words

@@ -82,7 +82,10 @@ def test_not_a_table(tmp_path):
         (b"# %ECSV 1.0\n# ---\n", "its header describes no columns"),
         (b"# %ECSV 1.0\n# ---\n# datatype: [\n", "not a readable ECSV table"),
         (b"# %ECSV 1.0\n# ---\n# {a: *b}\nframe\n", "not a readable ECSV table"),
-        (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\nx\n", "readable"),
+        (
+            b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\nx\n",
+            "row 1: a = x, all",
+        ),
         (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\n1\n", "missing col"),
     ]:
         path = tmp_path / "night.ecsv"

@@ -67,7 +67,9 @@ def test_reference_curves_and_logarithmic_axis(elliptical):
 
 def test_one_panel_a_dataset(several):
     figure = plot_accuracy(several)
-    assert [axes.get_title().split(":")[0] for axes in figure.axes] == ["polarized", "unpolarized"]
+    # counts below the name, which may be long
+    titles = [axes.get_title().split("\n")[0] for axes in figure.axes]
+    assert titles == ["polarized", "unpolarized"]
     assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
 
 
@@ -118,7 +120,7 @@ def test_standard_of_another_source_has_its_own_panel(elliptical):
     figure = plot_accuracy(replace(elliptical, fit=elliptical.fit | {"standards": [star]}))
     first, second = figure.axes
     assert list(lines(first)) == ["s_res", "s_mean", "s_cv"]
-    assert "star: n = 12 data per wavelength, predicted" in second.get_title()
+    assert "star\nn = 12 data per wavelength, predicted" in second.get_title()
     drawn = {line.get_label().split(" ")[0].rstrip(":"): line for line in second.lines}
     assert list(drawn) == ["s_standard", "s_cv"]
     np.testing.assert_allclose(drawn["s_cv"].get_ydata(), 0.1)
@@ -220,6 +222,14 @@ def test_a_target_at_an_angle(several):
     # looks of targets and parts do not coincide, for they share the legend
     looks = {(one.get_color(), one.get_marker()) for one in figure.axes[0].lines}
     assert (line.get_color(), line.get_marker()) not in looks
+
+
+def test_what_no_data_determine_is_said_in_the_panel(undetermined):
+    # a lamp alone leaves the angles open
+    *known, angle = plot_target_accuracy(undetermined).axes
+    assert not any(axes.texts for axes in known)
+    assert [text.get_text()[:5] for text in angle.texts] == ["open:"]
+    assert not len(angle.get_yticks())
 
 
 def test_impossible_and_unknown_targets_are_refused(several):

@@ -220,6 +220,9 @@ def test_calibration_from_a_file(tmp_path, elliptical):
     # the angles are gone, their consequence is not
     said = " ".join(panel(figure, "(c)").texts[0].get_text().split())
     assert " ".join(read.identifiability.sampling[0].split()) in said
+    # what star would help is not about these angles, and has no space there
+    read.identifiability.sampling.append("m3.theta: a star")
+    assert "m3" not in panel(plot_identifiability(read), "(c)").texts[0].get_text()
     assert panel(plot_identifiability(read, hwp=FULL), "(c)").patches
 
 

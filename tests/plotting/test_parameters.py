@@ -586,3 +586,10 @@ def test_bad_input(years):
         plot_history(years, ["m3"])
     with pytest.raises(ParameterError, match="0 parameters to draw"):
         plot_history(years, ["hwp.theta"])
+
+
+def test_accuracies_that_no_run_has_are_not_in_the_legend():
+    for known, labels in ((0.06, 2), (np.nan, 1)):
+        run = {"date": "2025-10-05", "s_cv_percent": known, "s_res_percent": 0.05}
+        figure = parameters.draw_accuracies({"calibrations": [run], "events": []})
+        assert len(legend_texts(figure)) == labels, known

@@ -584,8 +584,11 @@ def test_laws_and_groups_that_do_not_fit_get_one_line(nights, capsys):
         (["--follow", "hwp.theta:Polynomial2D(1):time"], "Polynomial2D has 2 inputs"),
         (["--follow", "hwp.theta:Polynomial1D(1):time:soon"], "is not a date"),
         (["--own", "hwp.thetta"], "did you mean 'hwp.theta'"),
-        (["--own", "hwp.theta=march"], "has 1 groups; there are 2 datasets"),
+        (["--own", "hwp.theta=march"], "has 1 group for 2 datasets"),
         (["--own", "hwp.theta", "--own", "wollaston.efficiency=a,b"], "or of none"),
         (["--own", "hwp.theta", "--start", "old.asdf"], "--own cannot be combined with --start"),
     ):
         assert words in complaint(capsys, *nights, *options)
+    # the packaged example has no times
+    line = complaint(capsys, "--follow", "hwp.theta:Polynomial1D(1):time")
+    assert "no table has a column time" in line

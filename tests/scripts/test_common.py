@@ -27,6 +27,7 @@ from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.observations import example_table
 from astropolcal.scripts._common import (
     Continued,
+    Drawing,
     Folder,
     Frames,
     Input,
@@ -102,6 +103,12 @@ def test_bad_places_for_files(tmp_path, locked):
     ]:
         with pytest.raises(AstropolcalError, match=words):
             check(Output(tmp_path / "good.json"), Output(tmp_path / place))
+
+
+def test_a_figure_in_no_known_format_is_refused_before_anything_runs(tmp_path):
+    check(Drawing(tmp_path / "a.pdf"))
+    with pytest.raises(AstropolcalError, match=r"the name must end with \.png"):
+        check(Drawing(tmp_path / "a.bmp"))
 
 
 def test_good_places_for_folders(tmp_path, monkeypatch):

@@ -68,7 +68,7 @@ def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
 def test_best_offset_for_a_night(capsys):
     run("--target", "72.7,28.3", "--night", NIGHT)
     out = capsys.readouterr().out
-    assert "Best derotator offset of charis, pupil still:" in out
+    assert "Best derotator offset of charis, pupil stabilized:" in out
     # the table of another pointing was not asked for
     assert out.startswith("Target at altitude")
     # the star passes north of the zenith, where the angle goes on from -180 to 180 deg

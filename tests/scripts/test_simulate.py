@@ -96,6 +96,7 @@ def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys):
         (["-o", "x.ecsv", "--saturate"], "--saturate: is for --cubes DIR"),
         (["-o", "x.ecsv", "--seed", "-1"], "seed = -1; allowed are whole numbers from 0 up"),
         (["--cubes", "cubes", *TWO, "--seed", "-1"], "seed = -1; allowed are"),
+        (["-o", "x.ecsv", "--instrument", "gpi"], "begins on sky; give --source star"),
         (["-o", "x.fits"], "-o x.fits: the name must end with .ecsv"),
         (["--cubes", "missing/cubes", *TWO], "no folder"),
         (["--cubes", "cubes", *TWO, "--halo", "2"], "halo = 2"),

@@ -253,13 +253,13 @@ def telescope_words(finding, measurement):
             inner = train[places.index("parallactic") + 1 : places.index(last)]
             mirrors |= {leaf.name for leaf in inner if not isinstance(leaf, Rotator)}
     for mirror in sorted(mirrors):
-        own = sorted(name for name in moving if name.startswith(f"{mirror}."))
+        # what its orientation turns with is said of the directions
+        own = sorted(n for n in moving if n.startswith(f"{mirror}.") and n != f"{mirror}.theta")
         if own:
             words.append(
                 f"{', '.join(own)}: an unpolarized star shows the diattenuation of {mirror} and "
-                "nothing else, at any altitude, so the numbers of its law trade off; a star of "
-                "known polarization over a wide range of parallactic angle adds the retardance, "
-                "a measured film or index (a prior) does the rest"
+                "nothing else, at any altitude; a star of known polarization over a wide range of "
+                "parallactic angle adds the retardance, a measured film or index (a prior) the rest"
             )
     return words
 
@@ -381,14 +381,8 @@ def mirror_branches(measurement, vector, view):
             slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
             if None not in slots:
                 retarders[leaf.name] = slots
-    candidates = [
-        (
-            f"{name}: a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic",
-            [name],
-            _other_turn,
-        )
-        for name in retarders
-    ]
+    turns = "a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic"
+    candidates = [(f"{name}: {turns}", [name], _other_turn) for name in retarders]
     candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", retarders, _other_hand))
     low, high = measurement.free.bounds()
     for words, names, edit in candidates:

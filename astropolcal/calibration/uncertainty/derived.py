@@ -31,18 +31,10 @@ from astropolcal.chain import (
     system_mueller_derivatives,
     with_beam,
 )
-from astropolcal.exceptions import (
-    ChainError,
-    ParameterError,
-)
+from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import SAME_WAVELENGTH
-from astropolcal.optics import (
-    Diattenuator,
-    DiattenuatorRetarder,
-    MetalMirror,
-    PowerLawMirror,
-)
+from astropolcal.optics import Diattenuator, DiattenuatorRetarder, MetalMirror, PowerLawMirror
 from astropolcal.units import canonical_factor, wavelengths_of
 
 __all__ = [
@@ -647,12 +639,22 @@ _MIRRORS = (Diattenuator, DiattenuatorRetarder, MetalMirror, PowerLawMirror)
 
 
 def mirror_names(calibration):
-    """Return the names of mirrors and other diattenuators, in the order of the light.
+    """Return the names of mirrors in the order of the light: they do not turn on a stage.
 
-    Those that are fixed and do nothing are left out.
+    What delays by less than a quarter wave, a mirror by half a wave, is a window or a relay.
     """
-    found = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
-    return [name for name, leaf in found.items() if isinstance(leaf, _MIRRORS)]
+    found = _diattenuators(calibration).items()
+    return [name for name, leaf in found if leaf.mount is None and not _is_window(leaf)]
+
+
+def _is_window(leaf):
+    retards = isinstance(leaf, DiattenuatorRetarder)
+    return retards and np.median(np.cos(leaf.retardance.quantity)) > 0
+
+
+def _diattenuators(calibration):
+    every = [leaf for chain in calibration.chains for leaf in leaves(chain)]
+    return {leaf.name: leaf for leaf in every if isinstance(leaf, _MIRRORS)}
 
 
 def mirror_values(calibration, name, incidence=45 * u.deg):
@@ -662,12 +664,12 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
     et al. (1998). Errors are NaN where the data do not determine a value alone, and where it is
     held.
     """
-    known = mirror_names(calibration)
-    if name not in known:
-        raise ChainError(f"no mirror {name!r}; the calibration has {', '.join(known) or 'none'}")
+    leaf = _diattenuators(calibration).get(name)
+    if leaf is None:
+        known = ", ".join(mirror_names(calibration)) or "none"
+        raise ChainError(f"no mirror {name!r}; the calibration has {known}")
     wavelength = calibration.wavelength
     table = QTable({"wavelength": wavelength})
-    leaf = _leaf(calibration.chains, name)
     percent, values = 100 * u.percent, calibration.parameter_values()
     for key, unit in (("diattenuation", percent), ("retardance", u.deg)):
         if hasattr(leaf, key):
