@@ -17,6 +17,7 @@ from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
+from astropolcal.observations.pointings import motion
 from astropolcal.simulation import simulate
 from astropolcal.testing import check_instrument
 
@@ -388,6 +389,27 @@ def test_beams_in_columns_are_frames_of_one_group():
     wide.remove_column("flux_b_err")
     with pytest.raises(ObservationError, match="missing column flux_b_err"):
         Observations.from_table(wide)
+
+
+def test_beams_of_an_exposure_are_taken_at_once():
+    # run, moves and rates of three beams are those of the two beams of a prism
+    turns, exposed = np.array([0, 40, 60, 45, 5.0]) * u.deg, np.array([2, 2, 3, 2, 2.0]) * u.s
+    columns = {"frame": np.arange(5), "bin": np.zeros(5, dtype=int), "wavelength": [0.6] * 5 * u.um}
+    columns |= {stage: turns for stage in ("hwp", "derotator", "parallactic")}
+    names = ["sequence", "hwp_move", "hwp_direction", "derotator_rate", "parallactic_rate"]
+    for times in ({}, {"time": [0, 10, 30, 40, 60] * u.s, "exposure_time": exposed}):
+        two, three = (
+            Observations.from_table(
+                QTable(columns | times | {f"flux_{one}": np.ones(5) * u.adu for one in beams})
+            )
+            for beams in (("right", "left"), "abc")
+        )
+        for name in names:
+            wanted = np.repeat(two.position(name), 3)
+            np.testing.assert_allclose(three.position(name), wanted, atol=1e-12, err_msg=name)
+        for duty in (0.5, None) if times else (0.5,):
+            moved = [motion(one, one.position("hwp"), duty) for one in (two, three)]
+            np.testing.assert_allclose(moved[1], np.repeat(moved[0], 3), atol=1e-12)
 
 
 # --- few frames, and none with noise -------------------------------------------------------------
