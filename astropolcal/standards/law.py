@@ -162,7 +162,7 @@ class SerkowskiLaw(Fittable1DModel):
         return {name: unit for name, unit in zip(self.param_names, units, strict=True) if unit}
 
     def without_units_for_data(self, **data):
-        """Return the law as a fitter takes it, with p_max and its bounds in the unit of the data."""
+        """Return the law as a fitter takes it, p_max and its bounds in the unit of the data."""
         law, own = self.copy(), self.p_max.unit or u.one
         scale = own.to(getattr(data[self.outputs[0]], "unit", u.one))
         # for astropy a plain number is in the unit of the data already, and bounds always are

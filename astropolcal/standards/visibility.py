@@ -55,7 +55,7 @@ def night_times(site, night, *, twilight, step):
     """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
     with offline():
         # from noon to noon, so that a night is never cut in two whatever the longitude
-        date = Time(date_of(night), scale="utc")
+        date = Time(date_of(night, site), scale="utc")
         # a time of its own, which is printed to the second
         noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
         times = (noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day) + np.arange(
@@ -71,9 +71,12 @@ def night_times(site, night, *, twilight, step):
     return times[dark]
 
 
-def date_of(night):
-    """Return the date of the evening as text, or raise."""
+def date_of(night, site):
+    """Return the date of the evening as text, of a moment that of its night, or raise."""
     try:
+        if isinstance(night, Time) and night.mjd % 1:
+            # nights begin at noon, of the mean Sun at the site
+            night = night.utc + (site.lon.to_value(u.deg) / 360 - 0.5) * u.day
         text = iso_date(night.to_value("iso", "date") if isinstance(night, Time) else night)
         if "T" in text:
             raise ValueError
@@ -365,7 +368,7 @@ def observability(
     site : str or `~astropy.coordinates.EarthLocation`
         ``"subaru"``, ``"keck"``, ``"paranal"``, ``"gemini_south"``, or a place.
     night : str or `~astropy.time.Time`
-        Calendar date at the site on which the night begins.
+        Calendar date at the site on which the night begins; or a moment, from noon to noon there.
     min_altitude : `~astropy.units.Quantity`
         The star is not observed below it.
     twilight : `~astropy.units.Quantity`
@@ -404,7 +407,7 @@ def observability(
             f"{name} does not rise above {limit.to_value(u.deg):g} deg in the dark hours of "
             f"{night!s}; it gets to {table['altitude'].max().to_value(u.deg):.1f} deg"
         )
-    return Observability(name, place, date_of(night), limit, table)
+    return Observability(name, place, date_of(night, place), limit, table)
 
 
 def _range(values):
@@ -576,9 +579,9 @@ def _observable(table, site, night, min_altitude):
         SkyCoord(table["ra"][:, None], table["dec"][:, None]), times, place
     )
     up = np.any(altitude >= limit, axis=1)
-    found = table[up]
+    found, evening = table[up], date_of(night, place)
     seen = [
-        Observability(str(name), place, date_of(night), limit, night_table(times, a, p, limit))
+        Observability(str(name), place, evening, limit, night_table(times, a, p, limit))
         for name, a, p in zip(found["name"], altitude[up], parallactic[up], strict=True)
     ]
     for name in ("altitude", "parallactic"):
