@@ -11,12 +11,13 @@ from astropy.table import QTable
 from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
-from astropolcal.exceptions import FitError, ObservationError
+from astropolcal.exceptions import AstropolcalWarning, FitError, ObservationError
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
+from astropolcal.observations.grid import mask_incomplete_cycles
 from astropolcal.observations.pointings import motion
 from astropolcal.simulation import simulate
 from astropolcal.testing import check_instrument
@@ -410,6 +411,18 @@ def test_beams_of_an_exposure_are_taken_at_once():
         for duty in (0.5, None) if times else (0.5,):
             moved = [motion(one, one.position("hwp"), duty) for one in (two, three)]
             np.testing.assert_allclose(moved[1], np.repeat(moved[0], 3), atol=1e-12)
+
+
+def test_cycles_of_a_half_wave_plate_are_those_of_its_exposures():
+    angles = np.tile([0, 45, 22.5, 67.5], 3)[:-1] * u.deg
+    beams = [
+        optics.StateAnalyser(theta=a * u.deg, mount=f"beam=i{a}", name=f"i{a}") for a in (0, 60)
+    ]
+    plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    star = simulate(join([plate, *beams]), [0.6] * u.um, QTable({"hwp": angles}), seed=1)
+    with pytest.warns(AstropolcalWarning, match="6 of 22 frames masked, incomplete"):
+        whole = mask_incomplete_cycles(star)
+    assert whole.mask[:, 0].tolist() == [False] * 16 + [True] * 6
 
 
 # --- few frames, and none with noise -------------------------------------------------------------
