@@ -483,7 +483,7 @@ def cycle_numbers(observations, start=None):
     """
     Return the number of the half-wave-plate cycle of every frame, from 0, (F,).
 
-    That of the column ``cycle``; else a cycle ends where a plate angle (of one beam and one state of
+    That of the column ``cycle``; else a cycle ends where a plate angle (of a beam, in a state of
     a modulator) comes again, the derotator moves, or ``start`` comes, the angle with which a cycle
     begins.
     """
