@@ -243,7 +243,7 @@ def test_the_table_survives_a_file(tmp_path):
 @every
 def test_pulls_are_one(kind):
     pulls, truth = [], Measurement(kind.chain(), observed(kind)).vector()
-    for seed in range(10):
+    for seed in range(12):
         found = calibrate(
             kind.chain(), observed(kind, seed=seed), weights="errors", cross_validate=False
         )
@@ -390,6 +390,20 @@ def test_beams_in_columns_are_frames_of_one_group():
     wide.remove_column("flux_b_err")
     with pytest.raises(ObservationError, match="missing column flux_b_err"):
         Observations.from_table(wide)
+
+
+def test_a_model_without_light_fits_no_single_beam():
+    polarizers = optics.LinearPolarizer(name="lamp") | optics.LinearPolarizer(
+        mount="wheel", name="analyser"
+    )
+    frames = QTable({"wheel": [0, 30, 60, 10, 80, 40] * u.deg, "group": [0, 0, 0, 1, 1, 1]})
+    run = simulate(polarizers, [0.6] * u.um, frames, flux=1e4, seed=1)
+    crossed = optics.Diattenuator(diattenuation=-1, name="crossed")
+    dark = insert_optic(polarizers, crossed, after="lamp")
+    lit, unlit = (Measurement(chain, run).residuals() for chain in (polarizers, dark))
+    assert np.abs(lit).max() < 0.1
+    # it predicts none, instead of whatever was measured
+    np.testing.assert_allclose(unlit, Measurement(polarizers, run).observed, atol=1e-12)
 
 
 def test_beams_of_an_exposure_are_taken_at_once():
