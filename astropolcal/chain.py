@@ -14,7 +14,12 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    ChainError,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.mueller import act, turned
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
@@ -383,6 +388,18 @@ def states_of(chain):
         if equals:
             known.setdefault(column, []).append(state)
     return known
+
+
+def check_states(chain, columns, label):
+    """Refuse columns, by name, with a state in which no optic of the chain would do anything."""
+    for column, states in states_of(chain).items():
+        # a column that is missing is named where positions are read
+        found = {str(state).strip() for state in np.atleast_1d(columns.get(column, []))}
+        if strange := sorted(found - set(states)):
+            raise ObservationError(
+                f"{label}: {column} = {', '.join(strange)} in the table; the chain knows "
+                f"{', '.join(states)}"
+            )
 
 
 def with_beam(chain, beam):

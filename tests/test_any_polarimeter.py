@@ -11,6 +11,7 @@ from astropy.table import QTable
 from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
+from astropolcal.efficiency import demodulation
 from astropolcal.exceptions import AstropolcalWarning, FitError, ObservationError
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import summary, to_dict
@@ -390,6 +391,23 @@ def test_beams_in_columns_are_frames_of_one_group():
     wide.remove_column("flux_b_err")
     with pytest.raises(ObservationError, match="missing column flux_b_err"):
         Observations.from_table(wide)
+
+
+def test_states_that_no_optic_knows_are_refused_wherever_they_are_given():
+    wheel = [
+        optics.StateAnalyser(theta=a * u.deg, name=f"p{a}", mount=f"filter=P{a}") for a in (0, 60)
+    ]
+    chain, light = join(wheel), ([0.6] * u.um,)
+    wrong = {"filter": ["P0", "p60"]}
+    fluxes = ScienceFrames.from_arrays([[1.0], [1.0]], None, *light, wrong)
+    for call in (
+        lambda: simulate(chain, *light, QTable(wrong)),
+        lambda: demodulation(chain, *light, QTable(wrong)),
+        lambda: measurement_rows(chain, wrong, *light),
+        lambda: correct(chain, fluxes),
+    ):
+        with pytest.raises(ObservationError, match=r"filter = p60 .* knows P0, P60"):
+            call()
 
 
 def test_a_model_without_light_fits_no_single_beam():

@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows, free_of, match_wavelengths
-from astropolcal.chain import join, leaves, stages, warn_beyond
+from astropolcal.chain import check_states, join, leaves, stages, warn_beyond
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.observations.pointings import plain_states
 from astropolcal.optics import COORDINATES
@@ -79,6 +79,7 @@ class RowModel(Rows):
                     AstropolcalWarning,
                     stacklevel=3,
                 )
+        check_states(chain, positions, "positions")
         placed, nodes = _placed(positions, stages(chain))
         warn_beyond(chain, placed)
         super().__init__(chain, length_to_um(self.wavelength), placed, free, mix, nodes)
