@@ -256,7 +256,7 @@ def _check_fit(chain, observations, observable):
         raise ObservationError(
             f"{name}: observable {observable.name} of {words[0]} a frame; allowed is {words[1]}"
         )
-    check_states(chain, observations.frames.columns, name)
+    check_states(chain, observations.frames.columns, name, least=1)
 
 
 def _positions(chain, observations, positions):

@@ -31,7 +31,7 @@ from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import MOVES, PLACES
-from astropolcal.units import angle_to_rad, mjd_of, plain_number
+from astropolcal.units import angle_to_rad, mjd_of, plain_number, to_unit
 from astropolcal.words import check_choice, check_type
 
 __all__ = ["location_of", "pointing"]
@@ -515,17 +515,14 @@ def axes_apart(first, second):
 def in_state(frames, name, label):
     """Return 1 where a column of frames has a state, ``"COLUMN=STATE"``, and 0 elsewhere, (F,)."""
     column, _, state = name.partition("=")
-    if column not in frames.colnames:
+    if column not in frames.keys():
         raise ObservationError(
             f"{label}: no column {column!r}, whose state {state!r} the chain needs; it has "
-            f"{', '.join(frames.colnames)}"
+            f"{', '.join(frames.keys())}"
         )
-    return (plain_states(frames[column]) == state).astype(float)
-
-
-def plain_states(column):
-    """Return the states of a column as text, by which optics know them."""
-    return np.array([str(value).strip() for value in column])
+    # states are known as text
+    found = [str(value).strip() == state for value in np.atleast_1d(frames[column])]
+    return np.array(found, dtype=float)
 
 
 def angle_change(observations, angle, turn=2 * np.pi):
@@ -557,10 +554,8 @@ def clock(frames):
     if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
         return None
     # one unknown time makes the order of all frames doubtful, so none is used then
-    known = ~np.asarray(getattr(column, "mask", False))
-    plain = getattr(column, "unmasked", column)
-    times = np.asarray(getattr(plain, "value", plain), dtype=float)
-    return times if np.all(known & np.isfinite(times)) else None
+    times = to_unit(column, getattr(column, "unit", None), "time")
+    return times if np.all(np.isfinite(times)) else None
 
 
 def modulator_states(frames, label):

@@ -426,9 +426,8 @@ def _spread(count, frames):
 FRAMES = 32
 # where m3_score and m3_error agree; photon noise grows as 10^(0.2 m)
 _REFERENCE_MAGNITUDE = 10
-_FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f")
-_FORMATS |= dict.fromkeys(("altitude_min", "altitude_max", "hours"), ".1f")
-_FORMATS |= dict.fromkeys(("parallactic_min", "parallactic_max"), ".1f")
+_RANGES = "altitude_min", "altitude_max", "parallactic_min", "parallactic_max", "hours"
+_FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f") | dict.fromkeys(_RANGES, ".1f")
 _BANDS = ("U", "B", "V", "R", "I", "J", "H", "K")
 
 
@@ -593,8 +592,7 @@ def _observable(table, site, night, min_altitude):
     errors = np.array([s.information(FRAMES).diattenuation for s in seen], dtype=float)
     excess = found["magnitude"].value - _REFERENCE_MAGNITUDE
     found["m3_error"], found["m3_score"] = errors, errors * 10 ** (0.2 * excess)
-    for name in found.colnames:
-        if name in _FORMATS:
-            found[name].info.format = _FORMATS[name]
+    for name, digits in _FORMATS.items():
+        found[name].info.format = digits
     found.sort(["m3_score", "name"])
     return found
