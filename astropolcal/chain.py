@@ -8,13 +8,15 @@ light travels. Nothing here depends on which optics they are.
 
 import math
 import warnings
+from functools import reduce
 from itertools import accumulate
+from operator import or_
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ChainError, ObservationError, ParameterError
 from astropolcal.mueller import act, turned
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
@@ -142,10 +144,7 @@ def join(optics):
     for optic in optics:
         leaves(optic)
     leaves(Train(optics))
-    chain = optics[0]
-    for optic in optics[1:]:
-        chain = chain | optic
-    return chain
+    return reduce(or_, optics)
 
 
 def find_optic(chain, name):
@@ -383,6 +382,20 @@ def states_of(chain):
         if equals:
             known.setdefault(column, []).append(state)
     return known
+
+
+def check_states(chain, columns, label, least=2):
+    """
+    Refuse columns, by name, with a state that no optic of the chain knows.
+
+    Of devices with ``least`` known states: one that is known in one state only may be off.
+    """
+    for column, states in states_of(chain).items():
+        # a column that is missing is named where positions are read
+        found = {str(state).strip() for state in np.atleast_1d(columns.get(column, []))}
+        if len(states) >= least and (strange := sorted(found - set(states))):
+            words = f"{column} = {', '.join(strange)} in the table; the chain knows "
+            raise ObservationError(f"{label}: {words}{', '.join(states)}")
 
 
 def with_beam(chain, beam):

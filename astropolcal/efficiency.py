@@ -59,9 +59,11 @@ def sky_path(chain):
     train = list(found[next(moving, end) : end])
     if not train:
         raise ChainError("the chain has no optic on a stage upstream of a beam splitter")
-    if end < len(found) and found[end].theta.value:
-        # the frame of a beam splitter that does not stand straight
-        train.append(Rotator(theta=found[end].theta.quantity, name="analyser"))
+    last = found[end] if end < len(found) else None
+    # the frame of a beam splitter that does not stand straight, or turns
+    if last is not None and (last.theta.value or (last.splits_light and last.stage)):
+        mount = last.mount if last.splits_light else None
+        train.append(Rotator(theta=last.theta.quantity, mount=mount, name="analyser"))
     return join(train)
 
 
@@ -224,9 +226,6 @@ def _positions(path, derotator, altitude, parallactic, law):
     unknown = wanted - set(found)
     if unknown:
         raise ChainError(f"no position of the stages {', '.join(sorted(unknown))}")
-    for name, angle in found.items():
-        if not np.all(np.isfinite(angle)):
-            raise ParameterError(f"{name} = {angle} must be finite")
     return {stage: found[stage] for stage in {"derotator", *wanted} & set(found)}
 
 

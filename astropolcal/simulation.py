@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from astropolcal.chain import leaves, stages, states_of
+from astropolcal.chain import check_states, leaves, stages, states_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
@@ -196,6 +196,7 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
 
 def stage_positions(chain, frames):
     """Return the position of each stage of a chain that frames have, canonical, (n_frames,)."""
+    check_states(chain, frames.columns, "frames")
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
     columns = {s: true if true in frames.colnames else s for s, true in known.items()}

@@ -11,12 +11,15 @@ from astropy.table import QTable
 from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
-from astropolcal.exceptions import FitError, ObservationError
+from astropolcal.efficiency import demodulation
+from astropolcal.exceptions import AstropolcalWarning, FitError, ObservationError
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
+from astropolcal.observations.grid import mask_incomplete_cycles
+from astropolcal.observations.pointings import motion
 from astropolcal.simulation import simulate
 from astropolcal.testing import check_instrument
 
@@ -241,7 +244,7 @@ def test_the_table_survives_a_file(tmp_path):
 @every
 def test_pulls_are_one(kind):
     pulls, truth = [], Measurement(kind.chain(), observed(kind)).vector()
-    for seed in range(10):
+    for seed in range(12):
         found = calibrate(
             kind.chain(), observed(kind, seed=seed), weights="errors", cross_validate=False
         )
@@ -388,6 +391,70 @@ def test_beams_in_columns_are_frames_of_one_group():
     wide.remove_column("flux_b_err")
     with pytest.raises(ObservationError, match="missing column flux_b_err"):
         Observations.from_table(wide)
+
+
+def test_states_that_no_optic_knows_are_refused_wherever_they_are_given():
+    wheel = [
+        optics.StateAnalyser(theta=a * u.deg, name=f"p{a}", mount=f"filter=P{a}") for a in (0, 60)
+    ]
+    chain, light = join(wheel), ([0.6] * u.um,)
+    wrong = {"filter": ["P0", "p60"]}
+    fluxes = ScienceFrames.from_arrays([[1.0], [1.0]], None, *light, wrong)
+    for call in (
+        lambda: simulate(chain, *light, QTable(wrong)),
+        lambda: demodulation(chain, *light, QTable(wrong)),
+        lambda: measurement_rows(chain, wrong, *light),
+        lambda: correct(chain, fluxes),
+    ):
+        with pytest.raises(ObservationError, match=r"filter = p60 .* knows P0, P60"):
+            call()
+
+
+def test_a_model_without_light_fits_no_single_beam():
+    polarizers = optics.LinearPolarizer(name="lamp") | optics.LinearPolarizer(
+        mount="wheel", name="analyser"
+    )
+    frames = QTable({"wheel": [0, 30, 60, 10, 80, 40] * u.deg, "group": [0, 0, 0, 1, 1, 1]})
+    run = simulate(polarizers, [0.6] * u.um, frames, flux=1e4, seed=1)
+    crossed = optics.Diattenuator(diattenuation=-1, name="crossed")
+    dark = insert_optic(polarizers, crossed, after="lamp")
+    lit, unlit = (Measurement(chain, run).residuals() for chain in (polarizers, dark))
+    assert np.abs(lit).max() < 0.1
+    # it predicts none, instead of whatever was measured
+    np.testing.assert_allclose(unlit, Measurement(polarizers, run).observed, atol=1e-12)
+
+
+def test_beams_of_an_exposure_are_taken_at_once():
+    # run, moves and rates of three beams are those of the two beams of a prism
+    turns, exposed = np.array([0, 40, 60, 45, 5.0]) * u.deg, np.array([2, 2, 3, 2, 2.0]) * u.s
+    columns = {"frame": np.arange(5), "bin": np.zeros(5, dtype=int), "wavelength": [0.6] * 5 * u.um}
+    columns |= {stage: turns for stage in ("hwp", "derotator", "parallactic")}
+    names = ["sequence", "hwp_move", "hwp_direction", "derotator_rate", "parallactic_rate"]
+    for times in ({}, {"time": [0, 10, 30, 40, 60] * u.s, "exposure_time": exposed}):
+        two, three = (
+            Observations.from_table(
+                QTable(columns | times | {f"flux_{one}": np.ones(5) * u.adu for one in beams})
+            )
+            for beams in (("right", "left"), "abc")
+        )
+        for name in names:
+            wanted = np.repeat(two.position(name), 3)
+            np.testing.assert_allclose(three.position(name), wanted, atol=1e-12, err_msg=name)
+        for duty in (0.5, None) if times else (0.5,):
+            moved = [motion(one, one.position("hwp"), duty) for one in (two, three)]
+            np.testing.assert_allclose(moved[1], np.repeat(moved[0], 3), atol=1e-12)
+
+
+def test_cycles_of_a_half_wave_plate_are_those_of_its_exposures():
+    angles = np.tile([0, 45, 22.5, 67.5], 3)[:-1] * u.deg
+    beams = [
+        optics.StateAnalyser(theta=a * u.deg, mount=f"beam=i{a}", name=f"i{a}") for a in (0, 60)
+    ]
+    plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    star = simulate(join([plate, *beams]), [0.6] * u.um, QTable({"hwp": angles}), seed=1)
+    with pytest.warns(AstropolcalWarning, match="6 of 22 frames masked, incomplete"):
+        whole = mask_incomplete_cycles(star)
+    assert whole.mask[:, 0].tolist() == [False] * 16 + [True] * 6
 
 
 # --- few frames, and none with noise -------------------------------------------------------------

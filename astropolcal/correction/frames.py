@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import stages
+from astropolcal.chain import check_states, stages
 from astropolcal.correction.solve import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
@@ -493,5 +493,6 @@ def frame_positions(instrument, table, chain, names=None):
     table["flux_right"] = table["flux_left"] = np.ones(len(table)) * u.adu
     # how the plate tracked the sky is all of the meta that positions depend on
     table.meta = {key: table.meta[key] for key in ("tracking",) if key in table.meta}
+    check_states(chain, table.columns, names[0])
     observations = Observations.from_table(table, name=names[0])
     return dict(instrument.positions(observations, chain))

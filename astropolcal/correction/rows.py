@@ -15,9 +15,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows, free_of, match_wavelengths
-from astropolcal.chain import join, leaves, stages, warn_beyond
+from astropolcal.chain import check_states, join, leaves, stages, warn_beyond
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
-from astropolcal.observations.pointings import plain_states
+from astropolcal.observations.pointings import in_state
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
@@ -79,6 +79,7 @@ class RowModel(Rows):
                     AstropolcalWarning,
                     stacklevel=3,
                 )
+        check_states(chain, positions, "positions")
         placed, nodes = _placed(positions, stages(chain))
         warn_beyond(chain, placed)
         super().__init__(chain, length_to_um(self.wavelength), placed, free, mix, nodes)
@@ -134,7 +135,7 @@ def _placed(positions, wanted):
     for name in wanted:
         column, _, state = name.partition("=")
         if name not in positions and state and column in positions:
-            placed[name] = (plain_states(np.atleast_1d(positions[column])) == state).astype(float)
+            placed[name] = in_state(positions, name, "positions")
             continue
         if name not in positions:
             raise ChainError(

@@ -112,12 +112,11 @@ def unknown_angles(observations, effect):
     """Return the frames whose angle, as an alternative reads it, is in no row of the table."""
     found = []
     for i, one in enumerate(observations):
-        f = effect.edge(one)
-        if f is not None:
+        for f in np.flatnonzero(effect.edge(one)):
             number = int(one.frames["frame"][f])
             words = f"frame {number}: its angle is in no row of the table"
-            told = {"probability": 1.0, "words": words, "place": (i, f)}
-            found.append(FrameFault(one.name, number, "unknown", **told))
+            given = {"probability": 1.0, "words": words, "place": (i, int(f))}
+            found.append(FrameFault(one.name, number, "unknown", **given))
     return found
 
 

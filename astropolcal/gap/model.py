@@ -522,11 +522,8 @@ def _may_be_wrong(calibration):
 def _with_alternative(observations, edited, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
     least, effect = found[0]
-    edges = [effect.edge(o) for o in observations]
-    observations = [
-        o if f is None else o.with_mask(np.arange(o.n_frames) == f, "its angle is in no row")
-        for o, f in zip(observations, edges, strict=True)
-    ]
+    edges = ((o, effect.edge(o)) for o in observations)
+    observations = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)

@@ -150,7 +150,7 @@ def _nominal(model):
 
 
 def _where(diagnosis):
-    """Return where the gap lies, behind what may be it unless one wavelength has nearly all."""
+    """Return where the gap lies, after what may be it unless one wavelength has nearly all."""
     found = _located(diagnosis.nominal)
     # what is at one wavelength is no perturbation with a law in wavelength
     alone = diagnosis.verdict == "unexplained" and found and found[0]["axis"] == "wavelength"

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal import instruments
-from astropolcal.chain import Train, leaves, stages, states_of
+from astropolcal.chain import Train, check_states, leaves, stages
 from astropolcal.exceptions import (
     ChainError,
     InstrumentError,
@@ -17,7 +17,6 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.observations import Observations
-from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator, splits
@@ -254,15 +253,7 @@ def _check_fit(chain, observations, observable):
         raise ObservationError(
             f"{name}: observable {observable.name} of {words[0]} a frame; allowed is {words[1]}"
         )
-    for column, states in states_of(chain).items():
-        # a column that is missing is named where its positions are read
-        found = observations.frames.columns.get(column, [])
-        strange = sorted(set(plain_states(found)) - set(states))
-        if strange:
-            raise ObservationError(
-                f"{name}: {column} = {', '.join(strange)} in the table; the chain knows "
-                f"{', '.join(states)}"
-            )
+    check_states(chain, observations.frames.columns, name, least=1)
 
 
 def _positions(chain, observations, positions):

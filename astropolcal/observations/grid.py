@@ -483,8 +483,8 @@ def cycle_numbers(observations, start=None):
     """
     Return the number of the half-wave-plate cycle of every frame, from 0, (F,).
 
-    That of the column ``cycle``; else a cycle ends where a plate angle (of one state of a
-    modulator) comes again, the derotator moves, or ``start`` comes, the angle with which a cycle
+    That of the column ``cycle``; else a cycle ends where a plate angle (of a beam, in a state of
+    a modulator) comes again, the derotator moves, or ``start`` comes, the angle with which a cycle
     begins.
     """
     frames = observations.frames
@@ -495,12 +495,12 @@ def cycle_numbers(observations, start=None):
     known = [] if start is None else [float(angle_to_rad(start, "start"))]
     plate = clusters(np.append(angle_or_zero(observations, "hwp"), known), _PLATE_STEPS, np.pi)
     plate, first = plate[: observations.n_frames], plate[observations.n_frames :]
-    state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
+    states = [np.asarray(frames[n]) for n in ("flc_state", "beam") if n in frames.colnames]
     moved = np.diff(derotator_runs(observations), prepend=0) > 0
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
-    for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
-        # with its first angle, unless nothing but that angle was seen: both states share it
-        begins = key[0] in first and any(angle != key[0] for angle, _ in seen)
+    for i, key in enumerate(zip(plate.tolist(), *states, strict=True)):
+        # with its first angle, unless nothing but that angle was seen: all states share it
+        begins = key[0] in first and any(angle != key[0] for angle, *_ in seen)
         if i and (moved[i] or begins or key in seen):
             number, seen = number + 1, set()
         seen.add(key)

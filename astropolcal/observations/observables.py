@@ -386,15 +386,18 @@ class _GroupedIntensity(Intensity):
         """Return the data of fluxes, (W, P), in units of the mean flux of each group."""
         # what is masked may be NaN in the table
         flux = np.where(self._usable, right[0], 0.0)
-        return self._over_mean(self._flux + self._left(self._scaled(flux)))
+        factor = self._factor(flux)
+        # no brightness makes light of a model without any
+        return self._over_mean(np.where(factor > 0, self._flux, 0.0) + self._left(factor * flux))
 
     def gathered(self, slopes, right, left):
         """Return the derivatives of the data; the brightness follows the model."""
         pull = self._weight * self._flux
         total = self._totals(pull * right[0])
         turn = self._totals(pull * slopes) / np.where(total > 0, total, np.inf)
-        change = self._left(self._factor(right[0]) * slopes)
-        return self._over_mean(change - self._left(self._scaled(right[0])) * turn)
+        factor = self._factor(right[0])
+        change = self._left(factor * slopes)
+        return self._over_mean(change - self._left(factor * right[0]) * turn)
 
     def variance(self, right, left, var_right, var_left, cov=0.0):
         """Return the variance of the data: that of the flux, as they are independent."""
@@ -408,9 +411,6 @@ class _GroupedIntensity(Intensity):
         pull = self._weight * self._flux
         total = self._totals(pull * flux)
         return self._totals(pull * self._flux) / np.where(total > 0, total, np.inf)
-
-    def _scaled(self, flux):
-        return self._factor(flux) * flux
 
     def _totals(self, array):
         """Return the sums over the group of each frame, (..., W, P)."""

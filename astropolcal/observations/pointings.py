@@ -31,7 +31,7 @@ from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import MOVES, PLACES, finite_position
-from astropolcal.units import angle_to_rad, mjd_of, plain_number
+from astropolcal.units import angle_to_rad, mjd_of, plain_number, to_unit
 from astropolcal.words import check_choice, check_type
 
 __all__ = ["location_of", "pointing"]
@@ -299,12 +299,25 @@ def motion(observations, angle, duty=None, turn=2 * np.pi):
     """
     # the parallactic angle jumps by 360 deg north of the zenith
     steady = np.unwrap(np.asarray(angle, dtype=float), period=turn)
-    if len(steady) < 2:
-        return np.zeros_like(steady)
-    if duty is not None:
-        if not 0 <= duty <= 1:
-            raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
-        return duty * np.gradient(steady)
+    change = np.zeros_like(steady)
+    # the beams of an exposure, which are frames of a table, are taken at once
+    beams = [np.sort(order) for order in _courses(observations)[1] if len(order) > 1]
+    if not beams:
+        return change
+    light, seconds = (duty, None) if duty is not None else _exposed(observations)
+    if duty is not None and not 0 <= duty <= 1:
+        raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
+    for own in beams:
+        place = np.arange(len(own)) if seconds is None else seconds[own]
+        if np.any(np.diff(place) <= 0):
+            raise ObservationError(f"{observations.name}: the times of the frames do not increase")
+        # second order also where the frames are not evenly spaced
+        change[own] = np.gradient(steady[own], place)
+    return change * light
+
+
+def _exposed(observations):
+    """Return the exposure time of each frame, and its time since the first one, in seconds."""
     frames, times = observations.frames, clock(observations.frames)
     if "exposure_time" not in frames.colnames or times is None:
         raise ObservationError(
@@ -315,11 +328,7 @@ def motion(observations, angle, duty=None, turn=2 * np.pi):
     if (unit := getattr(frames["time"], "unit", None)) is None:
         times, unit = _place(observations, "time"), u.day
     # differences before the factor, which would cost five digits
-    seconds = ((times - times[0]) * unit).to_value(u.s)
-    if np.any(np.diff(seconds) <= 0):
-        raise ObservationError(f"{observations.name}: the times of the frames do not increase")
-    # second order also where the frames are not evenly spaced
-    return np.gradient(steady, seconds) * exposure
+    return exposure, ((times - times[0]) * unit).to_value(u.s)
 
 
 def smeared(angle, change, nodes=3, when="middle"):
@@ -420,7 +429,7 @@ def frame_coordinate(observations, name):
         return modulator_states(observations.frames, observations.name)
     if name in PLACES:
         return _place(observations, name)
-    time = _time_or_order(observations)
+    time, courses = _courses(observations)
     if name == "sequence":
         # affine in time, so that a drift has the same parameter whatever the unit of the clock
         passed = time - time.min()
@@ -430,13 +439,14 @@ def frame_coordinate(observations, name):
     if name in MOVES:
         stage, _, what = name.rpartition("_")
         angle = observations.position(stage)
-        order, out = np.argsort(time, kind="stable"), np.zeros_like(angle)
-        steps = np.diff(angle[order], prepend=angle[order[:1]])
-        # a stage that stays where it is was last moved as before
-        last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
-        # whether it was backwards, or how far
-        found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
-        out[order] = found[what]
+        out = np.zeros_like(angle)
+        for order in courses:
+            steps = np.diff(angle[order], prepend=angle[order[:1]])
+            # a stage that stays where it is was last moved as before
+            last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+            # whether it was backwards, or how far
+            found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
+            out[order] = found[what]
         return out
     if name.endswith("_rate"):
         stage = name.removesuffix("_rate")
@@ -451,12 +461,8 @@ def frame_coordinate(observations, name):
         return np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))[None].repeat(2, axis=0)
     # what the frame before leaves behind, of several beams that of the same one; the first has
     # none, and 1 changes nothing there, nor where there is no light
-    beams = observations.frames.columns.get("beam", np.zeros(observations.n_frames))
     ratio = np.ones_like(fluxes)
-    for beam in np.unique(beams):
-        own = np.flatnonzero(np.asarray(beams) == beam)
-        # stable: frames of one time stay in the order of the table
-        order = own[np.argsort(time[own], kind="stable")]
+    for order in courses:
         now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
         ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
@@ -501,31 +507,28 @@ def axes_apart(first, second):
 def in_state(frames, name, label):
     """Return 1 where a column of frames has a state, ``"COLUMN=STATE"``, and 0 elsewhere, (F,)."""
     column, _, state = name.partition("=")
-    if column not in frames.colnames:
+    if column not in frames.keys():
         raise ObservationError(
             f"{label}: no column {column!r}, whose state {state!r} the chain needs; it has "
-            f"{', '.join(frames.colnames)}"
+            f"{', '.join(frames.keys())}"
         )
-    return (plain_states(frames[column]) == state).astype(float)
-
-
-def plain_states(column):
-    """Return the states of a column as text, by which optics know them."""
-    return np.array([str(value).strip() for value in column])
+    # states are known as text
+    found = [str(value).strip() == state for value in np.atleast_1d(frames[column])]
+    return np.array(found, dtype=float)
 
 
 def angle_change(observations, angle, turn=2 * np.pi):
     """
     Return how an angle (radian, (F,)) changes from frame to frame, in the order of the times.
 
-    That is half the change from the frame before to the one after. After a ``turn`` the angle is
-    the same again.
+    That is half the change from the frame before to the one after, of the same beam where there are
+    several. After a ``turn`` the angle is the same again.
     """
-    order = np.argsort(_time_or_order(observations), kind="stable")
     out = np.zeros_like(angle)
-    if len(angle) > 1:
-        # central differences, one-sided at both ends
-        out[order] = np.gradient(np.unwrap(angle[order], period=turn))
+    for order in _courses(observations)[1]:
+        if len(order) > 1:
+            # central differences, one-sided at both ends
+            out[order] = np.gradient(np.unwrap(angle[order], period=turn))
     return out
 
 
@@ -543,10 +546,8 @@ def clock(frames):
     if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
         return None
     # one unknown time makes the order of all frames doubtful, so none is used then
-    known = ~np.asarray(getattr(column, "mask", False))
-    plain = getattr(column, "unmasked", column)
-    times = np.asarray(getattr(plain, "value", plain), dtype=float)
-    return times if np.all(known & np.isfinite(times)) else None
+    times = to_unit(column, getattr(column, "unit", None), "time")
+    return times if np.all(np.isfinite(times)) else None
 
 
 def modulator_states(frames, label):
@@ -567,8 +568,21 @@ def modulator_states(frames, label):
     return np.array(found, dtype=float)
 
 
-def _time_or_order(observations):
-    times = clock(observations.frames)
+def _courses(observations):
+    """
+    Return the time of each frame, or its place in the order, and the frames of each beam by it.
+
+    The beams of an exposure, which are frames of a table, are taken at once.
+    """
+    times, count = clock(observations.frames), observations.n_frames
+    beams = np.asarray(observations.frames.columns.get("beam", np.zeros(count)))
+    own = [np.flatnonzero(beams == beam) for beam in np.unique(beams)]
     # a date alone is the same in all frames, and says no more than none
-    known = times is not None and np.ptp(times) > 0
-    return times if known else np.arange(observations.n_frames, dtype=float)
+    if times is None or not np.ptp(times) > 0:
+        times, seen = np.zeros(count), {beams[0]}
+        for i, beam in enumerate(beams[1:], start=1):
+            # one that comes again begins another exposure
+            times[i] = times[i - 1] + (beam in seen)
+            seen = {beam} if beam in seen else {*seen, beam}
+    # stable: frames of one time stay in the order of the table
+    return times, [frames[np.argsort(times[frames], kind="stable")] for frames in own]

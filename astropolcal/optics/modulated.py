@@ -20,6 +20,7 @@ from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import (
+    UNITS,
     _elliptical_retarder,
     _linear_retarder,
     _rotate,
@@ -383,21 +384,13 @@ class FerroelectricLiquidCrystal(FrameOptic):
         description="angle of the fast axis in state B from that in state A",
     )
 
-    @staticmethod
-    def _turned(matrix, coordinate, retardance, switching_angle):
-        angle = np.asarray(coordinate * switching_angle)
-        # states are (n_frames, 1) where there are several wavelengths
-        shape = np.broadcast_shapes(angle.shape, np.shape(retardance))
-        return _rotate(np.broadcast_to(matrix, (*shape, 4, 4)), np.broadcast_to(angle, shape))
-
     def _matrix(self, coordinate, retardance, switching_angle):
-        return self._turned(_linear_retarder(retardance), coordinate, retardance, switching_angle)
+        return _rotate(_linear_retarder(retardance), coordinate * switching_angle)
 
     def _derivatives(self, coordinate, retardance, switching_angle):
-        values = (coordinate, retardance, switching_angle)
-        slope = self._turned(retardance_slope(retardance), *values)
+        slope = _rotate(retardance_slope(retardance), coordinate * switching_angle)
         # the axis stands at s alpha: a turn of it, s times
-        turning = rotation_generator(self._matrix(*values))
+        turning = rotation_generator(self._matrix(coordinate, retardance, switching_angle))
         return slope, np.asarray(coordinate)[..., None, None] * turning
 
 
@@ -617,19 +610,16 @@ class StateAnalyser(FrameOptic):
         default=1.0, bounds=(0, 4), fixed=True, description="relative transmission"
     )
 
-    def _matrix(self, coordinate, efficiency, transmission):
-        out = blank(coordinate, efficiency, transmission)
-        out += scaled(1.0 - coordinate)
-        for i in (0, 1):
-            out[..., i, i] += coordinate * transmission / 2
-            out[..., i, 1 - i] += coordinate * transmission * efficiency / 2
-        return out
+    def _parts(self, *values):
+        """Return the values, and the matrices of ideal polarizers with and without efficiency."""
+        x, eta, t = (v[..., None, None] for v in np.broadcast_arrays(*values))
+        crossed = UNITS[0, 1] + UNITS[1, 0]
+        return x, t, crossed, UNITS[0, 0] + UNITS[1, 1] + eta * crossed
 
-    def _derivatives(self, coordinate, efficiency, transmission):
-        values = (coordinate, efficiency, transmission)
-        slopes = blank(*values), blank(*values)
-        for i in (0, 1):
-            slopes[0][..., i, 1 - i] = coordinate * transmission / 2
-            slopes[1][..., i, i] = coordinate / 2
-            slopes[1][..., i, 1 - i] = coordinate * efficiency / 2
-        return slopes
+    def _matrix(self, *values):
+        x, t, _, passed = self._parts(*values)
+        return (1 - x) * np.eye(4) + x * t / 2 * passed
+
+    def _derivatives(self, *values):
+        x, t, crossed, passed = self._parts(*values)
+        return x * t / 2 * crossed, x / 2 * passed

@@ -175,9 +175,7 @@ class VectorDiattenuator(Optic):
         return out
 
     def _derivatives(self, dispersion, horizontal, diagonal):
-        parts = np.broadcast_arrays(
-            np.asarray(horizontal, dtype=float), np.asarray(diagonal, dtype=float)
-        )
+        parts = np.broadcast_arrays(horizontal, diagonal)
         return tuple(_vector_slope(parts[i], parts[1 - i], i) for i in range(2))
 
 

@@ -115,7 +115,6 @@ class SerkowskiLaw(Fittable1DModel):
     [3.9  1.82] %
     """
 
-    # no upper bound: astropy does not convert bounds, and data may be in percent
     p_max = Parameter(default=0.05, bounds=(0, None), description="largest degree of polarization")
     lambda_max = Parameter(
         default=0.55, unit=u.um, bounds=(0.1, 2.5), description="wavelength of the maximum"
@@ -161,6 +160,15 @@ class SerkowskiLaw(Fittable1DModel):
         angle = (u.deg, u.deg / inputs_unit[self.inputs[0]])
         units = (outputs_unit[self.outputs[0]], inputs_unit[self.inputs[0]], None, *angle)
         return {name: unit for name, unit in zip(self.param_names, units, strict=True) if unit}
+
+    def without_units_for_data(self, **data):
+        """Return the law as a fitter takes it, p_max and its bounds in the unit of the data."""
+        law, own = self.copy(), self.p_max.unit or u.one
+        scale = own.to(getattr(data[self.outputs[0]], "unit", u.one))
+        # for astropy a plain number is in the unit of the data already, and bounds always are
+        law.p_max = self.p_max.value * own
+        law.p_max.bounds = [None if bound is None else bound * scale for bound in law.p_max.bounds]
+        return super(SerkowskiLaw, law).without_units_for_data(**data)
 
     def evaluate(self, x, p_max, lambda_max, K, theta, rotation):
         """Return the degree of polarization; astropy calls it."""

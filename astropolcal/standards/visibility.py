@@ -55,7 +55,7 @@ def night_times(site, night, *, twilight, step):
     """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
     with offline():
         # from noon to noon, so that a night is never cut in two whatever the longitude
-        date = Time(date_of(night), scale="utc")
+        date = Time(date_of(night, site), scale="utc")
         # a time of its own, which is printed to the second
         noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
         times = (noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day) + np.arange(
@@ -71,9 +71,12 @@ def night_times(site, night, *, twilight, step):
     return times[dark]
 
 
-def date_of(night):
-    """Return the date of the evening as text, or raise."""
+def date_of(night, site):
+    """Return the date of the evening as text, of a moment that of its night, or raise."""
     try:
+        if isinstance(night, Time) and night.mjd % 1:
+            # nights begin at noon, of the mean Sun at the site
+            night = night.utc + (site.lon.to_value(u.deg) / 360 - 0.5) * u.day
         text = iso_date(night.to_value("iso", "date") if isinstance(night, Time) else night)
         if "T" in text:
             raise ValueError
@@ -365,7 +368,7 @@ def observability(
     site : str or `~astropy.coordinates.EarthLocation`
         ``"subaru"``, ``"keck"``, ``"paranal"``, ``"gemini_south"``, or a place.
     night : str or `~astropy.time.Time`
-        Calendar date at the site on which the night begins.
+        Calendar date at the site on which the night begins; or a moment, from noon to noon there.
     min_altitude : `~astropy.units.Quantity`
         The star is not observed below it.
     twilight : `~astropy.units.Quantity`
@@ -404,7 +407,7 @@ def observability(
             f"{name} does not rise above {limit.to_value(u.deg):g} deg in the dark hours of "
             f"{night!s}; it gets to {table['altitude'].max().to_value(u.deg):.1f} deg"
         )
-    return Observability(name, place, date_of(night), limit, table)
+    return Observability(name, place, date_of(night, place), limit, table)
 
 
 def _range(values):
@@ -423,9 +426,8 @@ def _spread(count, frames):
 FRAMES = 32
 # where m3_score and m3_error agree; photon noise grows as 10^(0.2 m)
 _REFERENCE_MAGNITUDE = 10
-_FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f")
-_FORMATS |= dict.fromkeys(("altitude_min", "altitude_max", "hours"), ".1f")
-_FORMATS |= dict.fromkeys(("parallactic_min", "parallactic_max"), ".1f")
+_RANGES = "altitude_min", "altitude_max", "parallactic_min", "parallactic_max", "hours"
+_FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f") | dict.fromkeys(_RANGES, ".1f")
 _BANDS = ("U", "B", "V", "R", "I", "J", "H", "K")
 
 
@@ -576,9 +578,9 @@ def _observable(table, site, night, min_altitude):
         SkyCoord(table["ra"][:, None], table["dec"][:, None]), times, place
     )
     up = np.any(altitude >= limit, axis=1)
-    found = table[up]
+    found, evening = table[up], date_of(night, place)
     seen = [
-        Observability(str(name), place, date_of(night), limit, night_table(times, a, p, limit))
+        Observability(str(name), place, evening, limit, night_table(times, a, p, limit))
         for name, a, p in zip(found["name"], altitude[up], parallactic[up], strict=True)
     ]
     for name in ("altitude", "parallactic"):
@@ -590,8 +592,7 @@ def _observable(table, site, night, min_altitude):
     errors = np.array([s.information(FRAMES).diattenuation for s in seen], dtype=float)
     excess = found["magnitude"].value - _REFERENCE_MAGNITUDE
     found["m3_error"], found["m3_score"] = errors, errors * 10 ** (0.2 * excess)
-    for name in found.colnames:
-        if name in _FORMATS:
-            found[name].info.format = _FORMATS[name]
+    for name, digits in _FORMATS.items():
+        found[name].info.format = digits
     found.sort(["m3_score", "name"])
     return found

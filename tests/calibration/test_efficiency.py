@@ -58,6 +58,11 @@ def test_beam_splitter_does_not_count_but_its_orientation_does():
     turned = polarimetric_efficiency(bench(120, analyser=30), LAM, **kwargs)
     straight = polarimetric_efficiency(bench(120), LAM, derotator=0 * u.deg)
     np.testing.assert_allclose(turned, straight)
+    # one that turns stands at an angle that nobody gives
+    turning = bench(120)
+    turning["wollaston"].mount = "prism"
+    with pytest.raises(ChainError, match="no position of the stages prism"):
+        polarimetric_efficiency(turning, LAM, **kwargs)
 
 
 def test_path_ends_before_the_beam_splitter():

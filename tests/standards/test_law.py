@@ -88,6 +88,15 @@ def test_fit_of_data_in_percent_and_nanometre():
     fit = TRFLSQFitter()(SerkowskiLaw(), WAVELENGTH.to(u.nm), data)
     assert fit.p_max.quantity.to_value(u.percent) == pytest.approx(6, abs=0.05)
     np.testing.assert_allclose(fit.stokes(0.6 * u.um).q, 0.06, rtol=0.01)
+    # what is held, or bounded, is the same share in any unit of the data
+    held, bounded = SerkowskiLaw(p_max=0.06), SerkowskiLaw()
+    held.p_max.fixed, bounded.p_max.bounds = True, (0.02, 0.1)
+    for start in (held, bounded):
+        fit = TRFLSQFitter()(start, WAVELENGTH, data)
+        assert fit.p_max.quantity.to_value(u.percent) == pytest.approx(6, abs=0.05)
+        np.testing.assert_allclose(fit.lambda_max.value, 0.6, rtol=0.01)
+        again = TRFLSQFitter()(fit, WAVELENGTH, data.to(u.one))
+        assert again.p_max.value == pytest.approx(0.06, abs=0.0005)
 
 
 def test_unknown_tie_leaves_the_derivative_to_the_fitter():

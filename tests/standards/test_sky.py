@@ -132,8 +132,10 @@ def test_a_night_is_a_date():
 
 
 def test_a_time_is_a_night_too():
-    assert date_of(Time("2025-11-03T22:10")) == "2025-11-03"
-    assert date_of(" 2025-11-03 ") == "2025-11-03"
+    assert date_of(" 2025-11-03 ", SUBARU) == "2025-11-03"
+    # a moment belongs to the night from noon to noon at the site: here noon is at 22:22 UTC
+    for text, evening in {"03T22:10": "02", "03T22:30": "03", "04T12:00": "03"}.items():
+        assert date_of(Time(f"2025-11-{text}"), SUBARU) == f"2025-11-{evening}", text
     text, time = (
         night_times(SUBARU, night, twilight=-12 * u.deg, step=30 * u.min)
         for night in (NIGHT, Time(NIGHT))

@@ -412,7 +412,8 @@ class Alternative(Effect):
         return ()
 
     def edge(self, observations):
-        """Return the index of the frame of which the alternative knows no angle: None."""
+        """Return the frames, (F,) of bool, of which the alternative knows no angle: none."""
+        return np.zeros(observations.n_frames, dtype=bool)
 
     def edit(self, chains, context):
         """Return the changed chains; nothing is added that could be fitted."""
@@ -448,9 +449,10 @@ class Misread(Alternative):
         return super().applies_to(roles) and stages.issuperset(self.stages)
 
     def edge(self, observations):
-        """Return the index of the frame whose angle is in no row of its table, or None."""
-        find = {"_move": np.argmin, "_next": np.argmax}.get(self.what)
-        return find and int(find(observations.position("sequence")))
+        """Return the frames, (F,) of bool, whose angle is in no row of their table."""
+        first = {"_move": np.min, "_next": np.max}.get(self.what)
+        sequence = observations.position("sequence")
+        return super().edge(observations) if first is None else sequence == first(sequence)
 
     def change(self, chain, optic, *, roles, label, **_):
         """Return a chain with all optics on the stages turned."""
