@@ -146,7 +146,8 @@ def model_error(fit, lam, n=3):
     """Return what the model lacks, as directions (n_directions, n_wavelengths, n, n) of Stokes.
 
     From ``model_error`` of `Calibration.fit`: each of q and u errs in proportion to q and u, and by
-    a share of the intensity, at all wavelengths together, as what the model lacks is smooth.
+    a share of the intensity, at all wavelengths together, as what the model lacks is smooth. So
+    do signs of retardances that the data do not tell.
     """
     known = (fit or {}).get("model_error")
     if not known:
@@ -154,7 +155,10 @@ def model_error(fit, lam, n=3):
     own = np.asarray(known["wavelength_nm"], dtype=float) / 1e3
     order = np.argsort(own)
     directions = []
-    for key, columns in (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY)):
+    both = (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY))
+    for key, columns in (*both, *((f"sign_{key}", columns) for key, columns in both)):
+        if key not in known:
+            continue
         values = np.asarray(known[key], dtype=float)[order] / 100
         for row in _LINEAR:
             for column in columns:

@@ -239,7 +239,9 @@ def _stage(node):
 # in the unit of its declaration (degree, mm, nm, adu, none): far above all that an instrument has
 _LARGEST = 1e15
 _ACCURACY = ("wavelength", "n", "k", "s_res", "s_mean", "s_cv")
-_MODEL_ERROR = ("wavelength_nm", "relative_percent", "absolute_percent")
+_MODEL_ERROR = {"wavelength_nm"} | {
+    f"{sign}{key}_percent" for sign in ("", "sign_") for key in ("relative", "absolute")
+}
 
 
 def check_calibration(calibration):

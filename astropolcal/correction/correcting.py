@@ -232,8 +232,11 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
 
 def _mirrored(calibration):
     """Say which other solutions of the calibration, as good as it, no systematic error counts."""
-    mirrors = getattr(getattr(calibration, "identifiability", None), "mirrors", ())
+    if (getattr(calibration, "fit", None) or {}).get("model_error"):
+        # these count among the errors of the model
+        return []
     words = "systematic errors do not count another solution: {}"
+    mirrors = getattr(getattr(calibration, "identifiability", None), "mirrors", ())
     return [words.format(one) for one in mirrors if "tell the sign" in one]
 
 

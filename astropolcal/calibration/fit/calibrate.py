@@ -434,7 +434,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     if covariance is not None and not measurement.free.priors:
         # by the data of all runs, too
         finding.identifiable |= np.isfinite(covariance.stds)
-    finding.branches += undecided_signs(measurement)
+    signs, errors_of_signs = undecided_signs(measurement, view)
+    finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
     lacking = scatter = None
@@ -443,7 +444,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     else:
         scatter = Scatter(measurement, weighting, whitened)
         own = covariance_around(measurement, whitened, weighting, scatter)
-        lacking = model_error(measurement, scatter)
+        lacking = model_error(measurement, scatter, errors_of_signs)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),

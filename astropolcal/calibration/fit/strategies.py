@@ -19,7 +19,9 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
+from scipy.special import expit
 
+from astropolcal.calibration.identifiability.sky import mean_errors
 from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
@@ -238,14 +240,26 @@ def _turned(beside, phases, low, high, least):
     return found
 
 
-def undecided_signs(measurement):
-    """Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
+def _between(wavelength, phases):
+    """Return phases between the two beside each, NaN at the ends of the spectrum."""
+    found, lam = np.full(len(phases), np.nan), wavelength
+    for i in range(1, len(phases) - 1):
+        found[i] = np.interp(lam[i], lam[[i - 1, i + 1]], phases[[i - 1, i + 1]])
+    return found
+
+
+def undecided_signs(measurement, view):
+    """
+    Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
 
     That is where the other sign, other phases of the wavelength refitted, is less than three
     standard deviations worse, or better. What fits exactly as well is a mirror solution anyway.
+    With them the mean squares of the errors of q and u that the other signs would be on sky, times
+    their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
+    zero where the phases beside tell the sign.
     """
     problem = BinProblem(measurement, measurement.weighting)
-    vector, found = measurement.vector(), []
+    vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))
     costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
     for row, low, high in problem.main_retardances():
         slot, places = problem.slots[row], problem.elements[row]
@@ -258,16 +272,25 @@ def undecided_signs(measurement):
         moved = np.abs(np.remainder(trial[places] - vector[places] + np.pi, 2 * np.pi) - np.pi)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = new / costs
+            lost = count * np.log(ratio)
             # which may as well fit a little better
-            close = (np.abs(ratio - 1) > _ROUNDED) & (count * np.log(ratio) < _UNDECIDED)
-        for i in np.flatnonzero(close & (moved > _OTHER_SIGN) & (costs > 0)):
+            close = (np.abs(ratio - 1) > _ROUNDED) & (lost < _UNDECIDED)
+        close &= (moved > _OTHER_SIGN) & (costs > 0)
+        for i in np.flatnonzero(close):
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
             words = (
                 f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
                 f"sum of squares is {ratio[i]:.2f} times as large: the data do not tell the sign"
             )
             found.append({"words": words, "sky": None})
-    return found
+        beside = _between(measurement.wavelength, vector[places])
+        open_ = close & ~(4 * np.abs(vector[places] - beside) < np.abs(trial[places] - beside))
+        if view is not None and open_.any():
+            known = {o.name: o for chain in measurement.put_back(trial) for o in leaves(chain)}
+            other = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
+            chance = np.where(open_, expit(-np.where(close, lost, np.inf) / 2), 0.0)
+            errors = np.maximum(errors, chance * mean_errors(view, other))
+    return found, errors
 
 
 def other_laws(problem, vector, origin):
@@ -476,10 +499,8 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     told, moved = np.zeros((2, problem.n_bins), dtype=bool)
     for row, low, high in problem.main_retardances():
         where = problem.elements[row]
-        phases, beside = found[where], np.full(problem.n_bins, np.nan)
-        for i in range(1, problem.n_bins - 1):
-            beside[i] = np.interp(lam[i], lam[[i - 1, i + 1]], phases[[i - 1, i + 1]])
-        turned = _turned(beside, phases, low, high, _STICKS_OUT)
+        phases = found[where]
+        turned = _turned(_between(lam, phases), phases, low, high, _STICKS_OUT)
         told |= np.isfinite(turned)
         by_start = _turned(origin[where], phases, low, high, _OTHER_SIGN)
         turned = np.where(np.isfinite(turned), turned, by_start)

@@ -275,6 +275,18 @@ def consequences_of(view, chain):
     return _consequences(change[np.isfinite(change).all(axis=(-2, -1))], _whole)
 
 
+def mean_errors(view, chain):
+    """Return the mean squares of errors of q and u of taking another chain for the true one.
+
+    In proportion to the polarization and apart from it, of all settings, (2, n_wavelengths).
+    """
+    change = view.against(chain)
+    # of q = Q / I: what is found of I changes, too
+    change = change[..., 1:, :] - np.eye(3)[1:] * change[..., :1, :1]
+    square = np.where(np.isfinite(change), change, 0.0) ** 2
+    return np.stack([square[..., 1:].sum(axis=-1) / 2, square[..., 0]]).mean(axis=(-2, -1))
+
+
 def _consequences(matrices, changed):
     """Return least and largest change for each degree of polarization."""
     targets = []

@@ -342,17 +342,19 @@ def _amplitude(bins, residuals, spare):
     return np.maximum(levels, least)[bins] if total > 0 else np.full(len(bins), np.nan)
 
 
-def model_error(measurement, scatter):
+def model_error(measurement, scatter, signs):
     """Return the error of the model at a setting that it has not seen, for `Calibration.fit`.
 
     ``relative_percent`` multiplies the polarization, from polarized sources; ``absolute_percent``
     does not, from all others. Standard errors of q and u per wavelength; zero, and in ``missing``,
     where none tells. ``settings`` is the least number of them that tells one, if there is one.
+    ``sign_relative_percent`` and ``sign_absolute_percent`` are those of signs that the data do not
+    tell, whose mean squares are ``signs``, where there are such.
     """
     squares, settings = {"relative": [], "absolute": []}, []
-    if not scatter.is_known:
+    if not scatter.is_known and not signs.any():
         return None
-    for i, dataset in enumerate(measurement.datasets):
+    for i, dataset in enumerate(measurement.datasets if scatter.is_known else ()):
         polarized = kind_of_source(dataset.observations.source) == "polarized"
         square = scatter.at_settings(i) ** 2
         squares["relative" if polarized else "absolute"].append(square)
@@ -366,6 +368,9 @@ def model_error(measurement, scatter):
         found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
         if not count.any():
             found["missing"].append(key)
+    if signs.any():
+        keys = (f"sign_{key}_percent" for key in squares)
+        found |= zip(keys, (100 * np.sqrt(signs)).tolist(), strict=True)
     return found | ({"settings": min(settings)} if settings else {})
 
 

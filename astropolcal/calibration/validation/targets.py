@@ -196,9 +196,11 @@ def _of_model(calibration):
     known = calibration.fit.get("model_error")
     missing = known.get("missing", []) if known else _OF_SOURCES
     none = [source for key, source in _OF_SOURCES.items() if key in missing]
-    if len(none) == len(_OF_SOURCES):
-        return "without an error of the model"
-    return "and an error of the model" + "".join(f", but none from {one} sources" for one in none)
+    words = "and an error of the model" + "".join(f", but none from {one} sources" for one in none)
+    words = "without an error of the model" if len(none) == len(_OF_SOURCES) else words
+    # where the data leave two signs of a retardance open
+    signs = np.count_nonzero((known or {}).get("sign_relative_percent", ()))
+    return words + (f", with signs that nothing tells at {signs} wavelengths" if signs else "")
 
 
 def _target(dolp, aolp):
