@@ -293,7 +293,7 @@ def settings(angles, n):
     return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
 
 
-def noise(channel, residual, angles, without=None):
+def noise(channel, residual, angles, bins, without=None):
     """
     Return the noise of every datum, see `frame_noise`; of a single beam less its groups.
 
@@ -302,12 +302,12 @@ def noise(channel, residual, angles, without=None):
     valid = channel.valid if without is None else channel.valid & ~without
     seen = SimpleNamespace(variance=channel.variance, valid=valid)
     if channel.groups is None:
-        sigma = frame_noise(seen, residual, angles)
+        sigma = frame_noise(seen, residual, angles, bins)
     else:
         lamp = _GroupLamp(channel.groups)
         level = residual[1] - lamp.mean(residual[1], valid * 1.0)
         seen.variance = channel.variance[1:]
-        sigma = frame_noise(seen, np.where(valid, level, 0.0)[None], angles)
+        sigma = frame_noise(seen, np.where(valid, level, 0.0)[None], angles, bins)
         sigma = np.stack([np.ones_like(sigma[0]), sigma[0]])
     if without is None:
         return sigma

@@ -295,7 +295,8 @@ class GapProblem:
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
-            channel.set_noise(noise(channel, residual, angles, out), residual, saturating)
+            told = noise(channel, residual, angles, dataset.bins, out)
+            channel.set_noise(told, residual, saturating)
         found = [
             expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)

@@ -103,8 +103,13 @@ def test_what_optics_do_is_no_noise():
 
 def test_what_is_smooth_in_wavelength_is_no_noise():
     smooth = 0.05 * np.linspace(-1, 1, W)[:, None] * np.random.default_rng(3).normal(size=F)
-    found = estimates.frame_noise(channel(1e-6), draws(1e-3) + smooth, ANGLES)
+    residual = draws(1e-3) + smooth
+    found = estimates.frame_noise(channel(1e-6), residual, ANGLES)
     np.testing.assert_allclose(found, 1e-3, rtol=0.15)
+    # whatever the order of the table
+    order = np.random.default_rng(4).permutation(W)
+    again = estimates.frame_noise(channel(1e-6), residual[:, order], ANGLES, bins=order)
+    np.testing.assert_allclose(again, found[:, order], rtol=1e-12)
 
 
 # ---- roughness -----------------------------------------------------------------------------

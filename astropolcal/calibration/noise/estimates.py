@@ -525,15 +525,14 @@ def noise_from_roughness(measurement, vector=None):
             variance = _SINGLE.variance(*(x[None] for x in (*fluxes, *errors)))
             difference = _SINGLE.evaluate(*(x[None] for x in fluxes))
             residual = difference - _predicted_differences(part, vector).T
-        # neighbours are those along the wavelengths, whatever the order of the table
-        valid, order = np.isfinite(residual), np.argsort(part.bins)
-        frames = SimpleNamespace(variance=variance[None, order], valid=valid[order])
+        valid = np.isfinite(residual)
+        frames = SimpleNamespace(variance=variance[None], valid=valid)
         angles = {}
         for stage, angle in part.positions.items():
             angles[stage] = np.zeros(obs.n_frames)
             angles[stage][part.frames.T] = angle
-        (sigma,) = frame_noise(frames, np.where(valid, residual, 0.0)[None, order], angles)
-        sigma = sigma[np.argsort(order)]
+        residual = np.where(valid, residual, 0.0)
+        (sigma,) = frame_noise(frames, residual[None], angles, part.bins)
         of_data = np.mean(sigma[:, part.frames] ** 2, axis=-1)[part.valid]
         sigmas.append(np.sqrt(of_data / part.observable.frames_per_datum))
         known = np.isfinite(variance) & (variance > 0) & valid
@@ -549,18 +548,21 @@ def noise_from_roughness(measurement, vector=None):
     return _of_data(measurement, np.concatenate(sigmas), freedom, "roughness", words)
 
 
-def frame_noise(channel, residual, angles):
+def frame_noise(channel, residual, angles, bins=None):
     """
     Return the noise of every number of each frame: the stated errors, or more by the data.
 
     ``channel`` has the stated ``variance`` (n, W, F) and what is ``valid`` (W, F), ``residual`` has
-    the shape of the variance, ``angles`` the position of every stage, radian, (F,).
+    the shape of the variance, ``angles`` the position of every stage, radian, (F,), and ``bins``,
+    (W,), the place of each wavelength in the spectrum, by default that in the table.
 
     What static and rotating optics can do to a beam is a sum of a few
     harmonics of the stages' angles, sharp in wavelength or not; everything else
     is smooth in wavelength. So noise is what is left without either.
     """
-    sigma, valid = np.sqrt(channel.variance), channel.valid
+    order = np.arange(len(channel.valid)) if bins is None else np.argsort(bins)
+    sigma, valid = np.sqrt(channel.variance)[:, order], channel.valid[order]
+    residual = residual[:, order]
     basis = _turning(angles, valid)
     whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
     # neighbours in wavelength of which none is masked
@@ -598,7 +600,7 @@ def frame_noise(channel, residual, angles):
             total = (sigma[i][:-2] ** 2 + 4 * sigma[i][1:-1] ** 2 + sigma[i][2:] ** 2) / 6
             sigma[i] *= max(1.0, rough / np.median(np.sqrt(total)[three]))
         sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
-    return sigma
+    return sigma[:, np.argsort(order)]
 
 
 def _turning(angles, valid):
