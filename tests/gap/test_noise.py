@@ -137,7 +137,7 @@ def test_an_error_of_zero_states_nothing_of_frames_left_out():
     """Nor does it warn: what is stated of the others tells the noise of these."""
     some = channel(1e-6)
     some.variance[:, :, 0] = 0.0
-    found = channels.noise(some, draws(1e-3), {}, np.arange(F) == 3)
+    found = channels.noise(some, draws(1e-3), {}, np.arange(W), np.arange(F) == 3)
     usual = np.median(found[:, :, 4:], axis=(1, 2))
     np.testing.assert_allclose(found[:, :, 3], np.repeat(usual[:, None], W, axis=1))
 
