@@ -221,7 +221,9 @@ class Probe:
 
     def _positions(self, chain, n=16):
         draws = {stage: self.rng.uniform(0.1, 1, n) for stage in stages(chain)}
-        return {s: x * u.one if s in COORDINATES else 180 * x * u.deg for s, x in draws.items()}
+        # a star is above the horizon
+        units = {stage: (90 if stage == "altitude" else 180) * u.deg for stage in draws}
+        return {s: x * (u.one if s in COORDINATES else units[s]) for s, x in draws.items()}
 
     def check_on_sky(self):
         """A chain from the sky starts with the telescope, and nothing of the source is in it."""

@@ -465,7 +465,7 @@ class Instrument(ABC):
         ]
         for leaf in (leaf for chain in chains for leaf in leaves(chain)):
             for parameter in (getattr(leaf, key) for key in leaf.param_names):
-                parameter.wavelength = grid if parameter.shape == grid.shape else None
+                parameter.wavelength = grid if parameter.size == grid.size > 1 else None
         return add_nuisance(map(as_exact, chains) if exact else chains, datasets, nuisance)
 
     def telescope_optics(self, behind, **options):

@@ -19,7 +19,6 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
-from scipy.special import expit
 
 from astropolcal.calibration.identifiability.sky import mean_errors
 from astropolcal.calibration.noise.estimates import (
@@ -70,6 +69,8 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 _HOPELESS, _GLANCE = 100.0, 15
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
 _UNDECIDED = 9.0
+# below this the sign of the start is as good
+_EQUAL = 2.0
 # of data without noise, residuals below this are rounding
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -288,7 +289,7 @@ def undecided_signs(measurement, view):
         if view is not None and open_.any():
             known = {o.name: o for chain in measurement.put_back(trial) for o in leaves(chain)}
             other = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
-            chance = np.where(open_, expit(-np.where(close, lost, np.inf) / 2), 0.0)
+            chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
             errors = np.maximum(errors, chance * mean_errors(view, other))
     return found, errors
 
@@ -492,7 +493,7 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
     well. Any error of the model then decides between them; their neighbours tell which is true.
-    Where these say nothing the start does, if neither the data nor those of a neighbour refuse.
+    Where these say nothing, and the data hardly anything, the start does.
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
     start, lam = found.copy(), measurement.wavelength
@@ -500,14 +501,17 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     for row, low, high in problem.main_retardances():
         where = problem.elements[row]
         phases = found[where]
-        turned = _turned(_between(lam, phases), phases, low, high, _STICKS_OUT)
+        beside = _between(lam, phases)
+        turned = _turned(beside, phases, low, high, _STICKS_OUT)
         told |= np.isfinite(turned)
         by_start = _turned(origin[where], phases, low, high, _OTHER_SIGN)
+        # unless those beside it tell that the sign is right
+        by_start[4 * np.abs(phases - beside) < np.abs(by_start - beside)] = np.nan
         turned = np.where(np.isfinite(turned), turned, by_start)
         start[where] = np.where(np.isfinite(turned), turned, phases)
         moved |= np.isfinite(turned)
-    undecided = np.exp(_UNDECIDED / problem._present.sum(axis=1).clip(1))
-    worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], undecided)
+    equal = np.exp(_EQUAL / problem._present.sum(axis=1).clip(1))
+    worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], equal)
     if moved.any():
         before, (start, costs) = problem.costs(found), problem.polish(start)
         refused = moved & (costs >= far * before)
