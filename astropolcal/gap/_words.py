@@ -204,13 +204,19 @@ def _one_or_like(entry):
 
 
 def own_share(entry):
-    """Return how probable a cause is among its aliases, regardless of its place."""
-    return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
+    """Return how probable a cause is among its aliases, regardless of its place and name."""
+    return entry["share"] + sum(one["probability"] for one in _same(entry))
+
+
+def _same(entry):
+    """Return the aliases that are the same thing: at another place, or without the name."""
+    nameless = [a for a in entry["aliases"] if a["cell"] and a["cell"] == entry["cell"]]
+    return [*_alike(entry)[1:], *(a for a in nameless if entry["effect"] and not a["effect"])]
 
 
 def others(entry, ranks):
     """Return titles and probabilities of what else a cause may be, those of one kind as one."""
-    groups, same = {}, _alike(entry)[1:]
+    groups, same = {}, _same(entry)
     for one in entry["aliases"]:
         if one not in same and one["name"] not in ranks:
             groups.setdefault(_outline(one), []).append(one)
