@@ -69,7 +69,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --mirrored  east is to the right of north
 --subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
     measures it between two radii in pixels, DEG%%,DEG (0.8+-0.1,45+-3) states degree in percent and
-    angle, with their errors
+    angle, with their errors (exact without them)
 --open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not
     determine: infinite (default), ignore, or the standard deviation of the angle that each is
     named after, in degrees
