@@ -266,6 +266,26 @@ def test_cameras_that_contradict_each_other(copied):
         assert message in "; ".join(next(iter(problems.values())))
 
 
+def test_masters_of_other_settings_are_told(copied):
+    size, word = (SIDE, SIDE), VAMPIRES.files.keywords["filter"]
+    cards = {"EXPTIME": 10.0, "U_CAMERA": 1, "U_EMGAIN": 300.0}
+    for kind, changes, words in (
+        ("dark", {}, ""),
+        ("dark", {"U_EMGAIN": 10.0}, "em_gain = 300.0, but 10.0 in its dark"),
+        ("dark", {"U_CAMERA": 2}, "camera = 1.0, but 2.0 in its dark"),
+        ("flat", {"EXPTIME": 1.0, word: "625-50", "U_EMGAIN": 1.0}, ""),
+        ("flat", {word: "675-50"}, "filter = 625-50, but 675-50 in its flat"),
+    ):
+        for camera in (1, 2):
+            image = np.full(size, float(kind == "flat"))
+            header = fits.Header(cards | changes)
+            fits.writeto(copied / f"{kind}_cam{camera}.fit", image, header, overwrite=True)
+        for path in copied.glob("*.fits"):
+            edit(path, U_EMGAIN=300.0, **{word: "625-50"})
+        told = reduced(copied, **{kind: copied / f"{kind}_cam1.fit"}).doubts
+        assert {"; ".join(why) for why in told.values()} == ({words} if words else set()), changes
+
+
 def test_a_camera_that_is_missing(copied):
     (copied / "VMPA00000001_cam2.fits").unlink()
     (copied / "VMPA00000002_cam1.fits").unlink()

@@ -267,6 +267,27 @@ def check_stars(frames, layout, needed=True):
 # ---- dark and flat of raw frames ----------------------------------------------------------------
 
 
+# what the headers of a dark, or of a flat, must have in common with those of its frames
+_SETTINGS = {
+    "dark": ("exposure_time", "em_gain", "read_mode", "camera"),
+    "flat": ("filter", "camera"),
+}
+
+
+def other_settings(values, masters):
+    """Return in what a frame differs from its dark and flat, whose `Masters.settings` are given."""
+    found = []
+    for kind, told in masters.items():
+        for column in (c for c in _SETTINGS[kind] if c in values and c in told):
+            ours, theirs = values[column], told[column]
+            if isinstance(ours, str):
+                same = ours.casefold() == theirs.casefold()
+            else:
+                same = abs(ours - theirs) <= 0.01 * abs(ours)
+            found += [] if same else [f"{column} = {ours}, but {theirs} in its {kind}"]
+    return found
+
+
 @dataclass(frozen=True)
 class Masters:
     """
@@ -294,9 +315,11 @@ class Masters:
         """Return the files of the left beam."""
         return Masters(*(p and str(layout.left_file(p)) for p in (self.dark, self.flat)))
 
-    def exposure_time(self, layout):
-        """Return that of the dark, second; None without one, or if its header does not say."""
-        return self.dark and read_header(self.dark, layout).values.get("exposure_time")
+    def settings(self, layout):
+        """Return what the headers of dark and flat say, by ``"dark"`` and ``"flat"``."""
+        return {
+            kind: read_header(path, layout).values for kind, path in vars(self).items() if path
+        }
 
     def applied(self, cube, good, layout, detector):
         """Return a cube, or a stack of exposures, and its known pixels, less dark and over flat."""

@@ -38,10 +38,13 @@ from astropolcal.instruments.layout import (
 from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, sky_angle
 from astropolcal.units import iso_date
+from astropolcal.words import listed
 
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
+# days that start, middle and end of an exposure may be apart
+_RAW_APART = 1 / 24
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 # in which the times and the places of targets are understood
@@ -80,6 +83,8 @@ def frame_number(name, layout, header=None):
 def raw_frames(folder, layout):
     """
     Return the paths of the raw frames in a folder by number; files are looked at by name only.
+
+    Several of one number are lists of several.
     """
     folder = Path(folder)
     if not os.path.isdir(folder):
@@ -88,7 +93,7 @@ def raw_frames(folder, layout):
     for path in sorted(folder.iterdir()):
         number = frame_number(path.name, layout)
         if number is not None and path.name.lower().endswith(_SUFFIXES):
-            found.setdefault(number, path)
+            found.setdefault(number, []).append(path)
     if not found:
         raise ObservationError(f"{folder}: no FITS file with a frame number in its name")
     return found
@@ -135,11 +140,8 @@ def read_header(path, layout, *, header=None, raw=None):
         elif frame.number not in raw:
             frame.errors.append(f"no raw frame of number {frame.number}")
         else:
-            try:
-                # behind the cube: its own keywords come first
-                headers.append(primary_header(raw[frame.number]))
-            except ObservationError as error:
-                frame.errors.append(f"raw frame: {error}")
+            # behind the cube: its own keywords come first
+            headers += _raw_headers(frame, raw[frame.number], header, layout)
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
         if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
             frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"
@@ -157,6 +159,32 @@ def read_header(path, layout, *, header=None, raw=None):
     if look_up(headers, "mjd" if "mjd" in frame.values else "date", layout)[0] in _STARTS:
         frame.values["starts"] = True
     return frame
+
+
+def _raw_headers(frame, paths, header, layout):
+    """Return the header of the raw frame; why it may be that of another one is an error."""
+    # the same file, compressed or not, is one
+    if len({path.name.partition(".")[0] for path in paths}) > 1:
+        names = listed([path.name for path in paths], most=3)
+        frame.errors.append(f"{names} are raw frames of number {frame.number}: which one is its?")
+        return []
+    try:
+        found = primary_header(paths[0])
+    except ObservationError as error:
+        frame.errors.append(f"raw frame: {error}")
+        return []
+    # numbers begin again, in other nights; what is no time, or a date alone, says nothing
+    keys = ("mjd", "date", "time")
+    with suppress(ObservationError):
+        ours, theirs = (
+            observation_time({key: look_up([one], key, layout)[1] for key in keys})
+            for one in (header, found)
+        )
+        if abs(ours.mjd - theirs.mjd) > _RAW_APART:
+            frame.errors.append(
+                f"{paths[0].name} of the same number is of {theirs.isot}, the cube of {ours.isot}"
+            )
+    return [found]
 
 
 def _compare(frame, column, found, layout):

@@ -27,7 +27,7 @@ from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
+from astropolcal.reduction.frames import Frame, Masters, check_stars, other_settings, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table
 from astropolcal.version import version
@@ -313,10 +313,9 @@ def reduce_run(
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
-    dark_time = masters.exposure_time(layout)
+    settings = masters.settings(layout)
     for frame in frames:
-        if dark_time and abs(frame.values.get("exposure_time", dark_time) / dark_time - 1) > 0.01:
-            frame.doubts.append(f"exposed for another time than its dark, {dark_time:g} s")
+        frame.doubts += other_settings(frame.values, settings)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:

@@ -353,7 +353,7 @@ def test_dark_in_another_unit_is_refused_and_of_another_exposure_told(tmp_path, 
     for unit, time, words in [
         ("adu", 10.0, ""),
         (None, 10.0, ""),
-        ("adu", 5.0, "exposed for another time than its dark, 5 s"),
+        ("adu", 5.0, "exposure_time = 10.0, but 5.0 in its dark"),
         ("electron", 10.0, "dark.fits is in electron, the frame in adu"),
         ("adu/s", 10.0, "dark.fits is in adu/s, the frame in adu"),
     ]:
