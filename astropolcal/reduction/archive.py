@@ -282,7 +282,8 @@ def _cut(frames, gap, cycles):
     """Yield lists of frames, cut where there is a gap in time, and after some cycles."""
     part, end, count, seen = [], None, 1, []
     for frame in frames:
-        late = None not in (end, frame.mjd) and frame.mjd - end > gap
+        # of which night a frame without a time is, nobody knows
+        late = end is not None and (frame.mjd is None or frame.mjd - end > gap)
         known = frame.hwp is not None
         same = [known and abs(_half_turn(frame.hwp - other)) < _SAME_ANGLE for other in seen]
         if any(same[:-1]):
@@ -290,7 +291,7 @@ def _cut(frames, gap, cycles):
             count, seen, same = count + 1, [], []
         if part and (late or (cycles and count > cycles)):
             yield part
-            part, count, seen, same = [], 1, [], []
+            part, end, count, seen, same = [], None, 1, [], []
         part.append(frame)
         if known and not any(same[-1:]):
             seen.append(frame.hwp)

@@ -317,9 +317,7 @@ class Masters:
 
     def settings(self, layout):
         """Return what the headers of dark and flat say, by ``"dark"`` and ``"flat"``."""
-        return {
-            kind: read_header(path, layout).values for kind, path in vars(self).items() if path
-        }
+        return {kind: read_header(path, layout).values for kind, path in vars(self).items() if path}
 
     def applied(self, cube, good, layout, detector):
         """Return a cube, or a stack of exposures, and its known pixels, less dark and over flat."""
