@@ -213,6 +213,16 @@ def test_errors_of_fluxes_have_the_excess_noise(tmp_path):
         assert variance[same].mean() > 1.9 * photons
 
 
+def test_each_frame_is_read_out_as_its_row_says(tmp_path):
+    table = frames(hwp=[0], derotator=[45.0])
+    table["em_gain"] = [1.0, 300.0]
+    # so faint that the noise is that of the read-out, electrons over electrons per adu
+    for path, noise in zip(write(tmp_path, table, flux=1e-9), (9.6 / 4.5, 89 / 4.5), strict=True):
+        image, error = (fits.getdata(path, i) for i in (0, 1))
+        assert image.std() == pytest.approx(noise, rel=0.1)
+        assert error.mean() == pytest.approx(noise, rel=0.01)
+
+
 # --- files of two cameras ------------------------------------------------------------------------
 
 

@@ -32,6 +32,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import append_line, one_line, understood
 from astropolcal.fitscheck import primary_header
 from astropolcal.pipeline.headers import recognized
+from astropolcal.pipeline.store import sha256_of
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting
 from astropolcal.reduction.headers import _SUFFIXES, _half_turn, observation_time, read_header
@@ -362,13 +363,7 @@ class Manifest:
             same = state.st_mtime_ns == entry.get("changed")
             # a copy has another time, and the same content
             if state.st_size == entry.get("size") and (
-                same or checksum(product) == entry.get("sha256")
+                same or sha256_of(product) == entry.get("sha256")
             ):
                 return "done" if entry.get("source") == source else "older"
         return ""
-
-
-def checksum(path):
-    """Return the SHA-256 of a file."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

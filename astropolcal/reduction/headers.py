@@ -140,8 +140,11 @@ def read_header(path, layout, *, header=None, raw=None):
         elif frame.number not in raw:
             frame.errors.append(f"no raw frame of number {frame.number}")
         else:
-            # behind the cube: its own keywords come first
-            headers += _raw_headers(frame, raw[frame.number], header, layout)
+            try:
+                # behind the cube: its own keywords come first
+                headers.append(_raw_header(frame, raw[frame.number], header, layout))
+            except ObservationError as error:
+                frame.errors.append(f"raw frame: {error}")
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
         if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
             frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"
@@ -161,30 +164,24 @@ def read_header(path, layout, *, header=None, raw=None):
     return frame
 
 
-def _raw_headers(frame, paths, header, layout):
-    """Return the header of the raw frame; why it may be that of another one is an error."""
+def _raw_header(frame, paths, header, layout):
+    """Return the header of the raw frame; refused where it may be that of another one."""
+    names, found, times = [path.name for path in paths], primary_header(paths[0]), []
     # the same file, compressed or not, is one
-    if len({path.name.partition(".")[0] for path in paths}) > 1:
-        names = listed([path.name for path in paths], most=3)
-        frame.errors.append(f"{names} are raw frames of number {frame.number}: which one is its?")
-        return []
-    try:
-        found = primary_header(paths[0])
-    except ObservationError as error:
-        frame.errors.append(f"raw frame: {error}")
-        return []
-    # numbers begin again, in other nights; what is no time, or a date alone, says nothing
-    keys = ("mjd", "date", "time")
-    with suppress(ObservationError):
-        ours, theirs = (
-            observation_time({key: look_up([one], key, layout)[1] for key in keys})
-            for one in (header, found)
+    if len({name.partition(".")[0] for name in names}) > 1:
+        raise ObservationError(
+            f"{listed(names, most=3)} have the number {frame.number}: which one?"
         )
-        if abs(ours.mjd - theirs.mjd) > _RAW_APART:
-            frame.errors.append(
-                f"{paths[0].name} of the same number is of {theirs.isot}, the cube of {ours.isot}"
-            )
-    return [found]
+    for one in (header, found):
+        # what is no time, or a date alone, says nothing
+        with suppress(ObservationError):
+            told = {key: look_up([one], key, layout)[1] for key in ("mjd", "date", "time")}
+            times.append(observation_time(told))
+    # numbers begin again, in other nights
+    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > _RAW_APART:
+        ours, theirs = (time.isot for time in times)
+        raise ObservationError(f"{names[0]} of the same number is of {theirs}, the cube of {ours}")
+    return found
 
 
 def _compare(frame, column, found, layout):

@@ -27,7 +27,7 @@ from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.frames import Frame, Masters, check_stars, other_settings, reduce_frame
+from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
 from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
 from astropolcal.reduction.tables import photometry_table, reduced_table
 from astropolcal.version import version
@@ -315,7 +315,7 @@ def reduce_run(
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
     for frame in frames:
-        frame.doubts += other_settings(frame.values, settings)
+        frame.doubts += masters.doubts(frame.values, settings)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:

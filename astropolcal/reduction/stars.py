@@ -21,6 +21,7 @@ from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.reduction.finding import find_star, fit_gaussians
 from astropolcal.reduction.photometry import Photometry, flux_variance, outliers, shared_pixels
 from astropolcal.reduction.wings import wing_shares
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -123,10 +124,7 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
 
 
 def _check_correction(correction, layout):
-    if correction not in (False, True, "growth"):
-        raise ParameterError(
-            f"aperture_correction = {correction!r}; allowed are False, True and 'growth'"
-        )
+    check_choice("aperture_correction", correction, (False, True, "growth"), ParameterError)
     if correction is True and not layout.two_beams:
         raise ParameterError(
             f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
