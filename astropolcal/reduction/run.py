@@ -391,8 +391,9 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
     settings |= {"raw": repr(task["raw"]), "checked": False, "made by": version}
-    of_masters = (task["masters"] or Masters()).files(task["layout"])
-    settings["changed"] = [os.stat(path).st_mtime_ns for path in of_masters]
+    others = (task["masters"] or Masters()).files(task["layout"])
+    others += [path for paths in (task["raw"] or {}).values() for path in paths]
+    settings["changed"] = [os.stat(path).st_mtime_ns for path in others]
     journal = Journal(resume, settings, task["layout"].left_file)
     found = {path: frame for path in files if (frame := journal.done(path)) is not None}
     # a file that is named twice is measured once

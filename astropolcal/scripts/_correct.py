@@ -282,17 +282,11 @@ def choose_calibration(arguments, files):
 
 def _read(path):
     """Return a calibration and its hash, which many sequences of an archive have in common."""
-    state = os.stat(path) if os.path.exists(path) else None
-    return _read_once(path, None if state is None else (state.st_size, state.st_mtime_ns))
+    from astropolcal.pipeline import library
 
-
-@lru_cache(maxsize=8)
-def _read_once(path, state):
-    from astropolcal import Calibration
-    from astropolcal.converters.calibration import content_hash
-
-    calibration = Calibration.read(path)
-    return calibration, content_hash(calibration)
+    state = library._state(path) if os.path.exists(path) else None
+    calibration, record = library._read(path, state or ())
+    return calibration, record["content_hash"]
 
 
 @lru_cache(maxsize=1)

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Runs: what is left out and why, resuming, processes, the table, other people's tables."""
 
+import os
 import re
 import warnings
 from dataclasses import replace
@@ -346,6 +347,18 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
     for path, words in (("other.fits", r"\(20, 20\); .* is needed"), ("none.fits", "no such file")):
         with pytest.raises(AstropolcalError, match=words):
             reduce_run(paths[1], small, dark=tmp_path / path)
+
+
+def test_a_journal_knows_when_a_raw_header_was_mended(tmp_path, small, flat_cube):
+    (tmp_path / "raw").mkdir()
+    cube = write_cube(tmp_path / "CRSA00000001_cube.fits", flat_cube, drop=["RET-ANG1"])
+    for angle in (0.0, 45.0):
+        raw = write_cube(tmp_path / "raw" / "CRSA00000001.fits", None, RET__ANG1=angle)
+        # a clock may be coarser than two writes are apart
+        os.utime(raw, ns=(0, int(angle * 1e9)))
+        options = {"raw": tmp_path / "raw", "resume": tmp_path / "run.journal"}
+        (frame,) = reduce_run([cube], small, **options).frames
+        assert frame.values["hwp"] == angle
 
 
 def test_dark_in_another_unit_is_refused_and_of_another_exposure_told(tmp_path, small):
