@@ -10,6 +10,7 @@ from astropy.time import Time
 
 from astropolcal.calibration.fit.evidence import COURSES, moment_of
 from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.result.calibration import folded
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
@@ -95,7 +96,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     rows = {row["name"]: row for row in library.table()}
     groups = {}
     for entry in library.entries:
-        key = (entry.validity.instrument or "", entry.validity.mode or "")
+        # written now so, now so
+        key = (entry.validity.instrument or "", folded(entry.validity.mode or ""))
         groups.setdefault(key, []).append(entry)
     return plain(
         {
@@ -103,8 +105,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
             "goal_percent": goal,
             "unreadable": {path.name: reason for path, reason in library.problems.items()},
             "groups": [
-                _group(*key, sorted(own, key=_start), rows, moment, goal, limit, events)
-                for key, own in sorted(groups.items())
+                _group(sorted(own, key=_start), rows, moment, goal, limit, events)
+                for _, own in sorted(groups.items())
             ],
         }
     )
@@ -124,8 +126,9 @@ def _start(entry):
     return date_of(entry.calibration) or ""
 
 
-def _group(instrument, mode, entries, rows, moment, goal, limit, events):
+def _group(entries, rows, moment, goal, limit, events):
     """Return what is to be said of the calibrations of an instrument and a mode."""
+    held = entries[-1].validity
     gone = {digest for entry in entries for digest in entry.supersedes}
     left_out = [f"{e.name} is superseded" for e in entries if e.content_hash in gone]
     entries = [entry for entry in entries if entry.content_hash not in gone]
@@ -136,8 +139,8 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     entries = [entry for entry in entries if entry not in late] or entries
     dated = [e for e in entries if _start(e) and e not in late]
     content = {
-        "instrument": instrument,
-        "mode": mode,
+        "instrument": held.instrument or "",
+        "mode": held.mode or "",
         "calibrations": [
             {"name": entry.name, "date": _start(entry) or None}
             | {key: rows[entry.name][key.removesuffix("_percent")] for key in _OF_ROWS}

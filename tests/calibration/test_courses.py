@@ -202,6 +202,17 @@ def test_health_of_a_moment_knows_nothing_of_what_is_dated_later(folder, capsys)
     assert "Next: Calibrate: no calibration is of 2019-01-01 or before." in out
 
 
+def test_health_of_a_mode_however_it_is_written(steady):
+    modes, library = ("Broadband", "broadband", "BROADBAND"), Library([])
+    stated = [with_validity(one, mode=mode) for one, mode in zip(steady, modes, strict=False)]
+    library.entries = [
+        Entry(f"{i}.asdf", one, validity_of(one), str(i)) for i, one in enumerate(stated)
+    ]
+    (group,) = health(library, now="2021-01-01")["groups"]
+    assert (group["mode"], len(group["calibrations"])) == ("BROADBAND", 3)
+    assert group["courses"]
+
+
 def test_health_says_that_changes_about_a_restart_are_unsure(steady):
     new = replace(steady[2], settings=steady[2].settings | {"restarted": {"from": "", "free": []}})
     for calibrations, count in ((steady[:3], 0), ([*steady[:2], new], 1)):
