@@ -213,6 +213,16 @@ def test_errors_of_fluxes_have_the_excess_noise(tmp_path):
         assert variance[same].mean() > 1.9 * photons
 
 
+def test_each_frame_is_read_out_as_its_row_says(tmp_path):
+    table = frames(hwp=[0], derotator=[45.0])
+    table["em_gain"] = [1.0, 300.0]
+    # so faint that the noise is that of the read-out, electrons over electrons per adu
+    for path, noise in zip(write(tmp_path, table, flux=1e-9), (9.6 / 4.5, 89 / 4.5), strict=True):
+        image, error = (fits.getdata(path, i) for i in (0, 1))
+        assert image.std() == pytest.approx(noise, rel=0.1)
+        assert error.mean() == pytest.approx(noise, rel=0.01)
+
+
 # --- files of two cameras ------------------------------------------------------------------------
 
 
@@ -264,6 +274,26 @@ def test_cameras_that_contradict_each_other(copied):
         problems = reduced(copied).problems
         assert [p.rpartition("/")[2] for p in problems] == ["VMPA00000001_cam1.fits"], wrong
         assert message in "; ".join(next(iter(problems.values())))
+
+
+def test_masters_of_other_settings_are_told(copied):
+    size, word = (SIDE, SIDE), VAMPIRES.files.keywords["filter"]
+    cards = {"EXPTIME": 10.0, "U_CAMERA": 1, "U_EMGAIN": 300.0}
+    for kind, changes, words in (
+        ("dark", {}, ""),
+        ("dark", {"U_EMGAIN": 10.0}, "em_gain = 300.0, but 10.0 in its dark"),
+        ("dark", {"U_CAMERA": 2}, "camera = 1.0, but 2.0 in its dark"),
+        ("flat", {"EXPTIME": 1.0, word: "625-50", "U_EMGAIN": 1.0}, ""),
+        ("flat", {word: "675-50"}, "filter = 625-50, but 675-50 in its flat"),
+    ):
+        for camera in (1, 2):
+            image = np.full(size, float(kind == "flat"))
+            header = fits.Header(cards | changes)
+            fits.writeto(copied / f"{kind}_cam{camera}.fit", image, header, overwrite=True)
+        for path in copied.glob("*.fits"):
+            edit(path, U_EMGAIN=300.0, **{word: "625-50"})
+        told = reduced(copied, **{kind: copied / f"{kind}_cam1.fit"}).doubts
+        assert {"; ".join(why) for why in told.values()} == ({words} if words else set()), changes
 
 
 def test_a_camera_that_is_missing(copied):

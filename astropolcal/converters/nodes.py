@@ -362,7 +362,8 @@ def _parameter_node(optic, key):
     node = {"value": (value if value.ndim else float(value))}
     if declared is not None:
         node["unit"] = declared.to_string()
-    if parameter.grid is not None:
+    # a fit makes a number of an array of one
+    if parameter.grid is not None and value.ndim:
         node["wavelength"] = np.array(parameter.grid)
     bounds = [None if bound is None else float(bound) for bound in parameter.bounds]
     node |= {"fixed": bool(parameter.fixed), "bounds": bounds}

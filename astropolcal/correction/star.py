@@ -174,9 +174,10 @@ def star_words(table):
     }
     # of q and u: angles near 0 and 180 deg are neighbours
     angle = polarization_angle(middle["q"], middle["u"])
+    exact = "" if errors["s_p"] or errors["s_chi"] else ", taken as exact"
     return (
         f"{100 * middle['dolp']:.3g} +- {100 * errors['s_p']:.2g} % at {angle:.4g} +- "
-        f"{errors['s_chi']:.2g} deg"
+        f"{errors['s_chi']:.2g} deg{exact}"
     )
 
 

@@ -285,6 +285,7 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
     ``other date``.
     """
     held = validity_of(calibration)
+    limit = _max_age(max_age, held, known_instrument(calibration.instrument))
     dated = dates and (held.valid_from is not None or held.valid_until is not None)
     moments, way = {}, ways["mode"].format(repr(held.mode))
     for label, date, mode in frames:
@@ -318,7 +319,7 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
         times, taken = (Time(texts, format="isot", scale="utc") for texts in (list(moments), days))
     # (n_moments, n_days), in days
     apart = np.abs((times[:, None] - taken).to_value(u.day)).min(axis=1)
-    limit, worst = _max_age(max_age, held, known_instrument(calibration.instrument)), apart.argmax()
+    worst = apart.argmax()
     if apart[worst] > limit:
         moment = list(moments)[worst]
         warnings.warn(

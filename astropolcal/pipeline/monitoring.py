@@ -10,6 +10,7 @@ from astropy.time import Time
 
 from astropolcal.calibration.fit.evidence import COURSES, moment_of
 from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.result.calibration import folded
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
@@ -57,7 +58,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
         ``instrument``, ``mode``, ``calibrations`` (name, date, ``s_res_percent``,
         ``s_cv_percent``, converged, datasets), ``courses`` (what, course, probabilities),
         ``events`` (what, between which calibrations and dates, probability), ``alarms`` and
-        ``next`` (sentences), and ``left_out``, why calibrations take no part in the courses.
+        ``next`` (sentences), and ``left_out``, why calibrations take no part in the courses; those
+        that are dated after ``now`` are not there.
 
     Raises
     ------
@@ -94,7 +96,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     rows = {row["name"]: row for row in library.table()}
     groups = {}
     for entry in library.entries:
-        key = (entry.validity.instrument or "", entry.validity.mode or "")
+        # written now so, now so
+        key = (entry.validity.instrument or "", folded(entry.validity.mode or ""))
         groups.setdefault(key, []).append(entry)
     return plain(
         {
@@ -102,8 +105,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
             "goal_percent": goal,
             "unreadable": {path.name: reason for path, reason in library.problems.items()},
             "groups": [
-                _group(*key, sorted(own, key=_start), rows, moment, goal, limit, events)
-                for key, own in sorted(groups.items())
+                _group(sorted(own, key=_start), rows, moment, goal, limit, events)
+                for _, own in sorted(groups.items())
             ],
         }
     )
@@ -123,16 +126,21 @@ def _start(entry):
     return date_of(entry.calibration) or ""
 
 
-def _group(instrument, mode, entries, rows, moment, goal, limit, events):
+def _group(entries, rows, moment, goal, limit, events):
     """Return what is to be said of the calibrations of an instrument and a mode."""
+    held = entries[-1].validity
     gone = {digest for entry in entries for digest in entry.supersedes}
     left_out = [f"{e.name} is superseded" for e in entries if e.content_hash in gone]
     entries = [entry for entry in entries if entry.content_hash not in gone]
     left_out += [f"{e.name} has no date" for e in entries if not _start(e)]
-    dated = [e for e in entries if _start(e)]
+    # what is of a later day, or wrongly dated, tells nothing of this moment; days may be local
+    late = [e for e in entries if moment_of(_start(e) or moment, "date") > moment + 1 * u.day]
+    left_out += [f"{e.name} is of {_start(e)[:10]}, after {moment.isot[:10]}" for e in late]
+    entries = [entry for entry in entries if entry not in late] or entries
+    dated = [e for e in entries if _start(e) and e not in late]
     content = {
-        "instrument": instrument,
-        "mode": mode,
+        "instrument": held.instrument or "",
+        "mode": held.mode or "",
         "calibrations": [
             {"name": entry.name, "date": _start(entry) or None}
             | {key: rows[entry.name][key.removesuffix("_percent")] for key in _OF_ROWS}
@@ -148,16 +156,17 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
             found = courses(dated, events=events)
         except (ParameterError, FitError) as problem:
             found = ()
-            left_out.append(str(problem))
+            few = f"{counted(len(dated), 'calibration')} with a date; courses need at least three"
+            left_out.append(few if len(dated) < 3 else str(problem))
     for row in found:
         what, course = row["what"], row["course"]
-        words = f"{what} {_COURSE_WORDS[course]} ({row[course]:.0%})"
+        words = f"{what} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
         one = {"what": what, "course": course} | {name: row[name] for name in COURSES}
         content["courses"].append(one | {"words": words})
         for (before, after), chance in zip(pairwise(dated), row["change"], strict=True):
             if chance >= LIKELY:
                 days = [_start(e)[:10] for e in (before, after)]
-                words = f"{what} changed between {days[0]} and {days[1]} ({chance:.0%})"
+                words = f"{what} changed between {days[0]} and {days[1]} ({100 * chance:.0f} %)"
                 one = {"what": what, "before": before.name, "after": after.name, "from": days[0]}
                 one |= {"to": days[1], "probability": chance, "words": words}
                 content["events"].append(one)
@@ -169,6 +178,8 @@ def _group(instrument, mode, entries, rows, moment, goal, limit, events):
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
     content["alarms"] += dict.fromkeys(f"{doubt.message}." for doubt in doubts)
     following = "Give the calibrations dates: with_validity(valid_from=) states one."
+    if late:
+        following = f"Calibrate: no calibration is of {moment.isot[:10]} or before."
     if dated:
         due, n = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day, len(dated)
         words = "is due" if due < moment else f"is due by {due.isot[:10]}"

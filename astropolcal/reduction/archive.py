@@ -32,6 +32,7 @@ from astropolcal.exceptions import (
 from astropolcal.files import append_line, one_line, understood
 from astropolcal.fitscheck import primary_header
 from astropolcal.pipeline.headers import recognized
+from astropolcal.pipeline.store import sha256_of
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting
 from astropolcal.reduction.headers import _SUFFIXES, _half_turn, observation_time, read_header
@@ -282,7 +283,8 @@ def _cut(frames, gap, cycles):
     """Yield lists of frames, cut where there is a gap in time, and after some cycles."""
     part, end, count, seen = [], None, 1, []
     for frame in frames:
-        late = None not in (end, frame.mjd) and frame.mjd - end > gap
+        # of which night a frame without a time is, nobody knows
+        late = end is not None and (frame.mjd is None or frame.mjd - end > gap)
         known = frame.hwp is not None
         same = [known and abs(_half_turn(frame.hwp - other)) < _SAME_ANGLE for other in seen]
         if any(same[:-1]):
@@ -290,7 +292,7 @@ def _cut(frames, gap, cycles):
             count, seen, same = count + 1, [], []
         if part and (late or (cycles and count > cycles)):
             yield part
-            part, count, seen, same = [], 1, [], []
+            part, end, count, seen, same = [], None, 1, [], []
         part.append(frame)
         if known and not any(same[-1:]):
             seen.append(frame.hwp)
@@ -361,13 +363,7 @@ class Manifest:
             same = state.st_mtime_ns == entry.get("changed")
             # a copy has another time, and the same content
             if state.st_size == entry.get("size") and (
-                same or checksum(product) == entry.get("sha256")
+                same or sha256_of(product) == entry.get("sha256")
             ):
                 return "done" if entry.get("source") == source else "older"
         return ""
-
-
-def checksum(path):
-    """Return the SHA-256 of a file."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -252,8 +252,8 @@ def simulate_cubes(
         One row per frame: ``hwp`` as commanded, ``derotator`` and anything else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column
         ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` those of
-        ``files``; ``em_gain`` and ``read_mode`` of the first row tell how the detector is
-        read out. All columns that the layout has a keyword for are written.
+        ``files``; ``em_gain`` and ``read_mode`` tell how the detector is read out. All columns
+        that the layout has a keyword for are written.
     wavelength : `~astropy.units.Quantity`, optional
         Of the slices; by default the instrument's.
     source : {"internal", "star"}
@@ -320,8 +320,8 @@ def simulate_cubes(
     frames = _with_headers(frames, layout, source, files.exposure_time, files.start)
     n_frames = len(frames)
     scene = image._scene(layout, source, len(wavelength))
-    saturation = _read_out(frames, layout).saturation
-    how, background = detector._read_by(_read_out(frames, layout), len(wavelength))
+    ways = _read_outs(frames, layout)
+    read = [detector._read_by(way, len(wavelength)) for way in ways]
     light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
     if flux is None:
         looks = {"image": image, "background": detector.background}
@@ -336,20 +336,23 @@ def simulate_cubes(
     centres, widths = image._places(of_star, scene, layout, n_frames)
     flat, bad = detector._pixels(of_pixels, layout.shape)
     names = file_names(Path(directory), layout, files, n_frames)
-    brightest = 0.0
+    # part of the saturation, and both
+    fullest = (0.0, 0.0, 0.0)
     with shown(progress):
         for i in steps(range(n_frames), "cubes"):
+            how, background = read[i]
             falling = scene.light(beams[:, i], centres[i], widths[i]) + background
-            brightest = max(brightest, float(falling.max()))
+            brightest, saturation = float(falling.max()), ways[i].saturation
+            fullest = max(fullest, (brightest / saturation, brightest, saturation))
             cube, weight = expose(falling, how, flat, seeds[i] if detector.noise else None)
             # as extraction marks pixels without a value
             cube[bad], weight[bad] = np.nan, 0.0
             header = layout.to_header(header_of(frames[i], layout) | more)
             write_cube(*names[i], cube, weight, header, layout)
-    if brightest > saturation and not detector.saturate:
+    if fullest[0] > 1 and not detector.saturate:
         warnings.warn(
-            f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
-            f"{saturation:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
+            f"the brightest pixel has {fullest[1]:.3g} adu, above the saturation of "
+            f"{fullest[2]:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
             AstropolcalWarning,
             stacklevel=2,
         )
@@ -364,7 +367,7 @@ def _usual_flux(
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
     share = image._scene(layout, source, len(wavelength)).peak()
     fluxes = _beam_fluxes(chain, frames, wavelength, source, **light)
-    room = _FILLED * _read_out(frames, layout).saturation
+    room = _FILLED * min(way.saturation for way in _read_outs(frames, layout))
     room = room - per_wavelength("background", background, len(wavelength))
     if np.any(room <= 0):
         # no flux is low enough, which is warned of later
@@ -501,10 +504,10 @@ def _of_mode(instrument, wavelength):
     return layout, wavelength, header
 
 
-def _read_out(frames, layout):
-    """Return how the detector is read out in the first frame, and so in all."""
-    first = frames[0]
-    return layout.read_out({c: first[c] for c in ("em_gain", "read_mode") if c in frames.colnames})
+def _read_outs(frames, layout):
+    """Return how the detector is read out in each frame."""
+    known = [c for c in ("em_gain", "read_mode") if c in frames.colnames]
+    return [layout.read_out({c: frame[c] for c in known}) for frame in frames]
 
 
 def _with_headers(frames, layout, source, exposure_time, start):

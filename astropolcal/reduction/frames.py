@@ -267,6 +267,28 @@ def check_stars(frames, layout, needed=True):
 # ---- dark and flat of raw frames ----------------------------------------------------------------
 
 
+# what the headers of a dark, or of a flat, must have in common with those of its frames; numbers
+# may differ by so much, a part of them or degrees
+_SETTINGS = {
+    "dark": {"exposure_time": 0.01, "em_gain": 0.0, "read_mode": None, "camera": 0.0},
+    "flat": {"filter": None, "camera": 0.0},
+}
+
+
+def contradictions(ours, theirs, columns, where):
+    """Return in which columns the values of two headers differ, by more than is allowed."""
+    found = []
+    for column, tolerance in columns.items():
+        one, other = ours.get(column), theirs.get(column)
+        same = one == other
+        if tolerance is not None and None not in (one, other):
+            # half a turn is none of a plate and a derotator
+            off = _half_turn(one - other) if column in ANGLES else (one - other) / (one or 1.0)
+            same = abs(off) <= tolerance
+        found += [] if same else [f"{column} = {one}, but {other} in {where}"]
+    return found
+
+
 @dataclass(frozen=True)
 class Masters:
     """
@@ -294,9 +316,16 @@ class Masters:
         """Return the files of the left beam."""
         return Masters(*(p and str(layout.left_file(p)) for p in (self.dark, self.flat)))
 
-    def exposure_time(self, layout):
-        """Return that of the dark, second; None without one, or if its header does not say."""
-        return self.dark and read_header(self.dark, layout).values.get("exposure_time")
+    def settings(self, layout):
+        """Return what the headers of dark and flat say, by ``"dark"`` and ``"flat"``."""
+        return {kind: read_header(path, layout).values for kind, path in vars(self).items() if path}
+
+    @staticmethod
+    def doubts(values, settings):
+        """Return where ``settings`` that both state differ between a frame, and dark and flat."""
+        for kind, told in settings.items():
+            both = {c: n for c, n in _SETTINGS[kind].items() if c in values and c in told}
+            yield from contradictions(values, told, both, f"its {kind}")
 
     def applied(self, cube, good, layout, detector):
         """Return a cube, or a stack of exposures, and its known pixels, less dark and over flat."""
@@ -370,15 +399,7 @@ def _left_header(frame, layout):
     other = read_header(path, layout)
     frame.errors += [f"{path.name}: {error}" for error in other.errors]
     # what the plate did while the cameras were exposed must be one thing
-    for column, tolerance in _COMMON.items():
-        ours, theirs = frame.values.get(column), other.values.get(column)
-        same = ours == theirs
-        if tolerance is not None and None not in (ours, theirs):
-            off = ours - theirs
-            # half a turn is none of a plate and a derotator
-            same = abs(_half_turn(off) if column in ANGLES else off) <= tolerance
-        if not same:
-            frame.errors.append(f"{column} = {ours}, but {theirs} in {path.name}")
+    frame.errors += contradictions(frame.values, other.values, _COMMON, path.name)
     for one, mark in zip((frame, other), layout.beam_files, strict=True):
         camera = one.values.get("camera")
         if camera is not None and not mark.endswith(f"{camera:g}"):

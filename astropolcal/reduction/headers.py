@@ -38,10 +38,13 @@ from astropolcal.instruments.layout import (
 from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, sky_angle
 from astropolcal.units import iso_date
+from astropolcal.words import listed
 
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
+# days that start, middle and end of an exposure may be apart
+_RAW_APART = 1 / 24
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 # in which the times and the places of targets are understood
@@ -80,6 +83,8 @@ def frame_number(name, layout, header=None):
 def raw_frames(folder, layout):
     """
     Return the paths of the raw frames in a folder by number; files are looked at by name only.
+
+    Several of one number are lists of several.
     """
     folder = Path(folder)
     if not os.path.isdir(folder):
@@ -88,7 +93,7 @@ def raw_frames(folder, layout):
     for path in sorted(folder.iterdir()):
         number = frame_number(path.name, layout)
         if number is not None and path.name.lower().endswith(_SUFFIXES):
-            found.setdefault(number, path)
+            found.setdefault(number, []).append(path)
     if not found:
         raise ObservationError(f"{folder}: no FITS file with a frame number in its name")
     return found
@@ -137,7 +142,7 @@ def read_header(path, layout, *, header=None, raw=None):
         else:
             try:
                 # behind the cube: its own keywords come first
-                headers.append(primary_header(raw[frame.number]))
+                headers.append(_raw_header(frame, raw[frame.number], header, layout))
             except ObservationError as error:
                 frame.errors.append(f"raw frame: {error}")
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
@@ -157,6 +162,26 @@ def read_header(path, layout, *, header=None, raw=None):
     if look_up(headers, "mjd" if "mjd" in frame.values else "date", layout)[0] in _STARTS:
         frame.values["starts"] = True
     return frame
+
+
+def _raw_header(frame, paths, header, layout):
+    """Return the header of the raw frame; refused where it may be that of another one."""
+    names, found, times = [path.name for path in paths], primary_header(paths[0]), []
+    # the same file, compressed or not, is one
+    if len({name.partition(".")[0] for name in names}) > 1:
+        raise ObservationError(
+            f"{listed(names, most=3)} have the number {frame.number}: which one?"
+        )
+    for one in (header, found):
+        # what is no time, or a date alone, says nothing
+        with suppress(ObservationError):
+            told = {key: look_up([one], key, layout)[1] for key in ("mjd", "date", "time")}
+            times.append(observation_time(told))
+    # numbers begin again, in other nights
+    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > _RAW_APART:
+        ours, theirs = (time.isot for time in times)
+        raise ObservationError(f"{names[0]} of the same number is of {theirs}, the cube of {ours}")
+    return found
 
 
 def _compare(frame, column, found, layout):

@@ -40,7 +40,7 @@ class Photometry:
     background: np.ndarray
     # why a slice cannot be used, empty where it can; length W
     reasons: list
-    # pixels of an internal source that were left out, as they are far off their neighbours
+    # pixels that were left out, as they are far off their neighbours
     outliers: int = 0
 
     @classmethod
@@ -257,7 +257,7 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     inside = rectangles(layout.internal_apertures, cube.shape[1:])
     for beam, (rows, columns, weights) in enumerate(inside):
         own, cut, known = detector.of(beam), cube[:, rows, columns], good[:, rows, columns]
-        single = _outliers(cut, known, weights, own)
+        single = outliers(cut, known, weights, own)
         result.outliers += int(single.sum())
         used = known & ~single
         # one product for all slices: the weighted sum, and the area that has values
@@ -303,8 +303,8 @@ def evenly_lit(cube, good, layout):
 
 # damaged pixels may be beyond all numbers, and are then infinitely far off
 @np.errstate(over="ignore", invalid="ignore")
-def _outliers(cut, known, weights, detector):
-    """Return the single pixels that are far off their neighbours."""
+def outliers(cut, known, weights, detector, factor=_FACTOR):
+    """Return the single pixels far off their neighbours, with more than ``factor`` their light."""
     sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
     level = _median(cut[sample], known[sample])
     spread = MAD_TO_SIGMA * _median(np.abs(cut[sample] - level[:, None]), known[sample])
@@ -312,7 +312,7 @@ def _outliers(cut, known, weights, detector):
     def limits(level, spread):
         """Return between which values pixels are like those around them."""
         reach = _SIGMAS * np.sqrt(spread**2 + detector.variance(level))
-        high = np.maximum(_FACTOR * level, level + reach + _ELECTRONS / detector.gain)
+        high = np.maximum(factor * level, level + reach + _ELECTRONS / detector.gain)
         # there may be less light, down to none
         return np.minimum(level, 0.0) - reach, high
 

@@ -313,10 +313,9 @@ def reduce_run(
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
-    dark_time = masters.exposure_time(layout)
+    settings = masters.settings(layout)
     for frame in frames:
-        if dark_time and abs(frame.values.get("exposure_time", dark_time) / dark_time - 1) > 0.01:
-            frame.doubts.append(f"exposed for another time than its dark, {dark_time:g} s")
+        frame.doubts += masters.doubts(frame.values, settings)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:
@@ -392,8 +391,9 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     settings = {name: repr(task[name]) for name in ("layout", "source", "options", "masters")}
     # frames of an older journal hold angles that were checked already
     settings |= {"raw": repr(task["raw"]), "checked": False, "made by": version}
-    of_masters = (task["masters"] or Masters()).files(task["layout"])
-    settings["changed"] = [os.stat(path).st_mtime_ns for path in of_masters]
+    others = (task["masters"] or Masters()).files(task["layout"])
+    others += [path for paths in (task["raw"] or {}).values() for path in paths]
+    settings["changed"] = [os.stat(path).st_mtime_ns for path in others]
     journal = Journal(resume, settings, task["layout"].left_file)
     found = {path: frame for path in files if (frame := journal.done(path)) is not None}
     # a file that is named twice is measured once

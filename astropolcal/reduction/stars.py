@@ -19,8 +19,9 @@ from scipy import ndimage
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.reduction.finding import find_star, fit_gaussians
-from astropolcal.reduction.photometry import Photometry, flux_variance, shared_pixels
+from astropolcal.reduction.photometry import Photometry, flux_variance, outliers, shared_pixels
 from astropolcal.reduction.wings import wing_shares
+from astropolcal.words import check_choice
 
 __all__ = []
 
@@ -30,6 +31,8 @@ _OFF_TRACK = (1.5, 0.5)
 _WIDTHS = 2.5
 # standard deviations of the light under a Gaussian of the width of the star
 _SIGNIFICANT = 5.0
+# squared full width, in pixels, from which on no star is as sharp as a pixel that was hit
+_SAMPLED = 6.25
 # pixels of a ring whose median is a background
 _FEWEST = 20
 # of the polynomial over wavelength that smoothes an aperture correction
@@ -72,6 +75,7 @@ def measure_stars(
     if pair.reason:
         result.flag(True, pair.reason)
         return result
+    good = _without_single(result, cube, good, pair, detector, layout.fwhm, max_radius)
     images, there, origin = _cutouts(cube, good, pair)
     starts = np.repeat(pair.positions - origin, len(cube), axis=0)
     _check_light(result, images, there, starts, pair.fwhm, detector, layout.beams)
@@ -120,10 +124,7 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
 
 
 def _check_correction(correction, layout):
-    if correction not in (False, True, "growth"):
-        raise ParameterError(
-            f"aperture_correction = {correction!r}; allowed are False, True and 'growth'"
-        )
+    check_choice("aperture_correction", correction, (False, True, "growth"), ParameterError)
     if correction is True and not layout.two_beams:
         raise ParameterError(
             f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
@@ -138,6 +139,25 @@ def _mean(cube, good):
     # a pixel known in few slices would show their level, not that of the rest
     known = number > 0.5 * good.any(axis=(1, 2)).sum()
     return np.where(known, total / np.maximum(number, 1), 0.0), known
+
+
+def _without_single(result, cube, good, pair, detector, smoothing, reach):
+    """Return the known pixels but single ones about the star that are sharper than any star."""
+    # squared, before the image was smoothed
+    width = pair.fwhm**2 - (smoothing / 2) ** 2
+    if width < _SAMPLED:
+        return good
+    # three times what the peak of a star has over its neighbours at 1.2 pixels
+    factor, good = 3.0 * np.exp(4 * np.log(2) * 1.44 / width), good.copy()
+    for beam, place in enumerate(pair.positions):
+        box = tuple(slice(max(int(x - reach), 0), int(x + reach) + 2) for x in place[::-1])
+        cut, known, own = cube[:, *box], good[:, *box], detector.of(beam)
+        single = outliers(cut, known, np.ones(cut.shape[1:]), own, factor)
+        # a full pixel may be one of the star
+        single &= cut < own.saturation
+        result.outliers += int(single.sum())
+        known &= ~single
+    return good
 
 
 def _cutouts(cube, good, pair):

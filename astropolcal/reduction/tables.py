@@ -34,7 +34,8 @@ def reduced_table(frames, instrument, meta):
     flux, variance, covariance = (
         _stack(frames, name) for name in ("flux", "variance", "covariance")
     )
-    names = flux_names(instrument.files)
+    beams = instrument.files.beams
+    names = ["flux"] if len(beams) == 1 else [f"flux_{beam}" for beam in beams]
     columns = dict(zip(names, flux, strict=True))
     # errors of the beams alone cannot say what they share
     if (covariance[~failed] != 0).any():
@@ -51,11 +52,6 @@ def reduced_table(frames, instrument, meta):
         table["mask_reason"] = reasons
     table.meta.update(meta)
     return table
-
-
-def flux_names(layout):
-    """Return the columns of the fluxes of the beams."""
-    return ["flux"] if len(layout.beams) == 1 else [f"flux_{beam}" for beam in layout.beams]
 
 
 def _column(values, failed, unit):

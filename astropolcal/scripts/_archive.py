@@ -164,7 +164,7 @@ class _Work:
         return json.loads(json.dumps(given, sort_keys=True, default=str))
 
     def __call__(self, task):
-        from astropolcal.reduction.archive import checksum
+        from astropolcal.pipeline.store import sha256_of
         from astropolcal.scripts.main import earth
 
         name, _, instrument, files, before = task
@@ -194,7 +194,7 @@ class _Work:
             "product": os.path.basename(product),
             "size": state.st_size,
             "changed": state.st_mtime_ns,
-            "sha256": checksum(product),
+            "sha256": sha256_of(product),
             "calibration": summary.get("calibration"),
             "calibration_hash": summary.get("calibration_hash"),
             "seconds": round(time.monotonic() - started, 3),

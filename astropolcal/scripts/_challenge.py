@@ -65,6 +65,11 @@ def run(arguments):
         raise GapError(
             f"challenge {action} takes {counted(wanted, 'folder')}, {len(folders)} given"
         )
+    for name in {"make": ("figure", "reliability", "checkpoint", "json")}.get(action, ()):
+        if (path := getattr(arguments, name)) is not None:
+            raise GapError(
+                f"--{name} {path}: is for challenge run; what is made is written to {folders[0]}"
+            )
     if action == "score":
         result = score_cases(*folders)
     else:

@@ -69,7 +69,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --mirrored  east is to the right of north
 --subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
     measures it between two radii in pixels, DEG%%,DEG (0.8+-0.1,45+-3) states degree in percent and
-    angle, with their errors
+    angle, with their errors (exact without them)
 --open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not
     determine: infinite (default), ignore, or the standard deviation of the angle that each is
     named after, in degrees
@@ -282,17 +282,11 @@ def choose_calibration(arguments, files):
 
 def _read(path):
     """Return a calibration and its hash, which many sequences of an archive have in common."""
-    state = os.stat(path) if os.path.exists(path) else None
-    return _read_once(path, None if state is None else (state.st_size, state.st_mtime_ns))
+    from astropolcal.pipeline import library
 
-
-@lru_cache(maxsize=8)
-def _read_once(path, state):
-    from astropolcal import Calibration
-    from astropolcal.converters.calibration import content_hash
-
-    calibration = Calibration.read(path)
-    return calibration, content_hash(calibration)
+    state = library._state(path) if os.path.exists(path) else None
+    calibration, record = library._read(path, state or ())
+    return calibration, record["content_hash"]
 
 
 @lru_cache(maxsize=1)

@@ -68,7 +68,7 @@ def _group(group):
     sure = [one for one in group["courses"] if one["constant"] >= LIKELY]
     lines += [f"  Constant: {', '.join(one['what'] for one in sure)}"] if sure else []
     lines += [f"  Course: {one['words']}" for one in group["courses"] if one not in sure]
-    lines += [f"  Left out: {words}" for words in group["left_out"]]
+    lines += [f"  Not compared: {words}" for words in group["left_out"]]
     return lines + [f"  Next: {words}" for words in group["next"]]
 
 

@@ -183,6 +183,36 @@ def test_a_change_is_dated_by_the_data_whatever_is_stated_of_when_they_hold(worn
     assert (event["from"], event["to"]) == ("2022-01-01", "2022-07-01")
 
 
+def test_health_of_a_moment_knows_nothing_of_what_is_dated_later(folder, capsys):
+    """Such as a calibration of 2052 that is one of 2025: every older one would count as fresh."""
+    (group,) = health(folder, now="2021-12-31")["groups"]
+    # of the next day in another time zone
+    assert [one["date"] for one in group["calibrations"]][-1] == "2022-01-01"
+    assert len(group["calibrations"]) == 5
+    assert [words.partition(" is of ")[2] for words in group["left_out"]] == [
+        f"{date}, after 2021-12-31" for date in ("2022-07-01", "2023-01-01", "2023-07-01")
+    ]
+    assert not group["events"]
+    for moment, alarm in (("2020-03-01", []), ("2021-05-01", ["2021-01-01", "120 days old"])):
+        (group,) = health(folder, now=moment, max_age=90 * u.day)["groups"]
+        assert all(words in " ".join(group["alarms"]) for words in alarm)
+    assert main(["health", str(folder), "--date", "2019-01-01"]) in (0, None)
+    out = capsys.readouterr().out
+    assert "Not compared: 0 calibrations with a date; courses need at least three" in out
+    assert "Next: Calibrate: no calibration is of 2019-01-01 or before." in out
+
+
+def test_health_of_a_mode_however_it_is_written(steady):
+    modes, library = ("Broadband", "broadband", "BROADBAND"), Library([])
+    stated = [with_validity(one, mode=mode) for one, mode in zip(steady, modes, strict=False)]
+    library.entries = [
+        Entry(f"{i}.asdf", one, validity_of(one), str(i)) for i, one in enumerate(stated)
+    ]
+    (group,) = health(library, now="2021-01-01")["groups"]
+    assert (group["mode"], len(group["calibrations"])) == ("BROADBAND", 3)
+    assert group["courses"]
+
+
 def test_health_says_that_changes_about_a_restart_are_unsure(steady):
     new = replace(steady[2], settings=steady[2].settings | {"restarted": {"from": "", "free": []}})
     for calibrations, count in ((steady[:3], 0), ([*steady[:2], new], 1)):
@@ -201,7 +231,7 @@ def test_the_command_writes_a_page_and_numbers(folder, tmp_path, capsys):
     options = ["--html", str(page), "--json", str(numbers), "--date", "2024-01-01"]
     assert main(["health", str(folder), *options]) in (0, None)
     out = capsys.readouterr().out
-    assert "wollaston changed between 2022-01-01 and 2022-07-01" in out
+    assert "wollaston changed between 2022-01-01 and 2022-07-01 (100 %)" in out
     assert max(len(line) for line in out.splitlines() if str(tmp_path) not in line) <= 80
     text = page.read_text()
     assert text.count("<img") >= 4

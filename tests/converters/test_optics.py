@@ -170,6 +170,11 @@ def test_wavelengths_of_the_values_survive():
     again = round_trip(optic)
     np.testing.assert_array_equal(again.retardance.wavelength, optic.retardance.wavelength)
     assert again.theta.wavelength is None
+    # a fit makes a number of an array of one
+    optic = optics.LinearRetarder(retardance=[1] * u.deg)
+    optic.retardance.wavelength = [1.2] * u.um
+    optic.retardance.value = 2.0
+    assert round_trip(optic).retardance.value == 2
 
 
 def test_position_of_a_frame_is_not_stored():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from astropolcal.correction import Corrected, ScienceFrames, Systematic, correct
+from astropolcal.correction.star import star_words
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.stokes import polarization_angle
 
@@ -93,6 +94,8 @@ def test_error_of_a_stated_value_is_along_and_across_it(scene_with_star):
     np.testing.assert_allclose(result.error("U", "systematic"), 0.04 * np.deg2rad(3) * light)
     known = corrected(stokes).without_star(dolp=2 * u.percent, aolp=0 * u.deg)
     assert not known.error("Q", "systematic").any()
+    words = [star_words(one.star) for one in (known, result)]
+    assert [one.endswith(", taken as exact") for one in words] == [True, False]
     # one star at all wavelengths
     between = result.systematic.between(light[None, :, 10, 10] * np.array([[1], [0], [0]]))
     assert between[1, 0, 1, 2] == pytest.approx(0.001**2 * light[0, 10, 10] * light[2, 10, 10])

@@ -700,7 +700,7 @@ class Header(Reader):
 
         header, charis = primary_header(path), instruments.get("charis")
         # the header of a raw frame, on which that of its cube falls back, is read alike
-        raw = read_header("CRSA00000001_cube.fits", small_layout(), header={}, raw={1: path})
+        raw = read_header("CRSA00000001_cube.fits", small_layout(), header={}, raw={1: [path]})
         frame = read_header(path, small_layout(), header=header)
         assert set(raw.values) <= set(frame.values)
         for ask in (

@@ -115,13 +115,13 @@ def test_checksums_that_do_not_match_are_found_wherever_files_are_read(small, tm
     write_cube(path, flat_cube)
     with fits.open(path) as hdus:
         hdus.writeto(path, overwrite=True, checksum=True)
-    raw = {1: tmp_path / "CRSA00000001.fits"}
+    raw = {1: [tmp_path / "CRSA00000001.fits"]}
     good = path.read_bytes()
     for place, keyword in ((-4000, "DATASUM"), (good.index(b"HD 293396"), "CHECKSUM")):
         spoiled = bytearray(good)
         spoiled[place] ^= 1
         path.write_bytes(spoiled)
-        raw[1].write_bytes(spoiled)
+        raw[1][0].write_bytes(spoiled)
         (error,) = reduce_frame(path, small.files).errors
         assert error.startswith(f"{keyword} = ")
         for read in (describe_fits, lambda p: CubeFiles([p], [(131, 116), (71, 86)], 21)):
@@ -131,7 +131,7 @@ def test_checksums_that_do_not_match_are_found_wherever_files_are_read(small, tm
     cube = write_cube(tmp_path / "x_00000001_cube.fits", flat_cube, drop=["RET-ANG1"])
     assert reduce_frame(cube, small.files, raw=raw).errors[0].startswith("raw frame: ")
     path.write_bytes(good)
-    raw[1].write_bytes(good)
+    raw[1][0].write_bytes(good)
     assert reduce_frame(path, small.files).errors == []
     assert reduce_frame(cube, small.files, raw=raw).errors == []
 

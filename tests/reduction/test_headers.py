@@ -133,6 +133,23 @@ def test_raw_frame_of_the_same_number_gives_what_the_cube_lacks(tmp_path):
     assert frame.doubts == []
     lost = read_header("CRSA00000009_cube.fits", LAYOUT, header=cards, raw=found)
     assert lost.errors == ["no raw frame of number 9"]
+    twice = {7: [*found[7], raw / "AO00000007.fits"], 8: [*found[8], raw / "CRSA00000008.fits.gz"]}
+    both = read_header("CRSA00000007_cube.fits", LAYOUT, header=cards, raw=twice)
+    words = "raw frame: CRSA00000007.fits and AO00000007.fits have the number 7: which one?"
+    assert both.errors == [words]
+    assert read_header("CRSA00000008_cube.fits", LAYOUT, header=cards, raw=twice).errors == []
+    # numbers begin again: the raw frame is of MJD 60982.5
+    for when, same in (
+        ({"MJD": 60982.51}, True),
+        ({"MJD": 60983.5}, False),
+        ({"UTC-DATE": "2025-11-04", "UTC-TIME": "12:00"}, False),
+        ({"UTC-DATE": "2025-11-03"}, True),
+        ({"MJD": "lost"}, True),
+    ):
+        own = fits.Header(dict(cards) | when)
+        told = read_header("CRSA00000007_cube.fits", LAYOUT, header=own, raw=found).errors
+        words = "raw frame: CRSA00000007.fits of the same number is of 2025-11-03T12:00"
+        assert any(error.startswith(words) for error in told) != same, when
     nameless = read_header("cube.fits", LAYOUT, header=cards, raw=found)
     assert "no frame number" in nameless.errors[0]
 

@@ -277,6 +277,26 @@ def test_aperture_correction_is_not_misled_by_the_other_beam():
     np.testing.assert_allclose(corrected.flux, 2e5, rtol=1e-3)
 
 
+def test_single_pixels_about_a_star_are_left_out_as_far_as_no_star_is_so_sharp(star_cube):
+    clean = measure_stars(star_cube, None, DETECTOR, LAYOUT)
+    assert clean.outliers == 0
+    for x, y, value in ((78, 90, 3000.0), (134, 118, 20_000.0), (70, 95, -2000.0)):
+        cube = star_cube.copy()
+        cube[1, y, x] += value
+        found = measure_stars(cube, None, DETECTOR, LAYOUT)
+        assert found.outliers == 1, (x, y)
+        off = (found.flux - clean.flux) / np.sqrt(clean.variance)
+        assert np.abs(off).max() < 1, (x, y)
+    # a full pixel may be one of the star
+    cube[1, 90, 78] = 50_000.0
+    assert measure_stars(cube, None, DETECTOR, LAYOUT).reasons[1] == "saturated"
+    for fwhm in (1.5, 2.2, 3.0, 12.0):
+        for x, flux in ((70.0, 1e4), (70.0, 1e5), (70.5, 1e5)):
+            image = star_image(pair(LAYOUT, x=x), flux=flux, fwhm=fwhm)
+            found = measure_stars(expose(image, LAYOUT, seed=4), None, DETECTOR, LAYOUT)
+            assert found.outliers == 0, (fwhm, x, flux)
+
+
 def test_pixels_without_values_are_filled(star_cube):
     rng = np.random.default_rng(4)
     good = rng.random(star_cube.shape) > 0.01

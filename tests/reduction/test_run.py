@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Runs: what is left out and why, resuming, processes, the table, other people's tables."""
 
+import os
 import re
 import warnings
 from dataclasses import replace
@@ -348,12 +349,24 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
             reduce_run(paths[1], small, dark=tmp_path / path)
 
 
+def test_a_journal_knows_when_a_raw_header_was_mended(tmp_path, small, flat_cube):
+    (tmp_path / "raw").mkdir()
+    cube = write_cube(tmp_path / "CRSA00000001_cube.fits", flat_cube, drop=["RET-ANG1"])
+    for angle in (0.0, 45.0):
+        raw = write_cube(tmp_path / "raw" / "CRSA00000001.fits", None, RET__ANG1=angle)
+        # a clock may be coarser than two writes are apart
+        os.utime(raw, ns=(0, int(angle * 1e9)))
+        options = {"raw": tmp_path / "raw", "resume": tmp_path / "run.journal"}
+        (frame,) = reduce_run([cube], small, **options).frames
+        assert frame.values["hwp"] == angle
+
+
 def test_dark_in_another_unit_is_refused_and_of_another_exposure_told(tmp_path, small):
     paths = flat_frames(tmp_path)
     for unit, time, words in [
         ("adu", 10.0, ""),
         (None, 10.0, ""),
-        ("adu", 5.0, "exposed for another time than its dark, 5 s"),
+        ("adu", 5.0, "exposure_time = 10.0, but 5.0 in its dark"),
         ("electron", 10.0, "dark.fits is in electron, the frame in adu"),
         ("adu/s", 10.0, "dark.fits is in adu/s, the frame in adu"),
     ]:

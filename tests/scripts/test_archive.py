@@ -95,6 +95,10 @@ def test_frames_without_a_time_follow_their_numbers(tmp_path):
     write_night(tmp_path / "tree", CYCLE, MJD=None)
     _, found, _ = indexed(tmp_path)
     assert found == {"charis_hd1_Broadband_00000000": [0, 1, 2, 3]}
+    # and are of no other night, such as the last one
+    write_night(tmp_path / "tree", CYCLE, first=10)
+    _, found, _ = indexed(tmp_path)
+    assert sorted(found.values()) == [[0, 1, 2, 3], [10, 11, 12, 13]]
 
 
 def test_only_new_and_changed_files_are_opened(tmp_path):

@@ -72,6 +72,9 @@ def test_bad_input_is_refused(command):
         (["-n", "0"], "n = 0"),
         (["score", "cases"], "challenge score takes 2 folders, 1 given"),
         (["score", "nowhere", "outputs"], "no such file"),
+        (["make", "x", "--figure", "f.png"], "--figure f.png: is for challenge run; .* to x"),
+        (["make", "x", "--json", "-"], "--json -: is for challenge run"),
+        (["make", "x", "--checkpoint", "c.jsonl"], "--checkpoint c.jsonl: is for challenge run"),
     ]:
         with pytest.raises(AstropolcalError, match=words):
             command(*options)

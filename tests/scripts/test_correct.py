@@ -616,6 +616,9 @@ def test_calibration_that_is_old(frames_with):
         chosen(OLD, [early, late], optics_in=["nbs"])
     with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
         chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)
+    # also where no age is looked at
+    with pytest.raises(AstropolcalError, match=r"max_age = -1\.0 yr; a time from zero"):
+        chosen(OLD, [early], optics_in=["nbs"], max_age=-1, any_date=True)
 
 
 # ---- a library -------------------------------------------------------------------------
