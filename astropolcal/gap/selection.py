@@ -12,6 +12,7 @@ set leaves lowers the probability of all its causes.
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations, pairwise
+from operator import attrgetter, eq
 
 import numpy as np
 from scipy.special import expit
@@ -711,9 +712,26 @@ def _is_twin(one, other):
     return near and one.rank == other.rank and not (one.is_named or other.is_named)
 
 
+def _as_free(chosen, beside):
+    """Return the rivals of a cause; those that are most like it have a law as free as its own."""
+    rivals, cell = beside.candidates, chosen.cell
+    seen = next((one for one in rivals if one.name == chosen.name), chosen)
+    if cell is None or chosen.is_named or beside.probes is None or seen.degree == chosen.degree:
+        return rivals
+    # of place, kind and dependence no more than one is another, or the dependence is the same
+    parts = attrgetter("place", "kind", "dependence")
+    equal = [0 if one.is_named else list(map(eq, parts(one.cell), parts(cell))) for one in rivals]
+    near = [
+        one for one, same in zip(rivals, equal, strict=True) if same and (same[2] or sum(same) > 1)
+    ]
+    near = [seen, *(one for one in near if one is not seen)][: 3 * _AMONG]
+    free = {one.name: beside.of_cell(one.cell, chosen.degree) or one for one in near}
+    return [free.get(one.name, one) for one in rivals]
+
+
 def _members(chosen, beside, loss):
     """Return the chosen candidate and its aliases, with probabilities that sum to one."""
-    rivals = beside.candidates
+    rivals = _as_free(chosen, beside)
     seen = own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
     farthest = _FAR * max(own.size, 1.0)
