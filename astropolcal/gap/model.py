@@ -2,6 +2,7 @@
 """The nominal model with effects added to it, step by step."""
 
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from astropolcal.calibration.fit.strategies import BinProblem, few_frames, searc
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
@@ -475,10 +476,10 @@ def starting_model(calibration, observations, library, say):
                 found = _tried(chains, observations, some, say, found)
         if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
-            edited = found[0][1].edit(chains, _context(observations)).chains
-            best = nominal_calibration(edited, observations)
+            read = _read(found[0][1], chains, observations, _context(observations))
+            best = nominal_calibration(*read)
             if _misfit(best) < _FAR_BETTER * misfit:
-                return _with_alternative(observations, edited, made, best, found)
+                return _with_alternative(*read, made, best, found)
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
 
@@ -491,10 +492,18 @@ def _tried(chains, observations, effects, say, known):
     found = list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
-        trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
-        found.append((_misfit(trial), effect))
+        # where it leaves too few frames it is not asked for
+        with suppress(FitError, ObservationError):
+            found.append((_misfit(nominal_calibration(*_read(effect, *few, context))), effect))
     misfits = np.array([misfit for misfit, _ in found])
     return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min())]
+
+
+def _read(effect, chains, observations, context):
+    """Return the chains with an alternative, and the frames of which it knows the angles."""
+    edges = ((o, effect.edge(o)) for o in observations)
+    kept = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
+    return effect.edit(chains, context).chains, kept
 
 
 def _context(observations):
@@ -519,11 +528,9 @@ def _may_be_wrong(calibration):
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
-def _with_alternative(observations, edited, given, best, found):
+def _with_alternative(edited, observations, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
     least, effect = found[0]
-    edges = ((o, effect.edge(o)) for o in observations)
-    observations = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)

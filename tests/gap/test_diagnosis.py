@@ -205,6 +205,18 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
         assert content["double_difference"] is None
         edge = {"hwp_late": wrong.n_frames - 1, "angles_early": 0}.get(name)
         assert [fault.frame for fault in found.frames] == ([] if edge is None else [edge])
+        # nor has that frame a part in what calibrate says
+        assert content["accuracy_after"]["rms_percent"] < 0.1
+
+
+@pytest.mark.slow
+def test_an_angle_in_no_row_does_not_hide_that_a_short_table_is_late():
+    right = data.observed(table=half_wave_plate_cycles(derotator=[45, 80] * u.deg))
+    table = right.to_table()
+    for shift, name in ((-1, "hwp_early"), (1, "hwp_late")):
+        table["hwp"] = np.repeat(np.roll(right.position("hwp"), shift), right.n_bins) * u.rad
+        found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
+        assert (found.verdict, names(found.causes[0])) == ("named", [name])
 
 
 @pytest.mark.slow
