@@ -192,6 +192,12 @@ def _alike(entry):
     return [entry, *(a for a in same if a["probability"] >= least)]
 
 
+def _same(entry):
+    """Return the aliases that are the cause at another place, or the cell that its name is for."""
+    own = entry["effect"] and entry["cell"]
+    return [*_alike(entry)[1:], *(a for a in entry["aliases"] if own and a["cell"] == own)]
+
+
 def title(entry):
     """Return the title of a cause, with all places at which it may as well be."""
     return _title(_alike(entry))
@@ -205,12 +211,12 @@ def _one_or_like(entry):
 
 def own_share(entry):
     """Return how probable a cause is among its aliases, regardless of its place."""
-    return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
+    return entry["share"] + sum(one["probability"] for one in _same(entry))
 
 
 def others(entry, ranks):
     """Return titles and probabilities of what else a cause may be, those of one kind as one."""
-    groups, same = {}, _alike(entry)[1:]
+    groups, same = {}, _same(entry)
     for one in entry["aliases"]:
         if one not in same and one["name"] not in ranks:
             groups.setdefault(_outline(one), []).append(one)
@@ -411,7 +417,8 @@ def _on_sky(content):
     known = " if the undetermined parameters were known" if "as if" in before[0]["words"] else ""
     return (
         "Errors on sky that calibrate claims, with the nominal -> with the improved model"
-        f"{known}: {'; '.join(targets)}. --save keeps the improved one."
+        f"{known}: {'; '.join(targets)}."
+        f"{'' if content.get('misread') else ' --save keeps the improved one.'}"
     )
 
 
