@@ -13,7 +13,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import decimals
+from astropolcal.gap._words import ONE, decimals
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
 from astropolcal.words import listed
@@ -78,7 +78,8 @@ def changes(diagnosis, causes):
             brought = _brought(cell, run, names, chains)
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
-            entry["words"] = _sentence(cell, entry, names, wavelength)
+            of = "" if _is_told(cell, cause) else " of this or what looks the same"
+            entry["words"] = _sentence(cell, entry, names, wavelength, of)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
 
@@ -93,6 +94,17 @@ def _run_of(cell, names, chains):
         if cell.optic in [optic.name for optic in chain]
     ]
     return there[0] if len(there) == 1 else None
+
+
+def _is_told(cell, cause):
+    """Return whether the data tell a change from all others than the opposite one of another run."""
+    here = cell.place, cell.kind, split_run(cell.dependence)[0]
+    same = cause["share"]
+    for alias in cause["aliases"]:
+        one = alias["cell"] and Cell(**alias["cell"])
+        if one and (one.place, one.kind, split_run(one.dependence)[0]) == here:
+            same += alias["probability"]
+    return same >= ONE
 
 
 def _brought(cell, run, names, chains):
@@ -143,13 +155,13 @@ def paragraph(content, names, asked=False):
     return words
 
 
-def _sentence(cell, entry, names, wavelength):
+def _sentence(cell, entry, names, wavelength, of):
     """Return one change in words."""
     plain = Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
     size = _size(entry["size"], wavelength)
-    chance = f"probability {100 * entry['probability']:.0f} %"
+    chance = f"probability {100 * entry['probability']:.0f} %{of}"
     run = entry["dataset"]
     if constant and len(names) == 2 and size is not None:
         # of the second against the first, whichever of the two has it
