@@ -97,7 +97,7 @@ def _run_of(cell, names, chains):
 
 
 def _is_told(cell, cause):
-    """Return whether the data tell a change from all others than the opposite one of another run."""
+    """Return whether nothing looks like a change but the opposite one of another run."""
     here = cell.place, cell.kind, split_run(cell.dependence)[0]
     same = cause["share"]
     for alias in cause["aliases"]:
