@@ -462,22 +462,19 @@ def frame_positions(instrument, table, chain, names=None):
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))
-    of_flux, of_run = (
-        ", ".join(leaf.name for leaf in leaves(chain) if leaf.stage in those)
-        for those in (FLUXES, ("sequence", "frame"))
-    )
-    if of_flux:
-        raise ObservationError(
-            f"{names[0]}: {of_flux} of the calibrated chain follows the fluxes of a table, which "
-            "images do not have; correct images and tables for it, and calibrate without it"
-        )
-    if of_run:
-        warnings.warn(
-            f"{of_run} of the calibrated chain changes in the course of the calibrated run; the "
-            "frames are taken to change so too, in their order",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
+    for leaf in leaves(chain):
+        if leaf.stage in FLUXES:
+            raise ObservationError(
+                f"{names[0]}: {leaf.name} of the calibrated chain follows the fluxes of a table, "
+                "which images do not have; correct both for it, and calibrate without it"
+            )
+        if leaf.stage in ("sequence", "frame"):
+            warnings.warn(
+                f"{leaf.name} of the calibrated chain changes in the course of the calibrated run; "
+                "the frames are taken to change so too, in their order",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
     modulated = "flc_state" in stages(chain)
     needed = [stage for stage in stages(chain) if stage not in COORDINATES]
     if {"time", "right_ascension"} & set(table.colnames):

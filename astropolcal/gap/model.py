@@ -264,25 +264,6 @@ class Model:
         fit = self.problem.fit(self.fit.coefficients, **settings)
         return Model(self.problem, fit, self.added)
 
-    def sizes(self, name):
-        """
-        Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
-
-        The errors are those of the noise, or of the scatter of the residuals where it is larger.
-        """
-        errors = max(1.0, np.sqrt(self.mean_square)) * self.problem.errors(self.fit.coefficients)
-        found = {}
-        for parameter in self.added[name]:
-            slot = self.problem.free.by_name[parameter.name]
-            where = self.problem.slices[parameter.name]
-            found[parameter.name] = (
-                self.fit.coefficients[where] / slot.factor,
-                errors[where] / slot.factor,
-                slot.unit,
-                parameter,
-            )
-        return found
-
     def is_physical(self, name):
         """
         Return whether the fitted values of an effect are possible.
@@ -486,8 +467,6 @@ def starting_model(calibration, observations, library, say):
 
 def _tried(chains, observations, effects, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
-    if not effects:
-        return known
     few, context = thinned(chains, observations, _FEW), _context(observations)
     found = list(known)
     for effect in effects:
@@ -496,7 +475,7 @@ def _tried(chains, observations, effects, say, known):
         with suppress(FitError, ObservationError):
             found.append((_misfit(nominal_calibration(*_read(effect, *few, context))), effect))
     misfits = np.array([misfit for misfit, _ in found])
-    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min())]
+    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf))]
 
 
 def _read(effect, chains, observations, context):

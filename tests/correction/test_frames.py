@@ -334,5 +334,5 @@ def test_what_follows_fluxes_or_the_run_has_no_place_in_images_without_a_word():
             frame_positions(charis, table, optic | optics.WollastonPrism(name="wollaston"))
     for follows in ("sequence", "frame"):
         optic = optics.DriftRotator(rate=1 * u.deg, mount=follows, name="gap_x")
-        with pytest.warns(AstropolcalWarning, match=r"gap_x .* in the course of the calibrated run"):
+        with pytest.warns(AstropolcalWarning, match=r"gap_x .* the course of the calibrated run"):
             frame_positions(charis, table, optic | optics.WollastonPrism(name="wollaston"))

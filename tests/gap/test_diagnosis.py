@@ -13,7 +13,7 @@ from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.chain import insert_optic
+from astropolcal.chain import insert_optic, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
@@ -217,6 +217,19 @@ def test_an_angle_in_no_row_does_not_hide_that_a_short_table_is_late():
         table["hwp"] = np.repeat(np.roll(right.position("hwp"), shift), right.n_bins) * u.rad
         found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
         assert (found.verdict, names(found.causes[0])) == ("named", [name])
+
+
+def test_an_alternative_that_leaves_no_pair_of_frames_is_not_asked_for():
+    chain = data.chain()
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = True
+    table = half_wave_plate_cycles([0, 45] * u.deg, derotator=[45] * u.deg)
+    table = data.observed(table=table).to_table()
+    table["hwp"] += 15 * u.deg
+    options = QUICK | {"effects": ["hwp_late"], "cells": False}
+    found = diagnose(chain, Observations.from_table(table), **options)
+    assert found.verdict == "unexplained"
 
 
 @pytest.mark.slow
