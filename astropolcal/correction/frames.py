@@ -8,14 +8,15 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import check_states, stages
+from astropolcal.chain import check_states, leaves, stages
 from astropolcal.correction.solve import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations
 from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
+from astropolcal.optics.positions import FLUXES
 from astropolcal.pipeline.headers import describe
 from astropolcal.units import wavelengths_of
 
@@ -461,6 +462,19 @@ def frame_positions(instrument, table, chain, names=None):
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))
+    for leaf in leaves(chain):
+        if leaf.stage in FLUXES:
+            raise ObservationError(
+                f"{names[0]}: {leaf.name} of the calibrated chain follows the fluxes of a table, "
+                "which images do not have; correct both for it, and calibrate without it"
+            )
+        if leaf.stage in ("sequence", "frame"):
+            warnings.warn(
+                f"{leaf.name} of the calibrated chain changes in the course of the calibrated run; "
+                "the frames are taken to change so too, in their order",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
     modulated = "flc_state" in stages(chain)
     needed = [stage for stage in stages(chain) if stage not in COORDINATES]
     if {"time", "right_ascension"} & set(table.colnames):

@@ -66,8 +66,7 @@ class Fitted:
     def unit_of(self, name):
         """Return the unit of a parameter in words, and how much of it is canonical."""
         slot, optic = self.problem.free.by_name[name], name.partition(".")[0]
-        chains = self.model.chains
-        carrier = next((o for c in chains for o in leaves(c) if o.name == optic), None)
+        carrier = next((o for c in self.model.trains for o in leaves(c) if o.name == optic), None)
         if isinstance(carrier, Perturbation) and carrier.kind.startswith(ANGLES):
             return "deg", np.deg2rad(1.0)
         return str(slot.unit or ""), slot.factor

@@ -22,8 +22,8 @@ _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
 _WHERE, _SUMMARY = 5, 24
 # an alias at another place is the same thing if it is this probable against the best
 _SAME = 0.5
-# a cause is one thing, and not one of several, from this share on
-_ONE = 0.9
+#: A cause is one thing, and not one of several, from this share on
+ONE = 0.9
 # of causes less probable than this the table is enough
 _UNLIKELY = 0.1
 # a share of a signal below this is none
@@ -199,7 +199,7 @@ def title(entry):
 
 def _one_or_like(entry):
     """Return the title of a cause, and that other things look the same where some do."""
-    like = own_share(entry) < _ONE and others(entry, {})
+    like = own_share(entry) < ONE and others(entry, {})
     return f"{title(entry)}{' or what looks the same' if like else ''}"
 
 
@@ -232,7 +232,7 @@ def cause(entry):
 
 def _found(entry):
     chance = share(entry["probability"])
-    if own_share(entry) < _ONE and others(entry, {}):
+    if own_share(entry) < ONE and others(entry, {}):
         first = f"{title(entry)} ({share(own_share(entry))})"
         several = listed([first, *others(entry, {})], "or", _NAMED)
         return f"The model lacks one of several things ({chance}): {several}."
@@ -417,7 +417,8 @@ def _on_sky(content):
     known = " if the undetermined parameters were known" if "as if" in before[0]["words"] else ""
     return (
         "Errors on sky that calibrate claims, with the nominal -> with the improved model"
-        f"{known}: {'; '.join(targets)}. --save keeps the improved one."
+        f"{known}: {'; '.join(targets)}."
+        f"{'' if content.get('misread') else ' --save keeps the improved one.'}"
     )
 
 

@@ -304,7 +304,6 @@ def diagnose(
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     edges = unknown_angles(observations, exchanged[0]) if exchanged else []
-    observations = without_frames(observations, edges)
     say("looking for frames that are not what the table says")
     frames = suspect_frames(base)
     wrong = [fault for fault in frames if fault.what != "lamp"]
@@ -315,7 +314,7 @@ def diagnose(
         frames = [fault for fault in frames if fault.what == "lamp"]
     elif wrong:
         say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
-        kept = without_frames(observations, wrong)
+        kept = without_frames(base.observations, wrong)
         # a fit that the frames had bent need not find back
         fresh = nominal_model(base.start, kept, other=base.chains)
         groups = frame_groups(kept) if cross_validate else None

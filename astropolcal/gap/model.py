@@ -2,6 +2,7 @@
 """The nominal model with effects added to it, step by step."""
 
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from astropolcal.calibration.fit.strategies import BinProblem, few_frames, searc
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
@@ -263,25 +264,6 @@ class Model:
         fit = self.problem.fit(self.fit.coefficients, **settings)
         return Model(self.problem, fit, self.added)
 
-    def sizes(self, name):
-        """
-        Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
-
-        The errors are those of the noise, or of the scatter of the residuals where it is larger.
-        """
-        errors = max(1.0, np.sqrt(self.mean_square)) * self.problem.errors(self.fit.coefficients)
-        found = {}
-        for parameter in self.added[name]:
-            slot = self.problem.free.by_name[parameter.name]
-            where = self.problem.slices[parameter.name]
-            found[parameter.name] = (
-                self.fit.coefficients[where] / slot.factor,
-                errors[where] / slot.factor,
-                slot.unit,
-                parameter,
-            )
-        return found
-
     def is_physical(self, name):
         """
         Return whether the fitted values of an effect are possible.
@@ -475,26 +457,32 @@ def starting_model(calibration, observations, library, say):
                 found = _tried(chains, observations, some, say, found)
         if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
-            edited = found[0][1].edit(chains, _context(observations)).chains
-            best = nominal_calibration(edited, observations)
+            read = _read(found[0][1], chains, observations, _context(observations))
+            best = nominal_calibration(*read)
             if _misfit(best) < _FAR_BETTER * misfit:
-                return _with_alternative(observations, edited, made, best, found)
+                return _with_alternative(*read, made, best, found)
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
 
 
 def _tried(chains, observations, effects, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
-    if not effects:
-        return known
     few, context = thinned(chains, observations, _FEW), _context(observations)
     found = list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
-        trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
-        found.append((_misfit(trial), effect))
+        # where it leaves too few frames it is not asked for
+        with suppress(FitError, ObservationError):
+            found.append((_misfit(nominal_calibration(*_read(effect, *few, context))), effect))
     misfits = np.array([misfit for misfit, _ in found])
-    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min())]
+    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf))]
+
+
+def _read(effect, chains, observations, context):
+    """Return the chains with an alternative, and the frames of which it knows the angles."""
+    edges = ((o, effect.edge(o)) for o in observations)
+    kept = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
+    return effect.edit(chains, context).chains, kept
 
 
 def _context(observations):
@@ -519,11 +507,9 @@ def _may_be_wrong(calibration):
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
-def _with_alternative(observations, edited, given, best, found):
+def _with_alternative(edited, observations, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
     least, effect = found[0]
-    edges = ((o, effect.edge(o)) for o in observations)
-    observations = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)

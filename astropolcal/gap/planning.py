@@ -110,11 +110,6 @@ class Exposure:
         }
 
     @property
-    def modulator(self):
-        """State of the modulator in every frame, A or B."""
-        return np.tile(self.states, self.n_angles)
-
-    @property
     def effort(self):
         """Number of things to change in the set-up of the data, apart from its stages."""
         return bool(self.polarizer_turned) + (self.lamp != 1) + bool(self.without)
@@ -509,9 +504,8 @@ class Forecast:
         """
         rows, known, unknown, scale = directions
         names = self.model.problem.slices
-        order = np.concatenate(
-            [np.arange(self.problem.size)[self.problem.slices[n]] for n in names]
-        )
+        every = np.arange(self.problem.size)
+        order = np.concatenate([every[self.problem.slices[n]] for n in names])
         table = np.concatenate([rows, columns[:, order] * self.scale[order] / scale])
         basis = orthonormal(table @ known)
         left = table @ unknown
@@ -590,7 +584,8 @@ def _hypothetical(base, exposure):
         {name: a * u.deg if a.dtype.kind == "f" else a for name, a in exposure.angles.items()}
     )
     if exposure.states:
-        frames[MODULATOR] = (exposure.modulator == STATES[1]).astype(float)
+        states = np.tile(exposure.states, exposure.n_angles)
+        frames[MODULATOR] = (states == STATES[1]).astype(float)
     return simulate(
         join(chain),
         problem.wavelength * u.um,

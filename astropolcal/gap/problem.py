@@ -429,13 +429,6 @@ class GapProblem:
         # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
         return right[good] / singular[good, None] / scale, right[~good]
 
-    def errors(self, coefficients):
-        """Return the standard errors of the coefficients, infinite where they are open."""
-        half, null = self.directions(coefficients)
-        is_open = np.sum(null**2, axis=0) > TOUCHES**2
-        prior = np.divide(1, self.tight, out=np.full(self.size, np.inf), where=self.tight > 0)
-        return np.minimum(np.where(is_open, np.inf, np.linalg.norm(half, axis=0)), prior)
-
 
 def _within(triangle, wanted, low, high, found):
     """

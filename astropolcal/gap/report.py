@@ -116,6 +116,7 @@ def _worked_out(diagnosis):
         "shrinkage_percent": _shrinkage(diagnosis, exchanged),
         # frames that a misread table pairs are no double difference
         "double_difference": None if misread else _double(fitted, before, after),
+        "misread": misread,
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],

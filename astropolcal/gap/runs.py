@@ -13,7 +13,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import decimals
+from astropolcal.gap._words import ONE, decimals
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
 from astropolcal.words import listed
@@ -78,7 +78,8 @@ def changes(diagnosis, causes):
             brought = _brought(cell, run, names, chains)
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
-            entry["words"] = _sentence(cell, entry, names, wavelength)
+            of = "" if _is_told(cell, cause) else " of this or what looks the same"
+            entry["words"] = _sentence(cell, entry, names, wavelength, of)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
 
@@ -87,12 +88,19 @@ def _run_of(cell, names, chains):
     """Return the name of the one dataset that has a cell, None where several have it."""
     if cell.run is not None or cell.optic is None:
         return cell.run
-    there = [
-        name
-        for name, chain in zip(names, chains, strict=True)
-        if cell.optic in [optic.name for optic in chain]
-    ]
+    there = [n for n, c in zip(names, chains, strict=True) if cell.optic in [o.name for o in c]]
     return there[0] if len(there) == 1 else None
+
+
+def _in_any_run(cell):
+    return Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
+
+
+def _is_told(cell, cause):
+    """Return whether nothing looks like a change but the opposite one of another run."""
+    there = [(Cell(**one["cell"]), one["probability"]) for one in cause["aliases"] if one["cell"]]
+    same = sum(chance for one, chance in there if _in_any_run(one) == _in_any_run(cell))
+    return cause["share"] + same >= ONE
 
 
 def _brought(cell, run, names, chains):
@@ -143,26 +151,23 @@ def paragraph(content, names, asked=False):
     return words
 
 
-def _sentence(cell, entry, names, wavelength):
+def _sentence(cell, entry, names, wavelength, of):
     """Return one change in words."""
-    plain = Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
+    plain = _in_any_run(cell)
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
     size = _size(entry["size"], wavelength)
-    chance = f"probability {100 * entry['probability']:.0f} %"
+    chance = f"probability {100 * entry['probability']:.0f} %{of}"
     run = entry["dataset"]
-    if constant and len(names) == 2 and size is not None:
+    if constant and len(names) == 2 and size:
         # of the second against the first, whichever of the two has it
         sign = 1 if run == names[1] else -1
-        value, error, unit, where = size
+        value, error, of = size
         return (
             f'Between "{names[0]}" and "{names[1]}" the {title} changed by '
-            f"{_number(sign * value, error)} {unit}{where} ({chance})."
+            f"{_number(sign * value, error)} {of} ({chance})."
         )
-    told = ""
-    if size is not None:
-        value, error, unit, where = size
-        told = f", by {_number(value, error)} {unit}{where}"
+    told = f", by {_number(*size[:2])} {size[2]}" if size else ""
     if constant:
         return f'In "{run}" the {title} differs from that of the other runs{told} ({chance}).'
     return f'In "{run}" only there is {title}{told} ({chance}).'
@@ -174,19 +179,17 @@ def _number(value, error):
 
 
 def _size(parameters, wavelength):
-    """Return value, error, unit and where of the clearest size of a cause, None if it is open."""
-    best = None
+    """Return value, error, and unit with where, of the clearest size; nothing if all are open."""
+    found = [(-1.0,)]
     for one in parameters.values():
         # what has no unit is a share
         factor, unit = (1.0, one["unit"]) if one["unit"] else (100.0, "%")
         values = np.array(np.ravel(one["value"]), dtype=float)
         errors = np.array(np.ravel(one["std"]), dtype=float)
-        clear = np.where(errors > 0, np.abs(values) / errors, np.nan)
-        if np.isnan(clear).all():
-            continue
-        i = int(np.nanargmax(clear))
-        if best is None or clear[i] > best[0]:
-            one_of = values.size == len(wavelength) > 1 and np.ptp(values) > 0
-            where = f" at {wavelength[i]:.0f} nm" if one_of else ""
-            best = (clear[i], factor * values[i], factor * errors[i], unit, where)
-    return best and best[1:]
+        clear = np.divide(np.abs(values), errors, out=np.full(errors.shape, -1.0), where=errors > 0)
+        i = int(np.argmax(clear))
+        one_of = values.size == len(wavelength) > 1 and np.ptp(values) > 0
+        where = f" at {wavelength[i]:.0f} nm" if one_of else ""
+        found.append((clear[i], factor * values[i], factor * errors[i], f"{unit}{where}"))
+    best = max(found, key=lambda size: size[0])
+    return best[1:] if best[0] >= 0 else ()

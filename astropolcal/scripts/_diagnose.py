@@ -23,6 +23,7 @@ examples:
 
 Several tables are used together. The effects are listed by --effects help.
 """
+_CORRECT = "correct the angles in the table, and calibrate with that"
 _HINT = "--full adds each cause with its sizes, and where the gap lies"
 # what the figure with both channels of the data shows
 _SPECTRUM = (
@@ -85,20 +86,24 @@ def run(arguments):
     # first the files: a reader of our words may have gone in the meantime
     _write(diagnosis, content, arguments, instrument)
     following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
-    found = {
-        "none": "calibrate with this model",
-        "named": "--save FILE.asdf calibrates with what was found",
-        "located": "--save FILE.asdf calibrates with what was found",
-    }
+    found = {"none": "calibrate with this model"}
+    found |= dict.fromkeys(("named", "located"), "--save FILE.asdf calibrates with what was found")
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
+    told = [_CORRECT] if content["misread"] else told
+    saved = not content["misread"] and arguments.save
     ends = common.wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
-    ends += common.written_lines([arguments.json, arguments.report, arguments.save])
+    ends += common.written_lines([arguments.json, arguments.report, saved])
     if arguments.full:
         # its end is what stays on the screen
         lines = [summary(diagnosis), "", common.wrapped(content["sentences"][0]), *ends]
     else:
         lines = short(content, [*ends, _HINT])
     common.say(arguments, *lines)
+    if arguments.save and not saved:
+        raise AstropolcalError(
+            f"--save {arguments.save}: not written, as a calibration that misreads these angles "
+            f"would misread those of science frames, too; {_CORRECT}"
+        )
 
 
 # ---- the nominal model ------------------------------------------------------------------------
@@ -168,7 +173,7 @@ def _write(diagnosis, content, arguments, instrument):
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
-    if arguments.save:
+    if arguments.save and not content["misread"]:
         from astropolcal.gap._numbers import with_causes
 
         calibration = with_causes(diagnosis.improved, instrument=instrument)

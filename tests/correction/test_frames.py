@@ -14,7 +14,7 @@ from astropy.utils.masked import Masked
 from astropolcal import instruments, optics
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.correction.frames import frame_positions
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
 
 LAM = [1.2, 1.6] * u.um
 HWP = [0, 45, 22.5, 67.5] * u.deg
@@ -323,3 +323,16 @@ def test_fluxes_without_any_variance_are_no_measurement():
     frames = ScienceFrames.from_arrays(flux, flux, LAM, {"hwp": HWP}, **given)
     with pytest.raises(ObservationError, match="no pixel has values"):
         correct(CHAIN, frames, brightness="given")
+
+
+def test_what_follows_fluxes_or_the_run_has_no_place_in_images_without_a_word():
+    table = QTable({"hwp": [0, 22.5] * u.deg, "derotator": [60, 60] * u.deg})
+    charis = instruments.get("charis")
+    for follows in ("flux", "total_flux", "previous_flux"):
+        optic = optics.StrayLight(amount=0.01, reference=1e6, mount=follows, name="gap_x")
+        with pytest.raises(ObservationError, match=r"gap_x .* follows the fluxes of a table"):
+            frame_positions(charis, table, optic | optics.WollastonPrism(name="wollaston"))
+    for follows in ("sequence", "frame"):
+        optic = optics.DriftRotator(rate=1 * u.deg, mount=follows, name="gap_x")
+        with pytest.warns(AstropolcalWarning, match=r"gap_x .* the course of the calibrated run"):
+            frame_positions(charis, table, optic | optics.WollastonPrism(name="wollaston"))

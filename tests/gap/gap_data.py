@@ -9,7 +9,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.model import Model
-from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.problem import TOUCHES, GapProblem
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -64,6 +64,14 @@ def fitted(observations, chains=None):
 @cache
 def clean_model(seed=1):
     return fitted(observed(seed=seed))
+
+
+def errors(problem, coefficients):
+    """Return the standard errors of the coefficients, infinite where they are open."""
+    half, null = problem.directions(coefficients)
+    is_open = np.sum(null**2, axis=0) > TOUCHES**2
+    prior = np.divide(1, problem.tight, out=np.full(problem.size, np.inf), where=problem.tight > 0)
+    return np.minimum(np.where(is_open, np.inf, np.linalg.norm(half, axis=0)), prior)
 
 
 def effect_basis(model, effect, nominal):

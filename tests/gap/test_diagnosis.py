@@ -13,7 +13,7 @@ from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.chain import insert_optic
+from astropolcal.chain import insert_optic, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
@@ -205,6 +205,31 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
         assert content["double_difference"] is None
         edge = {"hwp_late": wrong.n_frames - 1, "angles_early": 0}.get(name)
         assert [fault.frame for fault in found.frames] == ([] if edge is None else [edge])
+        # nor has that frame a part in what calibrate says
+        assert content["accuracy_after"]["rms_percent"] < 0.1
+
+
+@pytest.mark.slow
+def test_an_angle_in_no_row_does_not_hide_that_a_short_table_is_late():
+    right = data.observed(table=half_wave_plate_cycles(derotator=[45, 80] * u.deg))
+    table = right.to_table()
+    for shift, name in ((-1, "hwp_early"), (1, "hwp_late")):
+        table["hwp"] = np.repeat(np.roll(right.position("hwp"), shift), right.n_bins) * u.rad
+        found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
+        assert (found.verdict, names(found.causes[0])) == ("named", [name])
+
+
+def test_an_alternative_that_leaves_no_pair_of_frames_is_not_asked_for():
+    chain = data.chain()
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = True
+    table = half_wave_plate_cycles([0, 45] * u.deg, derotator=[45] * u.deg)
+    table = data.observed(table=table).to_table()
+    table["hwp"] += 15 * u.deg
+    options = QUICK | {"effects": ["hwp_late"], "cells": False}
+    found = diagnose(chain, Observations.from_table(table), **options)
+    assert found.verdict == "unexplained"
 
 
 @pytest.mark.slow
@@ -257,9 +282,10 @@ def test_noise_that_neighbouring_wavelengths_share_has_no_cause():
 def test_wrong_frames_are_named_and_left_out():
     table = data.frames()
     table["hwp_true"] = table["hwp"] + np.where(np.arange(32) == 5, 3.0, 0.0) * u.deg
-    seen = data.observed(table=table, flux=1e7).to_table()
-    seen.remove_column("hwp_true")
-    found = diagnose(data.chain(), Observations.from_table(seen))
+    # the table does not say where the plate stood
+    table = data.observed(table=table, flux=1e7).to_table()
+    table.remove_column("hwp_true")
+    found = diagnose(data.chain(), Observations.from_table(table))
     assert [(fault.frame, fault.what) for fault in found.frames] == [(5, "hwp angle")]
     assert (found.verdict, found.causes) == ("none", [])
     for one in (found.nominal, found.improved):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from gap_data import effect_basis
+from gap_data import errors as errors_of
 from sky_data import sky_track
 
 from astropolcal import Calibration, calibrate, instruments, optics
@@ -348,7 +349,7 @@ def simulated(names, size=None, seed=3):
 
 
 def assert_recovered(model, name, truth):
-    found, errors = model.fit.coefficients, model.problem.errors(model.fit.coefficients)
+    found, errors = model.fit.coefficients, errors_of(model.problem, model.fit.coefficients)
     for key in (parameter.name for parameter in model.added[name]):
         where = model.problem.slices[key]
         off = (found[where] - truth[key]) / errors[where]

@@ -145,7 +145,7 @@ def test_the_values_of_a_law_are_held_to_the_bounds_of_its_optic():
     where = held.slices[EFFICIENCY]
     line = laws[EFFICIENCY][np.argmax(found)]
     along = np.array([-line[1], line[0]])
-    errors = held.errors(fit.coefficients)[where]
+    errors = data.errors(held, fit.coefficients)[where]
     assert abs(slopes[where] @ along) * np.linalg.norm(errors) < 0.05
     assert slopes[where] @ line > 0
 
@@ -165,7 +165,7 @@ def test_a_prior_holds_only_if_it_is_narrower_than_the_data(plain, fitted):
 
 def test_a_prior_as_wide_as_the_data_meets_them_half_way(plain, fitted):
     where = plain.slices[EFFICIENCY]
-    errors = plain.errors(fitted.coefficients)[where]
+    errors = data.errors(plain, fitted.coefficients)[where]
     target = fitted.coefficients[where][3] - 0.01
     one = problem_of(like=plain, priors={EFFICIENCY: errors[3]}, neutral={EFFICIENCY: target})
     moved = one.fit().coefficients[where][3]
@@ -204,7 +204,7 @@ def test_errors_are_those_of_the_normal_equations(plain, fitted):
     scale = np.linalg.norm(slopes, axis=0)
     inverse = np.linalg.inv((slopes / scale).T @ (slopes / scale))
     expected = np.sqrt(np.diag(inverse)) / scale
-    np.testing.assert_allclose(plain.errors(fitted.coefficients), expected, rtol=1e-5)
+    np.testing.assert_allclose(data.errors(plain, fitted.coefficients), expected, rtol=1e-5)
 
 
 def test_an_open_coefficient_is_known_as_well_as_its_prior(plain):
@@ -212,7 +212,7 @@ def test_an_open_coefficient_is_known_as_well_as_its_prior(plain):
     chain["wollaston"].theta.fixed = False
     chain["wollaston"].theta.bounds = (-5, 5)
     found = problem_of(chain=chain, like=plain, priors={"wollaston.theta": 2 * DEGREE})
-    (error,) = found.errors(found.start)[found.slices["wollaston.theta"]]
+    (error,) = data.errors(found, found.start)[found.slices["wollaston.theta"]]
     assert error <= 2 * DEGREE * (1 + 1e-9)
 
 

@@ -175,7 +175,7 @@ def test_a_modulator_has_both_states():
     one = found[0]
     assert one.n_frames == 2 * len(one.positions["hwp"])
     assert one.angles["hwp"][:4].tolist() == [0, 0, 11.25, 11.25]
-    assert one.modulator[:4].tolist() == ["A", "B", "A", "B"]
+    assert one.states == ("A", "B")
     entries = plan(even(modulated.with_effect(get_effect(PAIR[0])), *PAIR), candidates=found)
     assert entries[0]["question"] == "cause"
 

@@ -131,7 +131,7 @@ def test_errors_are_infinite_where_the_data_are_silent():
     chain["wollaston"].theta.bounds = (-5, 5)
     problem = GapProblem([chain], [data.observed()])
     problem.settle_noise()
-    errors = problem.errors(problem.start)
+    errors = data.errors(problem, problem.start)
     assert np.isinf(errors[problem.slices["wollaston.theta"]]).all()
     assert np.isfinite(errors[problem.slices["wollaston.efficiency"]]).all()
 

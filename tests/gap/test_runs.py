@@ -88,6 +88,17 @@ def test_a_change_is_found_with_its_run_cell_and_size():
     json.dumps(content)
 
 
+@pytest.mark.slow
+def test_a_change_that_others_look_like_is_not_told_as_sure():
+    turned = ("source", "rotation", "constant", np.deg2rad(0.5))
+    content = to_dict(diagnose(data.chain(), pair([], [turned]), changes=True))
+    (change,) = content["changes"]
+    assert change["words"].endswith("(probability 99 % of this or what looks the same).")
+    # the opposite change of the other run is the same one
+    (change,) = changed_content()["changes"]
+    assert change["words"].endswith("(probability 97 %).")
+
+
 def test_changes_come_first_and_the_shared_cause_after():
     first, *others = changed().causes
     assert first.cell.run in (JULY, OCTOBER)

@@ -222,6 +222,13 @@ def test_the_same_kind_at_several_places_is_told_once():
     assert "downstream of the derotator" not in _words.title(one)
 
 
+def test_a_name_and_the_cell_that_it_is_for_are_one_thing():
+    own = cell("detector", "gain", "constant", 0.48)
+    one = entry(named("beam_gain", 0.0), share=0.48, cell=own["cell"], aliases=[own])
+    assert _words.own_share(one) == pytest.approx(0.96)
+    assert said(one).startswith("The model lacks one effect: title of beam_gain (97 %)")
+
+
 def test_long_groups_are_told_shortly():
     aliases = [named(f"e{i}", 0.05 - 0.001 * i) for i in range(12)]
     words = said(entry(share=0.5, aliases=aliases))

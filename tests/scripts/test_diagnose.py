@@ -112,6 +112,26 @@ def check_improved(saved, content):
 
 
 @pytest.mark.slow
+def test_a_model_that_misreads_angles_is_not_saved(tmp_path, capsys):
+    chain = CHARIS.chain("polarized", wavelength=WAVELENGTH, derotator="linear")
+    frames = half_wave_plate_cycles(derotator=[45, 62.5, 80, 100] * u.deg)
+    meta = CHARIS.published_meta() | {"source": "polarized", "yjh50_dichroic": "out"}
+    meta["nasmyth_beam_switcher"] = "not installed"
+    table = simulate(chain, WAVELENGTH, frames, seed=1, meta=meta).to_table()
+    table["hwp"] *= 2
+    Observations.from_table(table).write(tmp_path / "doubled.ecsv")
+    outputs = ["--save", tmp_path / "cal.asdf", "--json", tmp_path / "out.json"]
+    arguments = [tmp_path / "doubled.ecsv", "--derotator", "linear", "--effects", "hwp_doubled"]
+    assert main(["diagnose", *map(str, [*arguments, *outputs])]) == 2
+    printed = capsys.readouterr()
+    assert "Next        correct the angles in the table" in printed.out
+    assert "--save" not in printed.out
+    assert "cal.asdf: not written" in printed.err
+    assert not (tmp_path / "cal.asdf").exists()
+    assert json.loads((tmp_path / "out.json").read_text())["misread"]
+
+
+@pytest.mark.slow
 def test_model_of_a_calibration(folder, cal, tmp_path):
     content = run(tmp_path, cal, folder / "polarized.ecsv", *FEW)
     assert content["causes"][0]["effect"] == "beam_gain"
