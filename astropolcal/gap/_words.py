@@ -302,6 +302,11 @@ def sentences(content):
     return [words for words in (first, *rest) if words]
 
 
+def correct(entry):
+    """Return what is to be done with a table of which the angles are misread."""
+    return f"Correct the table first: {title(entry)} ({share(entry['probability'])})."
+
+
 def _what(content):
     causes, verdict = content["causes"], content["verdict"]
     if verdict == "none":

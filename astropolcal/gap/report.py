@@ -139,7 +139,9 @@ def _worked_out(diagnosis):
     names = [o.name for o in improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
-    words += ["Correct the angles in the table, and calibrate with that."] if misread else []
+    if misread and causes[0]["probability"] >= 0.5:
+        # before all optics, and before what else is not known
+        words.insert(0, _words.correct(causes[0]))
     return plain(content | {"sentences": words})
 
 

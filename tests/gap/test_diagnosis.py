@@ -200,7 +200,7 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
         assert found.verdict == "named"
         assert names(found.causes[0]) == [name]
         content = to_dict(found)
-        assert content["sentences"][-1].startswith("Correct the angles in the table")
+        assert content["sentences"][0].startswith("Correct the table first: angle")
         # frames that such a table pairs are no double differences
         assert content["double_difference"] is None
         edge = {"hwp_late": wrong.n_frames - 1, "angles_early": 0}.get(name)
