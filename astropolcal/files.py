@@ -66,7 +66,8 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     if os.path.isdir(path):
         raise error(f"{path}: is a folder; name a file in it")
     if os.path.exists(path) and not overwrite:
-        raise error(f"{path}: exists already; overwrite=True replaces it")
+        ways = "remove it, name another, or in Python overwrite=True replaces it"
+        raise error(f"{path}: exists already; {ways}")
     if not os.path.isdir(path.parent):
         raise error(f"{path}: cannot be written: there is no folder {path.parent}")
     for source in sources:

@@ -291,7 +291,7 @@ def test_lines_are_appended_as_a_whole(tmp_path, monkeypatch):
 
 def test_a_file_that_cannot_be_new(tmp_path):
     for name, overwrite, words in [
-        ("there.txt", False, "exists already; overwrite=True replaces it"),
+        ("there.txt", False, "exists already; remove it, name another"),
         (".", True, "is a folder; name a file in it"),
         ("nowhere/new.txt", True, "cannot be written: there is no folder"),
     ]:

@@ -121,7 +121,7 @@ def _worked_out(diagnosis):
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
         "where": _where(diagnosis),
-        "where_left": [] if same or noisy else _located(improved),
+        "where_left": [] if same or noisy else [o for part in _located(improved) for o in part],
         "left_share": 0.0 if noisy else left,
         "left_share_limit": diagnosis.hidden_share,
         "hidden_percent": diagnosis.hidden_percent,
@@ -154,18 +154,18 @@ def _nominal(model):
 
 def _where(diagnosis):
     """Return where the gap lies, after what may be it unless one wavelength has nearly all."""
-    found = _located(diagnosis.nominal)
+    alone, rest = _located(diagnosis.nominal)
     # what is at one wavelength is no perturbation with a law in wavelength
-    alone = diagnosis.verdict == "unexplained" and found and found[0]["axis"] == "wavelength"
-    return found if alone else [*_courses(diagnosis), *found]
+    is_there = alone and diagnosis.verdict == "unexplained"
+    return [*alone, *rest] if is_there else [*_courses(diagnosis), *alone, *rest]
 
 
 def _located(model):
-    """Return where the gap of a model lies, a single wavelength that has nearly all of it first."""
+    """Return where the gap lies: a single wavelength that has nearly all of it, and the rest."""
     nm = [f"{nm:.0f} nm" for nm in 1000 * model.problem.wavelength]
     found = locate(model)
     alone = [one for one in found if one["detail"] in nm and one["share"] > _ALONE]
-    return [*alone, *(one for one in found if one not in alone)]
+    return alone, [one for one in found if one not in alone]
 
 
 def _courses(diagnosis):

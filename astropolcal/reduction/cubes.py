@@ -311,8 +311,11 @@ def simulate_cubes(
     ...     fits.getdata(paths[0], 1).shape
     (22, 201, 201)
     """
-    image, detector = image or ImageModel(), detector or DetectorModel()
-    files = files or CubeFiles()
+    image, detector, files = (
+        image or ImageModel(),
+        detector or DetectorModel(),
+        files or CubeFiles(),
+    )
     layout, wavelength, more = _of_mode(instrument, wavelength)
     # what is given goes before what the mode says
     more |= files.headers or {}
@@ -339,8 +342,7 @@ def simulate_cubes(
     # part of the saturation, and both
     fullest = (0.0, 0.0, 0.0)
     with shown(progress):
-        for i in steps(range(n_frames), "cubes"):
-            how, background = read[i]
+        for i, (how, background) in enumerate(steps(read, "cubes")):
             falling = scene.light(beams[:, i], centres[i], widths[i]) + background
             brightest, saturation = float(falling.max()), ways[i].saturation
             fullest = max(fullest, (brightest / saturation, brightest, saturation))

@@ -89,7 +89,7 @@ def run(arguments):
     found = {"none": "calibrate with this model"}
     found |= dict.fromkeys(("named", "located"), "--save FILE.asdf calibrates with what was found")
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
-    told = [_CORRECT] if content["misread"] else told
+    told = [_CORRECT] if content["misread"] and content["causes"][0]["probability"] >= 0.5 else told
     saved = not content["misread"] and arguments.save
     ends = common.wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
     ends += common.written_lines([arguments.json, arguments.report, saved])

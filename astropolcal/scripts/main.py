@@ -200,9 +200,7 @@ def _run(argv):
             with earth(arguments), shown(not getattr(arguments, "quiet", False)):
                 return arguments.run(arguments) or 0
         except AstropolcalError as error:
-            # what Python calls so is no option of a command
-            words = str(error).replace("overwrite=True replaces it", "remove it, or name another")
-            print(f"astropolcal: error: {_one_line(words)}", file=sys.stderr)
+            print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
             return 2
         except MemoryError as error:
             words = _one_line(error) or "give it less to do at a time"

@@ -562,7 +562,7 @@ def assert_not_written(calibration, path, message, **options):
 @pytest.mark.slow
 def test_existing_file_is_kept(calibration, path):
     path.write_text("precious")
-    assert_not_written(calibration, path, "exists already; overwrite=True replaces it")
+    assert_not_written(calibration, path, "exists already; remove it, name another")
     assert path.read_text() == "precious"
     calibration.write(path, overwrite=True)
     assert_same(calibration, Calibration.read(path))

@@ -63,7 +63,7 @@ def test_one_file_that_exists_stops_the_run(tmp_path):
         folder = tmp_path / str(i)
         (folder / "raw").mkdir(parents=True)
         (folder / there).write_text("old")
-        words = rf"{Path(there).name}: exists already; overwrite=True replaces it"
+        words = rf"{Path(there).name}: exists already; remove it, name another"
         with pytest.raises(ObservationError, match=words):
             names(folder, layout)
         assert len(names(folder, layout, overwrite=True)) == 2, there

@@ -123,7 +123,7 @@ def test_no_frames_make_an_empty_table(small):
 def test_file_is_not_replaced_unasked(small, tmp_path):
     path, table = tmp_path / "run.ecsv", reduced_table([frame(1), frame(2, 45.0)], small, {})
     write_table(table, path)
-    with pytest.raises(ObservationError, match=r"run\.ecsv: exists already; overwrite=True repl"):
+    with pytest.raises(ObservationError, match=r"run\.ecsv: exists already; remove it, name"):
         write_table(table[:N], path)
     assert len(Table.read(path)) == 2 * N
     write_table(table[:N], path, overwrite=True)

@@ -119,7 +119,7 @@ def test_cubes_are_not_written_over_others(tmp_path, capsys):
     assert simulated(*argv) == 0
     assert simulated(*argv) == 2
     # an argument of Python is no way out in a terminal
-    assert "exists already; remove it, or name another" in capsys.readouterr().err
+    assert "exists already; remove it, name another" in capsys.readouterr().err
 
 
 # an internal source and an unpolarized star do not tell where north is

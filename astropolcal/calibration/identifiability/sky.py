@@ -283,8 +283,10 @@ def mean_errors(view, chain):
     change = view.against(chain)
     # of q = Q / I: what is found of I changes, too
     change = change[..., 1:, :] - np.eye(3)[1:] * change[..., :1, :1]
-    square = np.where(np.isfinite(change), change, 0.0) ** 2
-    return np.stack([square[..., 1:].sum(axis=-1) / 2, square[..., 0]]).mean(axis=(-2, -1))
+    known = np.isfinite(change).all(axis=(-2, -1))
+    square = np.where(known[..., None, None], change, 0.0) ** 2
+    found = np.stack([square[..., 1:].sum(axis=-1) / 2, square[..., 0]]).mean(axis=-1)
+    return found.sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
 
 
 def _consequences(matrices, changed):
