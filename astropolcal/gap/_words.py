@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import ranked
-from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
+from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when, alike
 from astropolcal.words import listed, p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
@@ -18,6 +18,8 @@ _CONSPICUOUS = 0.01
 _WIDTH = 80
 # so many causes are named in a sentence, in a title, and in place of another
 _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
+# more single data than this are counted
+_SINGLE = 5
 # so many lines say where the gap lies, and so many has the summary
 _WHERE, _SUMMARY = 5, 24
 # an alias at another place is the same thing if it is this probable against the best
@@ -30,6 +32,11 @@ _UNLIKELY = 0.1
 _CANCELS = 0.02
 # so many targets on sky stand in the summary
 _TARGETS = 2
+_ONE_THING = {
+    "course": " Both follow the same thing: they may be one that no table has.",
+    "action": " Both are of one place and kind: they may be one thing with a course of its own.",
+    "": "",
+}
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 # what the amplitude of a cell is, by its dependence
 _AMPLITUDES = {
@@ -293,13 +300,26 @@ def details(entry, ranks):
 
 def sentences(content):
     """Return frames to distrust, what causes the gap, how large it is, and what is left."""
-    faults = [fault["words"].rstrip(".") for fault in content["frames"]]
-    if len({fault["dataset"] for fault in content["frames"]}) > 1:
-        pairs = zip(content["frames"], faults, strict=True)
-        faults = [f"{fault['dataset']}, {words}" for fault, words in pairs]
+    faults = _faults(content["frames"])
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
     rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
     return [words for words in (first, *rest) if words]
+
+
+def _faults(frames):
+    """Return what is wrong with each of some frames; of many single data only how many they are."""
+    single = [fault for fault in frames if fault["what"] == "one wavelength"]
+    single = single if len(single) > _SINGLE else []
+    several = len({fault["dataset"] for fault in frames}) > 1
+    told = [
+        f"{fault['dataset']}, {words}" if several else words
+        for fault in frames
+        if fault not in single and (words := fault["words"].rstrip("."))
+    ]
+    if single:
+        count = len({(fault["dataset"], fault["frame"]) for fault in single})
+        told.append(f"{len(single)} data in {count} of them are off the wavelengths beside them")
+    return told
 
 
 def correct(entry):
@@ -322,6 +342,7 @@ def _what(content):
     if causes:
         text += f"what helps most, {names[0]}, "
         text += "needs others beside it." if len(causes) > 1 else "is not probable enough."
+        text += _ONE_THING[alike([entry["cell"] and Cell(**entry["cell"]) for entry in causes])]
     else:
         text += f"none of the {content['n_effects']} causes that were tried explains the gap."
     where = content["where_left"] or content["where"]

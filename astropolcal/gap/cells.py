@@ -33,6 +33,8 @@ DETECTED = {
     "persistence": "previous",
     "crosstalk": "constant",
 }
+# what all frames have, or runs, or what a kind brings with it, is no course
+_NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
 _HARMONICS = (1, 2, 4)
 # steps are looked for at so many frames, and the best of them at those in between
@@ -170,6 +172,20 @@ def _when(dependence):
     where = _own_name(where).replace("=", " is ")
     words = _PATTERNS.get(kind, "").format(where, _TIMES.get(count, f"{count} times"))
     return words + (f' in "{run}" only' if run is not None else "")
+
+
+def alike(cells):
+    """
+    Return what two cells have in common: a "course" through the run, or an "action".
+
+    That is place and kind. Both may be one thing that no table has; empty for all others.
+    """
+    if len(cells) != 2 or None in cells:
+        return ""
+    one, other = cells
+    if one.dependence == other.dependence and not one.dependence.startswith(_NO_COURSE):
+        return "course"
+    return "action" if (one.place, one.kind) == (other.place, other.kind) else ""
 
 
 # ---- places ------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.frames import suspect_frames, unknown_angles, without_frames
+from astropolcal.gap.frames import single_data, suspect_frames, unknown_angles, without_frames
 from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
@@ -305,6 +305,10 @@ def diagnose(
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     edges = unknown_angles(observations, exchanged[0]) if exchanged else []
     say("looking for frames that are not what the table says")
+    single = []
+    while more := single_data(base, single):
+        nominal, base = _without(nominal, base, more, say)
+        single += more
     frames = suspect_frames(base)
     wrong = [fault for fault in frames if fault.what != "lamp"]
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
@@ -312,15 +316,11 @@ def diagnose(
     smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
         frames = [fault for fault in frames if fault.what == "lamp"]
-    elif wrong:
-        say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
-        kept = without_frames(base.observations, wrong)
-        # a fit that the frames had bent need not find back
-        fresh = nominal_model(base.start, kept, other=base.chains)
-        groups = frame_groups(kept) if cross_validate else None
-        # with noise and effects of its own
-        again = Model(fresh.problem, fresh.fit, base.added)
-        nominal, base = (again if nominal is base else nominal), again
+    else:
+        nominal, base = _without(nominal, base, wrong, say)
+    frames = single + frames
+    if single or wrong:
+        groups = groups and frame_groups(base.observations)
     say("looking for causes")
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     left = selection.model
@@ -334,6 +334,20 @@ def diagnose(
         found.nested = _nested(base, smooth, groups, say, cells)
         found.seconds = time.perf_counter() - started
     return found
+
+
+def _without(nominal, base, faults, say):
+    """Return the nominal model, and that with an alternative, fitted without what is wrong."""
+    if not faults:
+        return nominal, base
+    many = counted(len({fault.place for fault in faults}), "frame")
+    say(f"without what is wrong in {many}: fitting the nominal model again")
+    kept = without_frames(base.observations, faults)
+    # a fit that the frames had bent need not find back
+    fresh = nominal_model(base.start, kept, other=base.chains)
+    # with noise and effects of its own
+    again = Model(fresh.problem, fresh.fit, base.added, start=base.start)
+    return (again if nominal is base else nominal), again
 
 
 def _with_noise_of(base, selection):

@@ -18,7 +18,7 @@ from scipy import stats
 
 from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Trial, angle_stages
 from astropolcal.gap.model import Model, nominal_calibration
-from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
 from astropolcal.words import listed
 
@@ -43,6 +43,14 @@ _MOST, _LEAST_MOST = 0.05, 2
 _GONE, _APART = 0.8, 10.0
 # one angle of a group explains its frames if so little is left of them
 _LEFT = 0.01
+# single data that are so many robust standard deviations off what the others of their frame and
+# the nominal model say, and so many where some are known; a wavelength or a frame of which more
+# than such a share is, is something else
+_OFF, _ALSO = 8.0, 5.0
+_OF_WAVELENGTH, _OF_FRAME = 0.1, 0.3
+# scatter below this share of the noise is none; the largest degree of the law of a frame, and what
+# a datum has to itself
+_LITTLE, _SMOOTH, _SEEN = 0.2, 4, 0.05
 # of very many frames several are taken at once, those nearly as bad as the worst
 _AT_ONCE, _NEARLY = 12, 0.5
 # as bad frames are found, so little of the excess is left that the noise is measured anew
@@ -106,6 +114,69 @@ def suspect_frames(model):
         found = found if search.is_settled([fault.place for fault in found], last) else []
     named = {fault.place for fault in found}
     return found + [fault for fault in _lamp(model) if fault.place not in named]
+
+
+def single_data(model, known=()):
+    """
+    Return the single data that are far off the wavelengths beside them, the farthest first.
+
+    Hot pixels and cosmic rays do that; a gap is smooth in wavelength, or in more frames. There are
+    none where they are, with those known, in so few frames that `suspect_frames` finds them, or so
+    many that the model is at fault.
+    """
+    problem, linear, found = model.problem, model.linear, []
+    for i, (channel, rows) in enumerate(zip(problem.channels, problem.segments, strict=True)):
+        residual, tangent = (
+            part[rows].reshape(*channel.shape, -1)[channel.told].swapaxes(0, 1)
+            for part in (model.residual, linear.tangent)
+        )
+        weight = (channel.valid / channel.sigma[channel.told]).T
+        off = _single(residual[..., 0], tangent, weight, _ALSO if known else _OFF)
+        for f, k in zip(*np.nonzero(off), strict=True):
+            trial = Trial("one wavelength", 0.0, 0.0, bin=int(k))
+            chance = float(1 - 2 * off.size * stats.norm.sf(off[f, k]))
+            found.append(_fault(problem, (i, int(f)), trial, float(off[f, k] ** 2), chance))
+    few = max(_LEAST_MOST, _MOST * sum(c.valid.any(axis=0).sum() for c in problem.channels))
+    data = sum(c.valid.sum() for c in problem.channels)
+    places = [fault.place for fault in (*known, *found)]
+    is_many = len(set(places)) > few
+    return sorted(found, key=_order) if is_many and len(places) <= _MOST * data else []
+
+
+def _single(residual, tangent, weight, least):
+    """
+    Return by how many standard deviations data are off, (F, W), 0 where it is less than so many.
+
+    Each is left out in turn: of a frame, beside a smooth law in wavelength of its own, and of what
+    the nominal model takes up, ``tangent`` (F, W, p). ``weight`` (F, W) whitens.
+    """
+    found, n = np.zeros(residual.shape), residual.shape[1]
+    law = law_basis(np.arange(n), min(_SMOOTH, (n - 1) // 3))
+    while True:
+        kept = (weight > 0) & (found == 0)
+        kept &= np.sum(kept, axis=1, keepdims=True) > law.shape[1] + 1
+        own = np.linalg.qr(law * (weight * kept)[..., None])[0] * kept[..., None]
+        left = np.concatenate([tangent, residual[..., None]], axis=2) * kept[..., None]
+        left = left - own @ (own.swapaxes(1, 2) @ left)
+        flat = left.reshape(found.size, -1)
+        basis, size, _ = np.linalg.svd(flat[:, :-1], full_matrices=False)
+        basis = basis[:, size > _SEEN]
+        missed = (flat[:, -1] - basis @ (basis.T @ flat[:, -1])).reshape(found.shape)
+        seen = kept - np.sum(own**2, axis=2) - np.sum(basis**2, axis=1).reshape(found.shape)
+        off = np.abs(missed) / np.sqrt(np.where(seen > _SEEN, seen, np.inf))
+        spread = max(MAD_TO_SIGMA * np.median(off[kept]), _LITTLE) if kept.any() else np.inf
+        # the worst of each of the worst frames first: it makes others look bad, and the scatter
+        frames = np.flatnonzero(off.max(axis=1) > max(_ALSO * spread, _NEARLY * off.max()))
+        if not frames.size:
+            break
+        if np.count_nonzero(found) > 2 * _MOST * found.size:
+            return 0.0 * found
+        worst = off.argmax(axis=1)[frames]
+        found[frames, worst] = off[frames, worst]
+    found = np.where(found > least * spread, found / spread, 0.0)
+    found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
+    found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
+    return found
 
 
 def unknown_angles(observations, effect):

@@ -21,7 +21,7 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, preference, scan
-from astropolcal.gap.cells import Cell, count_runs
+from astropolcal.gap.cells import Cell, alike, count_runs
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
@@ -82,6 +82,10 @@ _ONE_COURSE, _AS_WELL = 0.65, 1.5
 # and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
 # right, and none of 53 to cells; of other cells one or another is there
 _BETTER_COURSE, _BETTER = 0.85, -2.8
+# and where two causes have the same course, or the same place and kind: of such answers to
+# mechanisms 2 of 16 and 2 of 10 causes given with 0.8 were right; of 458 pairs none was of the
+# first sort, and all six of the second were right
+_ALIKE_CAUSES = {"course": 0.85, "action": 0.5, "": 0.0}
 # from this probability on it is told
 _MAY_BE = 0.3
 # the same where one of several causes is not asked for in every part of the data: 23 of 52
@@ -661,7 +665,7 @@ def _unlisted(base, best, stable, instead):
     elif len(best.chosen) == 1:
         hidden = best.model.hidden_share(base)
         prior = max(prior, float(np.interp(hidden, _MAY_HIDE, _UNSEEN)))
-    prior = max(prior, instead)
+    prior = max(prior, instead, _ALIKE_CAUSES[alike([one.cell for one in best.chosen])])
     p = min(max(best.model.p_value, 1e-300), np.exp(-1))
     after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size

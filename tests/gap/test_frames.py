@@ -12,8 +12,11 @@ from astropy.table import QTable
 
 from astropolcal import instruments, optics
 from astropolcal.chain import join
-from astropolcal.gap.frames import suspect_frames, without_frames
+from astropolcal.gap.challenge import make_challenge, score_answer
+from astropolcal.gap.diagnosis import diagnose
+from astropolcal.gap.frames import single_data, suspect_frames, without_frames
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.report import to_dict
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -109,6 +112,34 @@ def test_datum_of_one_wavelength_that_was_off():
         # the others of the frame are kept
         (kept,) = without_frames([right], [fault])
         assert np.argwhere(kept.mask).tolist() == [[frame, k]]
+
+
+@pytest.mark.slow
+def test_single_data_in_many_frames_are_left_out_and_counted():
+    observations, chains, case = make_challenge(6, kind="listed", snr=40)
+    rng, planted, tables = np.random.default_rng(6), set(), []
+    for one in observations:
+        seen = one.to_table()
+        bad = rng.random(len(seen)) < 0.02
+        seen["flux_left"][bad] *= 1 + rng.choice([-0.1, 0.1], bad.sum())
+        planted |= {(one.name, *place) for place in seen["frame", "bin"][bad].iterrows()}
+        tables.append(Observations.from_table(seen, name=one.name))
+    diagnosis = diagnose(chains, tables)
+    named = {(f.dataset, f.frame, f.bin) for f in diagnosis.frames if f.what == "one wavelength"}
+    assert len(planted) > 12
+    assert len(named & planted) >= 0.9 * len(planted)
+    assert len(named - planted) < 2
+    content = to_dict(diagnosis)
+    assert f"{len(named)} data in " in content["sentences"][0]
+    assert score_answer(case, content) == "right"
+
+
+def test_noise_of_one_wavelength_is_no_single_datum():
+    seen = observed().to_table()
+    here = np.asarray(seen["bin"] == 2)
+    seen["flux_left"][here] *= 1 + 0.1 * np.random.default_rng(6).normal(size=here.sum())
+    assert single_data(data.fitted(Observations.from_table(seen, name="lamp"))) == []
+    assert single_data(data.clean_model()) == []
 
 
 def test_clean_frames_are_not_accused():

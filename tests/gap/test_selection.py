@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The choice of causes: planted cells are found, with their place and a probability."""
 
+import dataclasses
 import importlib
 import runpy
 from pathlib import Path
@@ -177,6 +178,19 @@ def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
     assert len(diagnosis.causes) == 2
     assert max(cause.probability for cause in diagnosis.causes) < 0.5
     assert score_answer(case, to_dict(diagnosis)) == "right"
+
+
+@pytest.mark.slow
+def test_two_causes_that_follow_the_same_thing_may_be_one_that_no_table_has():
+    setup = SETUPS["charis"]()
+    first = Cell("in:hwp", "diattenuation_h", "harmonic:derotator:1")
+    for dependence, least, most in (("harmonic:derotator:1", 0.0, 0.2), ("step:30", 0.9, 1.0)):
+        second = Cell("after:derotator", "rotation", dependence)
+        with_first = dataclasses.replace(setup, truth=setup.with_cell(first, 0.02, 0.01))
+        truth = with_first.with_cell(second, 0.03, 0.02)
+        found = chosen(setup, setup.observed(truth, seed=4))
+        assert len(found.groups) == 2
+        assert all(least <= group.probability <= most for group in found.groups)
 
 
 def test_the_table_of_the_rules_is_that_of_the_benchmark():
