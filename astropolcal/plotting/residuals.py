@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The data of a calibration and its model against angles, and maps of what is left between them."""
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import astropy.units as u
 import numpy as np
@@ -18,15 +18,9 @@ __all__ = ["plot_double_differences"]
 SAME_ANGLE = 0.5
 
 
-@dataclass
-class Series:
-    """Data taken with the same setting of the half-wave plate."""
-
-    label: str
-    #: Which data belong to it, indices on the second axis of the grids.
-    data: np.ndarray
-    #: Mean position (rad) of every stage in each frame of a datum, or None if one moves.
-    positions: dict | None
+# data taken with the same setting of the half-wave plate: which they are, indices on the second
+# axis of the grids, and the mean position (rad) of every stage, or None if one moves
+Series = namedtuple("Series", "label data positions")
 
 
 class DataGrid:
@@ -56,23 +50,18 @@ class DataGrid:
         self.calibrated_um = measurement.wavelength
         self.is_star = is_star(self.part.observations.source) and "altitude" in self.part.positions
         self.derotator = np.rad2deg(self.position("derotator")[0])
-
-    @property
-    def abscissa(self):
-        """What the data are drawn against, in degree, and how that is called."""
+        # what the data are drawn against, in degree, and how that is called
+        self.abscissa, self.label = self.derotator, "derotator angle (°)"
         if self.is_star:
-            return np.rad2deg(self.position("altitude").mean(axis=0)), "altitude of the star (°)"
-        return self.derotator, "derotator angle (°)"
+            self.abscissa = np.rad2deg(self.position("altitude").mean(axis=0))
+            self.label = "altitude of the star (°)"
+        # the observable in words
+        self.quantity = self.observable.name.replace("_", " ")
 
     def _grid(self, flat):
         grid = np.full(self.part.valid.shape, np.nan)
         grid[self.part.valid] = flat
         return grid
-
-    @property
-    def quantity(self):
-        """Name of the observable in words."""
-        return self.observable.name.replace("_", " ")
 
     # ---- where the stages stand -------------------------------------------------
 
@@ -234,7 +223,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
     with st.canvas(figure, 3.0 + 4.4 * columns, height) as figure:
         pairs = _panels(figure, len(bins), rows, columns)
-        fine = _fine(drawn.abscissa[0])
+        fine = _fine(drawn.abscissa)
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
@@ -245,7 +234,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
             if known:
                 bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
             for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
-                angle, points = drawn.abscissa[0][one.data], look | {"linestyle": "none"}
+                angle, points = drawn.abscissa[one.data], look | {"linestyle": "none"}
                 value, residual, sigma = (
                     a[row, one.data] for a in (drawn.observed, drawn.residual, drawn.sigma)
                 )
@@ -259,6 +248,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
                 else:
                     # where a stage moves from datum to datum there is no model between the data
                     top.plot(angle, value - residual, "x", color=look["color"], markersize=8)
+        pairs[0][0].set_xlim(fine[0], fine[-1])
         _label(pairs, drawn, columns)
         st.heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
         _legend(figure, drawn, series, bins, spread[bins])
@@ -298,14 +288,12 @@ def _fine(angle):
 
 
 def _label(pairs, grid, columns):
-    fine = _fine(grid.abscissa[0])
-    pairs[0][0].set_xlim(fine[0], fine[-1])
     for i, (top, bottom) in enumerate(pairs):
         last, first = i + columns >= len(pairs), i % columns == 0
         top.tick_params(labelbottom=False, labelleft=first)
         bottom.tick_params(labelbottom=last, labelleft=first)
         if last:
-            bottom.set_xlabel(grid.abscissa[1])
+            bottom.set_xlabel(grid.label)
         if first:
             top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
             bottom.set_ylabel(f"obs. {st.MINUS} model\n(%)")

@@ -15,7 +15,6 @@ import warnings
 import zlib
 from collections import namedtuple
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from fnmatch import fnmatchcase
 from functools import partial
@@ -258,15 +257,10 @@ class _Frame(namedtuple("_Frame", _COLUMNS[:-1])):
         return moment.strftime("%Y%m%dT%H%M%S")
 
 
-@dataclass
-class Sequence:
+class Sequence(namedtuple("Sequence", "name instrument target mode frames")):
     """Frames that are worked on together."""
 
-    name: str
-    instrument: str
-    target: str | None
-    mode: str | None
-    frames: list
+    __slots__ = ()
 
     @property
     def files(self):

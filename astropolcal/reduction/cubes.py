@@ -311,11 +311,8 @@ def simulate_cubes(
     ...     fits.getdata(paths[0], 1).shape
     (22, 201, 201)
     """
-    image, detector, files = (
-        image or ImageModel(),
-        detector or DetectorModel(),
-        files or CubeFiles(),
-    )
+    image, detector = image or ImageModel(), detector or DetectorModel()
+    files = files or CubeFiles()
     layout, wavelength, more = _of_mode(instrument, wavelength)
     # what is given goes before what the mode says
     more |= files.headers or {}
@@ -331,10 +328,8 @@ def simulate_cubes(
         flux = _usual_flux(chain, instrument, frames, 1e7, **light, **looks)
     beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
-    *seeds, of_pixels, of_star = map(
-        np.random.default_rng,
-        np.random.SeedSequence(check_seed(seed, generator=False)).spawn(n_frames + 2),
-    )
+    seeds = np.random.SeedSequence(check_seed(seed, generator=False)).spawn(n_frames + 2)
+    *seeds, of_pixels, of_star = map(np.random.default_rng, seeds)
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)
     flat, bad = detector._pixels(of_pixels, layout.shape)

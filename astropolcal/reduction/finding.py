@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Find a star in all beams of an image, and fit Gaussians to its images."""
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import numpy as np
 from astropy.stats import gaussian_fwhm_to_sigma, gaussian_sigma_to_fwhm, mad_std
@@ -17,16 +17,9 @@ _SIGNIFICANCE, _TOLERANCE = 6.0, 4.0
 _ROUNDING = 1e-12
 
 
-@dataclass(frozen=True)
-class Found:
-    """A star's images in all beams."""
-
-    # (x, y) of each image, (n_beams, 2); zeros if there is none
-    positions: np.ndarray
-    # diameter of the area above half of the maximum, pixels
-    fwhm: float
-    # why there is no unambiguous star; empty if there is
-    reason: str = ""
+# a star's images in all beams: (x, y) of each, (n_beams, 2), zeros if there is none; the diameter
+# of the area above half of the maximum, pixels; why there is no unambiguous star, empty if there is
+Found = namedtuple("Found", "positions fwhm reason")
 
 
 def find_star(image, good, places, *, fwhm=4.0, companion=0.1):
@@ -116,20 +109,18 @@ _DAMPING = (1e-3, 1e-9, 1e9)
 _MOST_STEPS, _SMALL = 40, 1e-5
 
 
-@dataclass(frozen=True)
-class GaussianFits:
-    """What `fit_gaussians` found, one value an image; pixels of the image."""
+class GaussianFits(
+    namedtuple("GaussianFits", "amplitude x y background fwhm elongation converged shape")
+):
+    """
+    What `fit_gaussians` found, one value an image; pixels of the image.
 
-    amplitude: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    background: np.ndarray
-    # geometric mean of the full widths along the two axes, and long axis over short one
-    fwhm: np.ndarray
-    elongation: np.ndarray
-    converged: np.ndarray
-    # elements xx, xy, yy of the inverse covariance matrix, (K, 3)
-    shape: np.ndarray
+    ``fwhm`` is the geometric mean of the full widths along the two axes, ``elongation`` the long
+    axis over the short one; ``shape`` are the elements xx, xy, yy of the inverse covariance matrix,
+    (K, 3).
+    """
+
+    __slots__ = ()
 
     def image(self, k, x, y):
         """Return Gaussian and constant of fit ``k`` at pixels ``x`` and ``y``."""

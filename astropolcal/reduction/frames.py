@@ -4,8 +4,9 @@
 import hashlib
 import re
 import warnings
+from collections import namedtuple
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -424,20 +425,9 @@ def beam_detectors(path, layout, values, unit=None):
 # ---- science frames, before their light is measured ---------------------------------------------
 
 
-@dataclass
-class Night:
-    """What the headers tell: date (or None) of each frame, and mode and optics of all."""
-
-    moments: dict
-    mode: str | None = None
-    beam: dict = field(default_factory=dict)
-
-    @property
-    def dates(self):
-        """Dates of the first and the last frame."""
-        # ISO dates sort as text; a calibration that holds at both ends holds between them
-        known = sorted(date for date in self.moments.values() if date)
-        return list(dict.fromkeys((known[0], known[-1]))) if known else []
+# what the headers tell: date (or None) of each frame, dates of the first and the last, and mode and
+# optics of all
+Night = namedtuple("Night", "moments dates mode beam")
 
 
 def read_night(files, instrument):
@@ -462,8 +452,12 @@ def read_night(files, instrument):
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
+    # ISO dates sort as text; a calibration that holds at both ends holds between them
+    known = sorted(filter(None, moments.values()))
     beam = told_beam([primary_header(file) for file in files], instrument, files)
-    return Night(moments, next(iter(modes), None), beam)
+    return Night(
+        moments, list(dict.fromkeys(known[:1] + known[-1:])), next(iter(modes), None), beam
+    )
 
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):

@@ -9,7 +9,7 @@ aperture is three full widths in radius but at most 45 pixels, and the median
 of a ring of 5 pixels around it is the background.
 """
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import numpy as np
 from astropy.nddata import Cutout2D
@@ -62,7 +62,14 @@ def measure_stars(
     around them have beyond it. The options are described in `reduce_run`.
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked)
-    _check_correction(aperture_correction, layout)
+    check_choice(
+        "aperture_correction", aperture_correction, (False, True, "growth"), ParameterError
+    )
+    if aperture_correction is True and not layout.two_beams:
+        raise ParameterError(
+            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
+            "the wings is that of two beams, allowed are False and 'growth'"
+        )
     result = Photometry.empty(len(cube), len(layout.beams))
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
@@ -86,7 +93,7 @@ def measure_stars(
     # what the noise of the background adds to the variance of a flux
     level_variance = np.zeros_like(result.flux)
     for k in np.flatnonzero(~result.failed):
-        found = run.measured(result, k, result.radius[0, k])
+        found = _measured(run, result, k, result.radius[0, k])
         if isinstance(found, str):
             result.flag(np.arange(len(cube)) == k, found)
         else:
@@ -121,15 +128,6 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
-
-
-def _check_correction(correction, layout):
-    check_choice("aperture_correction", correction, (False, True, "growth"), ParameterError)
-    if correction is True and not layout.two_beams:
-        raise ParameterError(
-            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
-            "the wings is that of two beams, allowed are False and 'growth'"
-        )
 
 
 def _mean(cube, good):
@@ -255,25 +253,16 @@ def growth_radius(image, places, largest, fraction=0.99):
     return float(np.interp(fraction, curve[around], radii[around]))
 
 
-@dataclass(frozen=True)
-class _Cube:
-    """A cube, its fits, and what all its apertures have in common."""
+# a cube, its fits, and what all its apertures have in common
+_Cube = namedtuple("_Cube", "cube good fits origin detector edge annulus max_masked")
 
-    cube: np.ndarray
-    good: np.ndarray
-    fits: object
-    origin: np.ndarray
-    detector: object
-    edge: float
-    annulus: float
-    max_masked: float
 
-    def measured(self, result, k, radius):
-        """Return what `_aperture` does of each beam in a slice, (4, n_beams), or why it cannot."""
-        places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
-        found = [_aperture(self, k, beam, places, radius) for beam in range(len(places))]
-        wrong = [one for one in found if isinstance(one, str)]
-        return wrong[0] if wrong else np.transpose(found)
+def _measured(cube, result, k, radius):
+    """Return what `_aperture` does of each beam in a slice, (4, n_beams), or why it cannot."""
+    places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
+    found = [_aperture(cube, k, beam, places, radius) for beam in range(len(places))]
+    wrong = [one for one in found if isinstance(one, str)]
+    return wrong[0] if wrong else np.transpose(found)
 
 
 def _aperture(cube, k, beam, places, radius):
@@ -348,7 +337,7 @@ def _growth_shares(result, cube, reach):
     """Return which part of the flux in wider circles both beams together have, and its noise."""
     share, spread = np.full((2, len(result.reasons)), np.nan)
     for k in np.flatnonzero(~result.failed):
-        wide = cube.measured(result, k, reach)
+        wide = _measured(cube, result, k, reach)
         if isinstance(wide, str):
             continue
         total = wide[0].sum()

@@ -12,7 +12,7 @@ Moffat 1969, A&A 3, 455: the profile. Its exponent is 11/6 in the wings of a
 seeing-limited image (Racine 1996, PASP 108, 699).
 """
 
-from dataclasses import dataclass
+from collections import namedtuple
 from functools import cached_property
 
 import numpy as np
@@ -59,8 +59,8 @@ def wing_shares(cube, good, photometry, level_variance, detector, layout, *, rea
     """
     if photometry.failed.all():
         return None
-    star = Star.of(cube, good, photometry, level_variance, layout)
-    if star.unlit_part > _UNLIT or (rings := Rings.of(star, reach * _TO)) is None:
+    star = Star(cube, good, photometry, level_variance, layout)
+    if star.unlit_part > _UNLIT or (rings := rings_of(star, reach * _TO)) is None:
         return None
     seeing = min(_SEEING / layout.pixel_scale, reach)
     return _fit(star, rings, detector, seeing / _HALO_WIDTH)
@@ -242,70 +242,40 @@ _FROM = 1.2
 _FEWEST_PIXELS, _FEWEST_RINGS = 10, 8
 
 
-@dataclass(frozen=True)
 class Star:
-    """
-    The slices of a star that can be used, and what was measured in them.
+    """The slices of a star that have not failed, and what was measured in them."""
 
-    ``lit`` are the pixels of each beam, ``stopped`` says that a stop hides the light of the other
-    one there.
-    """
+    def __init__(self, cube, good, photometry, level_variance, layout):
+        self.usable = usable = np.flatnonzero(~photometry.failed)
+        self.cube, self.good, self.photometry = cube, good, photometry
+        self.level_variance = level_variance[:, usable]
+        # whether a stop hides the light of the other image, and the lit pixels of each beam
+        self.stopped = len(layout.internal_apertures) == 5
+        # both images (beam, x or y, K), their fluxes (2, K), and the radii of the apertures (K,)
+        self.places = np.stack([photometry.x, photometry.y], axis=1)[..., usable]
+        self.flux, self.radius = photometry.flux[:, usable], photometry.radius[0, usable]
+        # number of the slice, from -1 to 1
+        n = len(usable)
+        self.x = np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
+        # of the Gaussians of both beams, which see one atmosphere, smooth over the slices, (K,)
+        width = photometry.fwhm[:, usable].mean(axis=0)
+        self.width = legval(self.x, legfit(self.x, width, min(2, n - 1)))
+        self.lit = self._lit(layout)
 
-    cube: np.ndarray
-    good: np.ndarray
-    photometry: object
-    level_variance: np.ndarray
-    usable: np.ndarray
-    lit: np.ndarray
-    stopped: bool
-
-    @classmethod
-    def of(cls, cube, good, photometry, level_variance, layout):
-        """Return the slices that have not failed."""
-        usable = np.flatnonzero(~photometry.failed)
-        shape, stopped = cube.shape[1:], len(layout.internal_apertures) == 5
-        # one map for all slices
-        if stopped:
-            lit = np.zeros((2, *shape), dtype=bool)
-            beams = rectangles(layout.internal_apertures, shape)
-            for own, (rows, columns, weights) in zip(lit, beams, strict=True):
-                # pixels wholly inside; those on the edge are dark in part
-                own[rows, columns] = weights > 0.999
-        else:
+    def _lit(self, layout):
+        """Return the pixels in which each beam is seen, one map for all slices."""
+        shape = self.cube.shape[1:]
+        if not self.stopped:
             rows, columns = np.ogrid[: shape[0], : shape[1]]
-            middle = [a[:, usable].mean(axis=1) for a in (photometry.x, photometry.y)]
             # without a stop a pixel belongs to the image whose mean place is nearer
-            right, left = (np.hypot(columns - x, rows - y) for x, y in zip(*middle, strict=True))
-            lit = np.stack([right < left, left < right])
-        return cls(cube, good, photometry, level_variance[:, usable], usable, lit, stopped)
-
-    @cached_property
-    def x(self):
-        """Number of the slice, from -1 to 1."""
-        n = len(self.usable)
-        return np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
-
-    @cached_property
-    def flux(self):
-        """Of both beams, (2, K)."""
-        return self.photometry.flux[:, self.usable]
-
-    @cached_property
-    def radius(self):
-        """Of the apertures, (K,)."""
-        return self.photometry.radius[0, self.usable]
-
-    @cached_property
-    def width(self):
-        """Of the Gaussians, smooth over the slices, (K,)."""
-        # of both beams, which see one atmosphere
-        width = self.photometry.fwhm[:, self.usable].mean(axis=0)
-        return legval(self.x, legfit(self.x, width, min(2, len(width) - 1)))
-
-    @cached_property
-    def places(self):
-        """Of both images, (beam, x or y, K)."""
-        return np.stack([self.photometry.x, self.photometry.y], axis=1)[..., self.usable]
+            right, left = (np.hypot(columns - x, rows - y) for x, y in self.places.mean(axis=2))
+            return np.stack([right < left, left < right])
+        lit = np.zeros((2, *shape), dtype=bool)
+        beams = rectangles(layout.internal_apertures, shape)
+        for own, (rows, columns, weights) in zip(lit, beams, strict=True):
+            # pixels wholly inside; those on the edge are dark in part
+            own[rows, columns] = weights > 0.999
+        return lit
 
     @cached_property
     def unlit(self):
@@ -347,40 +317,31 @@ class Star:
         return max(parts, default=0.0)
 
 
-@dataclass(frozen=True)
-class Rings:
-    """
-    Mean values in rings of a pixel's width, and their pixels; (beam, slice, ring).
+# mean values in rings of a pixel's width, and their pixels; (beam, slice, ring)
+# distances from the own and the other image are mean less and plus standard deviation (first
+# axis): the mean of a smooth profile over a ring is that of its values at both
+Rings = namedtuple("Rings", "values counts own other")
 
-    Distances from the own and the other image are mean less and plus standard deviation (first
-    axis): the mean of a smooth profile over a ring is that of its values at both.
-    """
 
-    values: np.ndarray
-    counts: np.ndarray
-    own: np.ndarray
-    other: np.ndarray | None
-
-    @classmethod
-    def of(cls, star, outer):
-        """Return the rings that are seen in all slices; None if there are too few."""
-        # from the innermost place at which all slices are in their wings
-        edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
-        if len(edges) <= _FEWEST_RINGS:
-            return None
-        found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
-        # one set of rings for all slices and beams, or the profile could not be common
-        full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
-        if full.sum() < _FEWEST_RINGS:
-            return None
-        # (quantity, beam, slice, ring)
-        counts, values, *moments = found[..., full]
-        points = []
-        for mean, square in zip(moments[::2], moments[1::2], strict=True):
-            # rounding may leave a variance below zero
-            spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-            points.append(np.stack([mean - spread, mean + spread]))
-        return cls(values, counts, points[0], None if star.stopped else points[1])
+def rings_of(star, outer):
+    """Return the rings that are seen in all slices; None if there are too few."""
+    # from the innermost place at which all slices are in their wings
+    edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
+    if len(edges) <= _FEWEST_RINGS:
+        return None
+    found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
+    # one set of rings for all slices and beams, or the profile could not be common
+    full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
+    if full.sum() < _FEWEST_RINGS:
+        return None
+    # (quantity, beam, slice, ring)
+    counts, values, *moments = found[..., full]
+    points = []
+    for mean, square in zip(moments[::2], moments[1::2], strict=True):
+        # rounding may leave a variance below zero
+        spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+        points.append(np.stack([mean - spread, mean + spread]))
+    return Rings(values, counts, points[0], None if star.stopped else points[1])
 
 
 def _means(star, beam, edges):

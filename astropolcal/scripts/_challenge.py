@@ -49,7 +49,7 @@ folders FOLDER *  of the cases, and of the answers
 
 
 TYPES = {
-    "range": common.numbers_type("of the form LOW:HIGH", 2, ":"),
+    "range": common.text_type("of the form LOW:HIGH", common.numbers, 2, ":"),
     "kinds": lambda text: text.split(","),
 }
 

@@ -35,7 +35,7 @@ name NAME ?  a star, such as 'HD 293396'
 --plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
 """
-TYPES = {"pair": common.numbers_type("2 numbers with a comma between them", 2)}
+TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.numbers, 2)}
 # R, J, H and K, for what a calibration assumes of a star
 _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 # more stars than this make a figure unreadable
@@ -171,20 +171,13 @@ def _pair(value, form, error=math.nan):
 
 
 def _many(arguments):
-    site = None if arguments.site is None else _site(arguments.site)
-    radius = 15.0 if arguments.radius is None else arguments.radius
-    near = {}
+    wanted = {key: getattr(arguments, key) for key in ("kind", "band", "magnitude", "night")}
+    wanted["site"] = None if arguments.site is None else _site(arguments.site)
     if arguments.near:
-        near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
-    found = standards.search(
-        **near,
-        kind=arguments.kind,
-        band=arguments.band,
-        magnitude=arguments.magnitude,
-        site=site,
-        night=arguments.night,
-        min_altitude=arguments.min_altitude * u.deg,
-    )
+        radius = 15.0 if arguments.radius is None else arguments.radius
+        wanted["center"] = common.sky_position(arguments.near, "--near")
+        wanted["radius"] = radius * u.deg
+    found = standards.search(**wanted, min_altitude=arguments.min_altitude * u.deg)
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")
