@@ -26,11 +26,7 @@ _CURVES = {
 }
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
-_NOT_KNOWN = "{}: not known (too few data or groups)"
 _PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
-_STANDARD_MARKERS = ("D", "v", "P", "X")
-_STANDARD_STYLES = ("-", "--", ":", "-.")
-_DASHES = ("--", ":", "-.")
 
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
@@ -124,7 +120,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
             label = _label(key, values, calibration)
             st.draw_line(axes, lam, values, color=color, marker=marker, label=label)
     own = [[e for e in standards if e["source"] == record.source] for record in records]
-    looks = zip(cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False)
+    looks = zip(cycle("DvPX"), cycle(("-", "--", ":", "-.")), strict=False)
     looks = {id(entry): look for entry, look in zip(standards, looks, strict=False)}
     for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
         for entry in entries:
@@ -137,13 +133,15 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         look = {"color": st.GREEN, "alpha": 0.6, "label": _COMPARED}
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
-        for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
+        for (label, (lam, value)), line in zip(
+            curves.items(), cycle(("--", ":", "-.")), strict=False
+        ):
             st.draw_line(axes, lam, value, color=st.BLACK, linestyle=line, label=label)
 
 
 def _label(key, values, calibration):
     label = _CURVES[key][2].format(what_is_left_out(calibration))
-    return label if np.isfinite(values).any() else _NOT_KNOWN.format(key)
+    return label if np.isfinite(values).any() else f"{key}: not known (too few data or groups)"
 
 
 def _reference(label, pair):

@@ -14,9 +14,7 @@ __doctest_requires__ = {"plot_corner": ["corner"]}
 # more panels than this cannot be read
 MAX_CORNER = 12
 MAX_TRACES = 16
-# points of a walker in a trace, and of all walkers, which become a solid band far earlier
-_DRAWN_STEPS, _DRAWN_POINTS = 2000, 50_000
-_INCH = 2.1
+
 # behind words that stand on data
 _PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 _MARGIN = 1.35
@@ -75,7 +73,7 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         raise ParameterError(f"no corner plot: {', '.join(stuck)} did not move")
     labels, shifts = _labels(posterior, columns, samples)
     marks = posterior.fitted[columns] if fitted and posterior.fitted is not None else None
-    size = 1.2 + _INCH * len(columns)
+    size = 1.2 + 2.1 * len(columns)
     # corner sets margins of its own, which a layout engine would undo
     with canvas(figure, size, size, layout=None) as figure:
         corner.corner(
@@ -219,8 +217,8 @@ def plot_traces(posterior, parameters=None, *, figure=None):
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
             chain, steps = posterior.chain[:, :, column], posterior.steps
-            # the larger of both strides keeps either limit
-            every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
+            # so many points of a walker, and of all walkers, which become a solid band far earlier
+            every = max(len(chain) // 2000, chain.size // 50_000, 1)
             trace.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
             middle = np.median(chain[::every], axis=1)
             trace.plot(steps[::every], middle, color=BLACK, linewidth=1.0)

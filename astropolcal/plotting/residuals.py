@@ -89,9 +89,8 @@ class DataGrid:
             still = now and len(set(angles)) == 1
             label = angles[0] if still else f" {st.MINUS} ".join(angles)
             moving = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
-            positions = {stage: a.mean(axis=1) for stage, a in moving.items()}
-            if any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values()):
-                positions = None
+            moves = any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values())
+            positions = None if moves else {s: a.mean(axis=1) for s, a in moving.items()}
             label = f"{label}, {now}" if now else label
             found.append(Series(label, np.flatnonzero(member), positions))
         return found
@@ -159,9 +158,6 @@ class DataGrid:
 
 
 # ---- observed and modelled differences ------------------------------------------------------
-_PANELS = 4
-# so many that a curve over 180 deg has no corners
-_CURVE_POINTS = 241
 
 
 def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=None):
@@ -215,7 +211,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     4
     """
     drawn = DataGrid(calibration, dataset)
-    bins = drawn.spread_bins(_PANELS) if wavelengths is None else drawn.nearest_bins(wavelengths)
+    bins = drawn.spread_bins(4) if wavelengths is None else drawn.nearest_bins(wavelengths)
     series = drawn.series()
     columns = min(2, len(bins))
     rows = -(-len(bins) // columns)
@@ -223,7 +219,11 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
     with st.canvas(figure, 3.0 + 4.4 * columns, height) as figure:
         pairs = _panels(figure, len(bins), rows, columns)
-        fine = _fine(drawn.abscissa)
+        # the curve goes a little beyond the data, ten degrees around a single angle
+        low, high = drawn.abscissa.min(), drawn.abscissa.max()
+        margin = 0.04 * (high - low) if high - low > 1 else 10
+        # so many points that a curve over 180 deg has no corners
+        fine = np.linspace(low - margin, high + margin, 241)
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
@@ -279,14 +279,6 @@ def _looks(count):
     ]
 
 
-def _fine(angle):
-    """Return angles for the curve: a little beyond the data, ten degrees around a single one."""
-    low, high = angle.min(), angle.max()
-    # a single angle would give a curve without a length
-    margin = 0.04 * (high - low) if high - low > 1 else 10
-    return np.linspace(low - margin, high + margin, _CURVE_POINTS)
-
-
 def _label(pairs, grid, columns):
     for i, (top, bottom) in enumerate(pairs):
         last, first = i + columns >= len(pairs), i % columns == 0
@@ -330,8 +322,6 @@ def _legend(figure, grid, series, bins, s_res):
 # ---- maps of the residuals -------------------------------------------------------------------
 # share of the residuals that the colour scale covers, so that one outlier does not blank the map
 _COVERED = 99
-# maps have one scale unless those of their own differ by more than this factor
-_ONE_SCALE = 3
 # room above the tallest bar
 _HEADROOM = 1.05
 
@@ -377,7 +367,8 @@ def _scales(grids):
     residuals = [100 * grid.residual.ravel() for grid in grids]
     own = [st.color_limit(one, _COVERED) for one in residuals]
     ends = [limit for limit, _ in own]
-    if max(ends) > _ONE_SCALE * min(ends):
+    # maps have one scale unless those of their own differ by more than this factor
+    if max(ends) > 3 * min(ends):
         return own, False
     return [st.color_limit(np.concatenate(residuals), _COVERED)] * len(grids), True
 

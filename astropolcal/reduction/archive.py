@@ -47,8 +47,6 @@ _COLUMNS = (
 # headers that are read at a time by one process
 _BATCH = 64
 _DAY = 86400.0
-# degree; two commanded angles that differ by less are one
-_SAME_ANGLE = 0.3
 
 
 # ---- the index -----------------------------------------------------------------------------------
@@ -280,7 +278,8 @@ def _cut(frames, gap, cycles):
         # of which night a frame without a time is, nobody knows
         late = end is not None and (frame.mjd is None or frame.mjd - end > gap)
         known = frame.hwp is not None
-        same = [known and abs(_half_turn(frame.hwp - other)) < _SAME_ANGLE for other in seen]
+        # degree; two commanded angles that differ by less are one
+        same = [known and abs(_half_turn(frame.hwp - other)) < 0.3 for other in seen]
         if any(same[:-1]):
             # an angle that was there before the last one begins another cycle
             count, seen, same = count + 1, [], []

@@ -43,8 +43,6 @@ from astropolcal.words import listed
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
-# days that start, middle and end of an exposure may be apart
-_RAW_APART = 1 / 24
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 # in which the times and the places of targets are understood
@@ -177,8 +175,8 @@ def _raw_header(frame, paths, header, layout):
         with suppress(ObservationError):
             told = {key: look_up([one], key, layout)[1] for key in ("mjd", "date", "time")}
             times.append(observation_time(told))
-    # numbers begin again, in other nights
-    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > _RAW_APART:
+    # numbers begin again, in other nights; start, middle and end may be an hour apart
+    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > 1 / 24:
         ours, theirs = (time.isot for time in times)
         raise ObservationError(f"{names[0]} of the same number is of {theirs}, the cube of {ours}")
     return found
@@ -380,9 +378,6 @@ def _misfits(block, steps, sequence, uneven):
 
 # ---- files of several cameras --------------------------------------------------------------------
 
-# seconds; cameras may start as far apart in exposures shorter than twice that
-_APART = 1.0
-
 
 def sort_beams(files, layout):
     """
@@ -404,7 +399,8 @@ def sort_beams(files, layout):
         for path, (start, length) in groups.get((right, state), {}).items():
             apart = {other: abs(start - begin) for other, (begin, _) in lefts.items()}
             near = min(apart, key=apart.get, default=None)
-            if near is not None and apart[near] <= max(length / 2, _APART):
+            # seconds; cameras may start as far apart in exposures shorter than twice that
+            if near is not None and apart[near] <= max(length / 2, 1.0):
                 partners[path] = near
                 del lefts[near]
     for (camera, state), group in groups.items():

@@ -35,8 +35,6 @@ from astropolcal.words import check_choice, counted
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
-# below this number of files a process, its start costs more than it saves
-_FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
@@ -399,7 +397,8 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
     if workers is None:
-        workers = max(1, min(os.cpu_count() or 1, len(todo) // _FILES_A_WORKER))
+        # below this number of files a process, its start costs more than it saves
+        workers = max(1, min(os.cpu_count() or 1, len(todo) // 100))
     if not (isinstance(workers, int) and workers >= 1):
         raise ParameterError(f"workers = {workers!r}; a whole number above zero is needed")
     results = _results(todo, task, min(workers, max(len(todo), 1)), cluster)

@@ -17,7 +17,6 @@ from astropolcal.units import plain_number
 __all__ = ["read_pypolcal"]
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
-_GEOMETRY = {"x": "pix", "y": "pix", "fwhm": "pix", "radius": "pix"}
 
 
 def reduced_table(frames, instrument, meta):
@@ -100,7 +99,8 @@ def photometry_table(frames, instrument):
     if not frames:
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
-    for name, unit in (_GEOMETRY | {"background": frames[0].unit}).items():
+    units = dict.fromkeys(("x", "y", "fwhm", "radius"), "pix") | {"background": frames[0].unit}
+    for name, unit in units.items():
         for beam, values in zip(instrument.files.beams, _stack(frames, name), strict=True):
             table[f"{name}_{beam}"] = _column(values, failed, u.Unit(unit))
     for name in ("scale", "scale_err"):

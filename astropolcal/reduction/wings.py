@@ -27,12 +27,7 @@ __all__ = []
 HALO_BETA = 11 / 6
 # full width of the halo: that of the seeing, milliarcsecond, and its relative uncertainty
 _SEEING, _SEEING_SPREAD = 500.0, 0.35
-# full width at half maximum over alpha
-_HALO_WIDTH = 2 * np.sqrt(2 ** (1 / HALO_BETA) - 1)
-# rings up to this multiple of the given radius
-_TO = 1.5
-# part of an aperture that may lie outside of the lit field
-_UNLIT = 0.2
+
 # ln of core width over Gaussian width, 1 / exponent, ln of halo radius, slope of the first
 _START = np.array([np.log(0.6), 0.3, 0.0, 0.0])
 _LOW, _HIGH = np.array([-2.0, 1e-3, -1.2, -0.5]), np.array([1.0, 0.7, 1.2, 0.5])
@@ -60,10 +55,12 @@ def wing_shares(cube, good, photometry, level_variance, detector, layout, *, rea
     if photometry.failed.all():
         return None
     star = Star(cube, good, photometry, level_variance, layout)
-    if star.unlit_part > _UNLIT or (rings := rings_of(star, reach * _TO)) is None:
+    # part of an aperture that may lie outside of the lit field
+    if star.unlit_part > 0.2 or (rings := rings_of(star, reach * 1.5)) is None:
         return None
-    seeing = min(_SEEING / layout.pixel_scale, reach)
-    return _fit(star, rings, detector, seeing / _HALO_WIDTH)
+    # divided by full width at half maximum over alpha
+    halo = min(_SEEING / layout.pixel_scale, reach) / (2 * np.sqrt(2 ** (1 / HALO_BETA) - 1))
+    return _fit(star, rings, detector, halo)
 
 
 # --- profile ---------------------------------------------------------------------
@@ -237,8 +234,6 @@ def _shares(profile, found, covariance):
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
 
-# rings from this many full widths on; further in the profile need not be a Moffat
-_FROM = 1.2
 _FEWEST_PIXELS, _FEWEST_RINGS = 10, 8
 
 
@@ -260,22 +255,18 @@ class Star:
         # of the Gaussians of both beams, which see one atmosphere, smooth over the slices, (K,)
         width = photometry.fwhm[:, usable].mean(axis=0)
         self.width = legval(self.x, legfit(self.x, width, min(2, n - 1)))
-        self.lit = self._lit(layout)
-
-    def _lit(self, layout):
-        """Return the pixels in which each beam is seen, one map for all slices."""
-        shape = self.cube.shape[1:]
-        if not self.stopped:
+        # one map of the lit pixels for all slices
+        self.lit, shape = np.zeros((2, *cube.shape[1:]), dtype=bool), cube.shape[1:]
+        if self.stopped:
+            beams = rectangles(layout.internal_apertures, shape)
+            for own, (rows, columns, weights) in zip(self.lit, beams, strict=True):
+                # pixels wholly inside; those on the edge are dark in part
+                own[rows, columns] = weights > 0.999
+        else:
             rows, columns = np.ogrid[: shape[0], : shape[1]]
             # without a stop a pixel belongs to the image whose mean place is nearer
             right, left = (np.hypot(columns - x, rows - y) for x, y in self.places.mean(axis=2))
-            return np.stack([right < left, left < right])
-        lit = np.zeros((2, *shape), dtype=bool)
-        beams = rectangles(layout.internal_apertures, shape)
-        for own, (rows, columns, weights) in zip(lit, beams, strict=True):
-            # pixels wholly inside; those on the edge are dark in part
-            own[rows, columns] = weights > 0.999
-        return lit
+            self.lit = np.stack([right < left, left < right])
 
     @cached_property
     def unlit(self):
@@ -325,8 +316,9 @@ Rings = namedtuple("Rings", "values counts own other")
 
 def rings_of(star, outer):
     """Return the rings that are seen in all slices; None if there are too few."""
-    # from the innermost place at which all slices are in their wings
-    edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
+    # from the innermost place at which all slices are in their wings, beyond 1.2 full widths:
+    # further in the profile need not be a Moffat
+    edges = np.arange(np.floor(np.minimum(1.2 * star.width, star.radius).max()), outer + 1)
     if len(edges) <= _FEWEST_RINGS:
         return None
     found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)

@@ -15,8 +15,6 @@ from astropolcal.observations.observables import get_observable
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 
-# so that a first call without any data shows what comes out
-_EXAMPLE = Path(__file__).parents[1] / "data" / "charis_example.ecsv"
 HELP = "fit an instrument's chain of optics to observation tables"
 DESCRIPTION = """\
 Fit an instrument's chain of optics to observation tables. Without files,
@@ -93,7 +91,8 @@ def run(arguments):
     targets = [_target(text) for text in arguments.target] or TARGETS
     files = arguments.files
     if not files:
-        files = [_EXAMPLE]
+        # so that a first call without any data shows what comes out
+        files = [Path(__file__).parents[1] / "data" / "charis_example.ecsv"]
         words = "No files given: this is the packaged example, a simulated run\n"
         common.say(arguments, words)
     datasets = common.read_datasets(files)

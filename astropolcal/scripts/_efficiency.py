@@ -25,11 +25,7 @@ from astropolcal.scripts import _common as common
 from astropolcal.units import iso_date
 from astropolcal.words import counted
 
-# what is printed as more than 1
-_ABOVE_ONE = 1.0005
 _TITLE = "Polarimetric efficiency of {}"
-# from which efficiency on V is solved for, too
-_MODULATED = 0.1
 HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
 DESCRIPTION = """\
 Share of the linear polarization that an observation measures, over
@@ -135,7 +131,7 @@ def _any_modulation(arguments, instrument, chain, grid, settings):
     found = demodulation(chain, grid, frames, components="IQU")
     with suppress(ParameterError):
         whole = demodulation(chain, grid, frames)
-        found = whole if whole.efficiency[:, 3].min() > _MODULATED else found
+        found = whole if whole.efficiency[:, 3].min() > 0.1 else found
     rows = _rows(arguments.wavelength, grid)
     content = {"instrument": instrument.name, "n_frames": len(frames)}
     content |= {f"{key}_deg": angle.value for key, angle in pointing.items()}
@@ -188,7 +184,8 @@ def _table(arguments, instrument, chain, grid):
         corner, names = "derotator", [f"{angle:8.2f} " for angle in derotator]
     title = f"{_TITLE.format(instrument.name)} {where.format_map(content)}"
     lines = _table_lines(title, corner, names, content)
-    if np.max(values) >= _ABOVE_ONE:
+    # what is printed as more than 1
+    if np.max(values) >= 1.0005:
         lines.append("Above 1: optics before the analyzer add polarization of their own.")
     return content, lines
 

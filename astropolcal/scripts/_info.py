@@ -83,16 +83,10 @@ def _wrapped(lines, content, indent=4):
 
 
 def _installation():
-    content = {
-        "astropolcal": version,
-        "instruments": instruments.names(),
-        "optics": sorted(OPTICS),
-        "observables": sorted(OBSERVABLES),
-    }
-    lines = [f"astropolcal {version}"]
-    for key in ("instruments", "optics", "observables"):
-        lines.append(common.wrapped(f"  {key + ':':<13}{', '.join(content[key])}", indent=15))
-    return lines, content
+    known = {"instruments": instruments.names(), "optics": sorted(OPTICS)}
+    known["observables"] = sorted(OBSERVABLES)
+    lines = [f"  {key + ':':<13}{', '.join(names)}" for key, names in known.items()]
+    return _wrapped([f"astropolcal {version}", *lines], {"astropolcal": version} | known, 15)
 
 
 def _calibration(path, arguments):

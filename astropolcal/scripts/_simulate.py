@@ -15,8 +15,6 @@ from astropolcal.words import counted
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
-# double differences of Q, then of U: the order in which stars are observed
-_STAR_CYCLE = [0, 45, 22.5, 67.5]
 
 HELP = "simulate an observation table or image cubes, with photon and read noise"
 DESCRIPTION = """\
@@ -143,7 +141,8 @@ def _frames(arguments, chain):
     from astropolcal.reduction.cubes import both_states
 
     star = arguments.source == "star"
-    hwp = arguments.hwp or (_STAR_CYCLE if star else None)
+    # double differences of Q, then of U: the order in which stars are observed
+    hwp = arguments.hwp or ([0, 45, 22.5, 67.5] if star else None)
     given = {"derotator": arguments.derotator or _DEROTATOR} | ({"hwp": hwp} if hwp else {})
     frames = half_wave_plate_cycles(**{k: v * u.deg for k, v in given.items()})
     for name in ("altitude", "parallactic"):

@@ -23,7 +23,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction import images as _images
+from astropolcal.reduction import cubes as _images
 from astropolcal.reduction.cubes import (
     CubeFiles,
     DetectorModel,

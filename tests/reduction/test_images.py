@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.cubes import ImageModel, simulate_cubes
-from astropolcal.reduction.images import Scene, expose, gaussian, moffat, rectangle
+from astropolcal.reduction.cubes import (
+    ImageModel,
+    Scene,
+    expose,
+    gaussian,
+    moffat,
+    rectangle,
+    simulate_cubes,
+)
 from astropolcal.simulation import half_wave_plate_cycles
 
 # two upright rectangles of 20 x 16 pixels, side by side

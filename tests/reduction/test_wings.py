@@ -12,9 +12,9 @@ from scipy.integrate import quad
 
 from astropolcal.instruments import CHARIS
 from astropolcal.instruments.layout import ReadOut
-from astropolcal.reduction import images
+from astropolcal.reduction import cubes
 from astropolcal.reduction import wings as module
-from astropolcal.reduction.images import Scene
+from astropolcal.reduction.cubes import Scene
 from astropolcal.reduction.photometry import Photometry, detector_of
 from astropolcal.reduction.stars import measure_stars
 from astropolcal.reduction.wings import wing_shares
@@ -50,7 +50,7 @@ def exposure(stage, seed, *, noise=True, flux=5e5, background=5.0):
     true = flux / 2 * np.linspace(1.2, 0.8, n) * np.array([[1.01], [0.99]])
     place = stage.centre + rng.standard_normal(2)
     light = stage.light(true, place, np.exp(0.05 * rng.standard_normal()))
-    return images.expose(light + background, detector, 1.0, rng if noise else None)[0], true
+    return cubes.expose(light + background, detector, 1.0, rng if noise else None)[0], true
 
 
 def pulls_of(profile, seeds, **options):
