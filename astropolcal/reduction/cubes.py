@@ -50,7 +50,7 @@ __all__ = [
     "true_observations",
 ]
 
-_SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
+_SOURCES = ("internal", "star")
 
 
 @dataclass(frozen=True)
@@ -96,20 +96,6 @@ class ImageModel:
     motion: object = 0.0
     seeing: float = 0.0
     margin: float = 6.0
-
-    def _scene(self, layout, source, n_wavelengths):
-        """Return what falls on the detector, of numbers that have been checked."""
-        check_choice("psf", self.psf, _PROFILES, ParameterError)
-        return Scene(
-            layout,
-            source=source,
-            psf=self.psf,
-            fwhm=pixels("fwhm", self.fwhm, layout, n_wavelengths),
-            beta=number("beta", self.beta, above=1.0),
-            halo=number("halo", self.halo, most=1.0),
-            halo_fwhm=pixels("halo_fwhm", self.halo_fwhm, layout, n_wavelengths),
-            margin=number("margin", self.margin),
-        )
 
     def _places(self, rng, scene, layout, n_frames):
         """Return the place of the star and the factor of its width, in each frame."""
@@ -321,7 +307,7 @@ def simulate_cubes(
     check_choice("source", source, _SOURCES, ParameterError)
     frames = _with_headers(frames, layout, source, files.exposure_time, files.start)
     n_frames = len(frames)
-    scene = image._scene(layout, source, len(wavelength))
+    scene = Scene(image, layout, source, len(wavelength))
     ways = _read_outs(frames, layout)
     read = [detector._read_by(way, len(wavelength)) for way in ways]
     light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
@@ -364,7 +350,7 @@ def _usual_flux(
     """Return the flux of cubes for which none is given, at most so much."""
     layout, wavelength, _ = _of_mode(instrument, wavelength)
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
-    share = image._scene(layout, source, len(wavelength)).peak()
+    share = Scene(image, layout, source, len(wavelength)).peak()
     fluxes = _beam_fluxes(chain, frames, wavelength, source, **light)
     # a default may fill half of the saturation: room for better seeing, and uneven pixels
     room = 0.5 * min(way.saturation for way in _read_outs(frames, layout))
@@ -676,10 +662,15 @@ _NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.
 class Scene:
     """Where the light of each beam falls: the shares of its flux in every pixel."""
 
-    def __init__(self, layout, *, source, psf, fwhm, beta, halo, halo_fwhm, margin):
+    def __init__(self, image, layout, source, n_wavelengths):
+        check_choice("psf", image.psf, ("moffat", "gaussian"), ParameterError)
+        self.shape, self.source, self.psf = layout.shape, source, image.psf
+        self.fwhm = pixels("fwhm", image.fwhm, layout, n_wavelengths)
+        self.beta = number("beta", image.beta, above=1.0)
+        self.halo = number("halo", image.halo, most=1.0)
+        self.halo_fwhm = pixels("halo_fwhm", image.halo_fwhm, layout, n_wavelengths)
+        margin = number("margin", image.margin)
         left, right, width, height, angle = layout.internal_apertures
-        self.shape, self.source, self.psf = layout.shape, source, psf
-        self.fwhm, self.beta, self.halo, self.halo_fwhm = fwhm, beta, halo, halo_fwhm
         self.offset = np.asarray(layout.star_offset, dtype=float)
         # the field stop moves with the star from beam to beam
         # place in the left beam whose image in the right one is as far off its aperture
@@ -750,9 +741,8 @@ class Scene:
         core = moffat if self.psf == "moffat" else gaussian
         share = _by_width(core, box, place, fwhm, self.beta)
         if self.halo:
-            share = (1 - self.halo) * share + self.halo * _by_width(
-                moffat, box, place, self.halo_fwhm, HALO_BETA
-            )
+            halo = _by_width(moffat, box, place, self.halo_fwhm, HALO_BETA)
+            share = (1 - self.halo) * share + self.halo * halo
         return share
 
 

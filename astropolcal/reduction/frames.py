@@ -455,9 +455,8 @@ def read_night(files, instrument):
     # ISO dates sort as text; a calibration that holds at both ends holds between them
     known = sorted(filter(None, moments.values()))
     beam = told_beam([primary_header(file) for file in files], instrument, files)
-    return Night(
-        moments, list(dict.fromkeys(known[:1] + known[-1:])), next(iter(modes), None), beam
-    )
+    dates = list(dict.fromkeys(known[:1] + known[-1:]))
+    return Night(moments, dates, next(iter(modes), None), beam)
 
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):

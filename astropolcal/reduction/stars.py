@@ -54,9 +54,8 @@ def measure_stars(
     around them have beyond it. The options are described in `reduce_run`.
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked)
-    check_choice(
-        "aperture_correction", aperture_correction, (False, True, "growth"), ParameterError
-    )
+    corrections = (False, True, "growth")
+    check_choice("aperture_correction", aperture_correction, corrections, ParameterError)
     if aperture_correction is True and not layout.two_beams:
         raise ParameterError(
             f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "

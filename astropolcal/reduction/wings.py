@@ -58,30 +58,22 @@ def wing_shares(cube, good, photometry, level_variance, detector, layout, *, rea
     # part of an aperture that may lie outside of the lit field
     if star.unlit_part > 0.2 or (rings := rings_of(star, reach * 1.5)) is None:
         return None
-    # divided by full width at half maximum over alpha
-    halo = min(_SEEING / layout.pixel_scale, reach) / (2 * np.sqrt(2 ** (1 / HALO_BETA) - 1))
-    return _fit(star, rings, detector, halo)
+    # full width at half maximum over the radius of the profile
+    width = 2 * np.sqrt(HALO_BETA * (2 ** (1 / HALO_BETA) - 1))
+    return _fit(star, rings, detector, min(_SEEING / layout.pixel_scale, reach) / width)
 
 
 # --- profile ---------------------------------------------------------------------
 
 
-def _core(r, radius, t):
+def _moffat(r, radius, t):
     """Return a Moffat profile of unit sum, t = 1 / beta, alpha^2 = beta radius^2."""
     return np.exp(-np.log1p(t * (r / radius) ** 2) / t) * (1 - t) / (np.pi * radius**2)
 
 
-def _core_beyond(r, radius, t):
+def _beyond(r, radius, t):
+    """Return the part of its light that is farther away than r."""
     return np.exp(np.log1p(t * (r / radius) ** 2) * (1 - 1 / t))
-
-
-def _halo(r, radius):
-    scale = (HALO_BETA - 1) / (np.pi * radius**2)
-    return scale * (1 + (r / radius) ** 2) ** -HALO_BETA
-
-
-def _halo_beyond(r, radius):
-    return (1 + (r / radius) ** 2) ** (1 - HALO_BETA)
 
 
 class _Profile:
@@ -94,33 +86,30 @@ class _Profile:
 
     def in_rings(self, p):
         """Return the light in the rings, of both beams, that one unit of each number gives."""
-        radius, halo_radius = self._radii(p)
-        flux, core, halo = self.star.flux, 0.0, 0.0
-        seen = [(flux, self.rings.own)]
+        light = self.star.flux[:, :, None]
+        seen = [(light, self.rings.own)]
         # without a stop there is light of the other image
-        seen += [] if self.rings.other is None else [(flux[::-1], self.rings.other)]
-        for light, r in seen:
-            light = light[:, :, None]
-            core = core + (light * _core(r, radius[:, None], p[1]).mean(axis=0)).sum(axis=0)
-            halo = halo + (light * _halo(r, halo_radius).mean(axis=0)).sum(axis=0)
-        return self._columns(core, halo)
+        seen += [] if self.rings.other is None else [(light[::-1], self.rings.other)]
+        parts = []
+        for radius, t in self._components(p):
+            shares = ((own, _moffat(r, radius[:, None], t).mean(axis=0)) for own, r in seen)
+            parts.append(sum((own * share).sum(axis=0) for own, share in shares))
+        return self._columns(parts)
 
     def lacking(self, p):
         """Return the light that the sums of the lit pixels in the apertures lack."""
-        star = self.star
-        radius, halo_radius = self._radii(p)
+        star, parts = self.star, []
         total = star.flux.sum(axis=0)
-        core = total * _core_beyond(star.radius, radius, p[1])
-        halo = total * _halo_beyond(star.radius, halo_radius)
-        if not star.stopped:
-            apart = np.hypot(*(star.places[0] - star.places[1]))
-            # the light of the other image in the aperture, nearly constant over it
-            core = core - total * self.area * _core(apart, radius, p[1])
-            halo = halo - total * self.area * _halo(apart, halo_radius)
-        for beam, k, r, weights, _ in star.unlit:
-            core[k] += star.flux[beam, k] * weights @ _core(r, radius[k], p[1])
-            halo[k] += star.flux[beam, k] * weights @ _halo(r, halo_radius)
-        return self._columns(core, halo)
+        for radius, t in self._components(p):
+            part = total * _beyond(star.radius, radius, t)
+            if not star.stopped:
+                apart = np.hypot(*(star.places[0] - star.places[1]))
+                # the light of the other image in the aperture, nearly constant over it
+                part = part - total * self.area * _moffat(apart, radius, t)
+            for beam, k, r, weights, _ in star.unlit:
+                part[k] += star.flux[beam, k] * weights @ _moffat(r, radius[k], t)
+            parts.append(part)
+        return self._columns(parts)
 
     def background_in_apertures(self, background):
         """Return what the true background has in the lit pixels of both apertures together."""
@@ -138,12 +127,14 @@ class _Profile:
             sums[k] -= light
         return sums
 
-    def _radii(self, p):
-        return self.star.width * np.exp(p[0] + p[3] * self.star.x), self.halo_radius * np.exp(p[2])
+    def _components(self, p):
+        """Return radius in each slice and 1 / exponent of core and halo."""
+        core = self.star.width * np.exp(p[0] + p[3] * self.star.x)
+        return (core, p[1]), (np.full(len(core), self.halo_radius * np.exp(p[2])), 1 / HALO_BETA)
 
-    def _columns(self, core, halo):
-        along = self.terms.T.reshape(-1, len(core), *(1,) * (core.ndim - 1))
-        return np.concatenate([core * along, halo * along])
+    def _columns(self, parts):
+        along = self.terms.T.reshape(-1, len(parts[0]), *(1,) * (parts[0].ndim - 1))
+        return np.concatenate([part * along for part in parts])
 
 
 # --- fit -------------------------------------------------------------------------
@@ -291,14 +282,12 @@ class Star:
                 if not dark.any():
                     continue
                 rows, columns = np.nonzero(dark)
-                r = np.hypot(
-                    columns + inside[1].start - place[0], rows + inside[0].start - place[1]
-                )
+                x, y = columns + inside[1].start - place[0], rows + inside[0].start - place[1]
                 # (pixels in the dark part,) of the slice
                 values, known = (a[self.usable[k]][inside][dark] for a in (self.cube, self.good))
                 weights = mask.data[part][dark]
                 light = float(weights @ np.where(known, values, 0.0))
-                found.append((beam, k, r, weights, light))
+                found.append((beam, k, np.hypot(x, y), weights, light))
         return found
 
     @property

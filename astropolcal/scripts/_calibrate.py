@@ -93,8 +93,7 @@ def run(arguments):
     if not files:
         # so that a first call without any data shows what comes out
         files = [Path(__file__).parents[1] / "data" / "charis_example.ecsv"]
-        words = "No files given: this is the packaged example, a simulated run\n"
-        common.say(arguments, words)
+        common.say(arguments, "No files given: this is the packaged example, a simulated run\n")
     datasets = common.read_datasets(files)
     standards = common.read_datasets(arguments.standard)
     for path, standard in zip(arguments.standard, standards, strict=True):
@@ -213,13 +212,11 @@ def _held(arguments, chains):
     from astropolcal.measurement import parameter_table
 
     # a --prior frees one parameter of an optic that --fix holds
-    held, loose = (
-        {text.partition("=")[0] for text in texts} for texts in (arguments.fix, arguments.prior)
-    )
+    held = {text.partition("=")[0] for text in arguments.fix}
+    loose = {text.partition("=")[0] for text in arguments.prior}
     own = {name: {name, name.partition(".")[0]} for name in parameter_table(chains)}
-    return (
-        dict.fromkeys(n for n, names in own.items() if names & held and not names & loose) or None
-    )
+    found = [name for name, names in own.items() if names & held and not names & loose]
+    return dict.fromkeys(found) or None
 
 
 def _target(text):
