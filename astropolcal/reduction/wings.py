@@ -83,6 +83,12 @@ class _Profile:
         self.star, self.rings, self.halo_radius = star, rings, halo_radius
         self.terms = legvander(star.x, min(1, len(star.x) - 1))
         self.area = np.pi * star.radius**2
+        # lit pixels of an aperture, mean of both, and the sums in both with the background
+        level = star.photometry.background[:, star.usable].sum(axis=0)
+        self.pixels, self.sums = self.area.copy(), star.flux.sum(axis=0) + level * self.area
+        for _, k, _, weights, light in star.unlit:
+            self.pixels[k] -= weights.sum() / 2
+            self.sums[k] -= light
 
     def in_rings(self, p):
         """Return the light in the rings, of both beams, that one unit of each number gives."""
@@ -110,22 +116,6 @@ class _Profile:
                 part[k] += star.flux[beam, k] * weights @ _moffat(r, radius[k], t)
             parts.append(part)
         return self._columns(parts)
-
-    def background_in_apertures(self, background):
-        """Return what the true background has in the lit pixels of both apertures together."""
-        pixels = self.area.copy()
-        for _, k, _, weights, _ in self.star.unlit:
-            pixels[k] -= weights.sum() / 2
-        return background * pixels
-
-    def sums(self):
-        """Return the sums of the lit pixels in both apertures, with the background."""
-        star = self.star
-        level = star.photometry.background[:, star.usable].sum(axis=0)
-        sums = star.flux.sum(axis=0) + level * self.area
-        for _, k, _, _, light in self.star.unlit:
-            sums[k] -= light
-        return sums
 
     def _components(self, p):
         """Return radius in each slice and 1 / exponent of core and halo."""
@@ -214,10 +204,9 @@ def _slopes(columns, found):
 def _shares(profile, found, covariance):
     star, (_, c, background) = profile.star, found
     measured = star.flux.sum(axis=0)
-    known = profile.sums() - profile.background_in_apertures(background)
+    known = profile.sums - background * profile.pixels
     total = known + np.tensordot(c, profile.lacking(found[0]), 1)
-    aperture = np.diag(-profile.background_in_apertures(np.ones(len(background))))
-    slopes = np.concatenate([_slopes(profile.lacking, found), aperture])
+    slopes = np.concatenate([_slopes(profile.lacking, found), np.diag(-profile.pixels)])
     noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
     relative = measured / total**2
     return measured / total, noise * np.outer(relative, relative)
