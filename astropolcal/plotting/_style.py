@@ -12,7 +12,8 @@ from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import atomic_path
 from astropolcal.units import wavelengths_of
 
-# Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
+# Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines, and the
+# eighth is from P. Tol's "muted" scheme
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, "#882255")
@@ -89,7 +90,7 @@ def heading(figure, calibration, what, names=None):
             return
         names = [record.name for record in calibration.datasets]
     state = "" if calibration.converged else "  (FIT NOT CONVERGED)"
-    # more names than this do not fit into a title
+    # more than two names do not fit into a title
     of = ", ".join(names) if len(names) <= 2 else f"{len(names)} datasets"
     instrument = f"{calibration.instrument}: " if calibration.instrument else ""
     figure.suptitle(f"{what}{state}\n{instrument}{of}")
@@ -209,7 +210,7 @@ def scale_axis(axes, values):
     """Use a logarithmic axis where the values need it, with plain numbers on it."""
     # zero stands for what is missing and has no logarithm
     known = values[np.isfinite(values) & (values > 0)]
-    # a larger ratio between the extremes is drawn on a logarithmic axis
+    # where the largest is more than six times the smallest
     if known.size and known.max() > 6 * known.min():
         axes.set_yscale("log")
         axes.set_ylim(known.min() / 1.3, known.max() * 1.3)
@@ -256,7 +257,7 @@ def color_bar(figure, drawn, panels, clipped, scale=";"):
 
 def name_groups(axes, ends, labels, label):
     """Name runs of data, which end at these numbers, below their middles, as far as they fit."""
-    # rounded up, so that there are never more labels than fit
+    # rounded up, so that there are never more than twelve labels, which is what fits
     step = -(-len(ends) // 12)
     middles = (np.concatenate([[0], ends[:-1]]) + ends) / 2
     axes.set_xticks(middles[::step], labels=labels[::step])

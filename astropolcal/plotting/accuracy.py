@@ -26,6 +26,7 @@ _CURVES = {
 }
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
+_DASHES = ("--", ":", "-.")
 _PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
 
 
@@ -133,9 +134,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         look = {"color": st.GREEN, "alpha": 0.6, "label": _COMPARED}
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
     for axes in panels:
-        for (label, (lam, value)), line in zip(
-            curves.items(), cycle(("--", ":", "-.")), strict=False
-        ):
+        for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
             st.draw_line(axes, lam, value, color=st.BLACK, linestyle=line, label=label)
 
 

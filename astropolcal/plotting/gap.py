@@ -173,22 +173,19 @@ def plot_gap_frames(diagnosis, *, figure=None):
             _frame_axis(axes, observations)
         for axes, (i, frames) in zip(panels[len(datasets) :], told, strict=True):
             name, observations, *_ = datasets[i]
-            _course_panel(axes, course, i, frames, 1000 * diagnosis.nominal.problem.wavelength)
+            # the size in the frames of the dataset that tell it
+            angle = course.kind.startswith(ANGLES)
+            scale = np.rad2deg(1) if angle else 100
+            value, error = (scale * values[i][frames] for values in (course.wave, course.std))
+            look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
+            axes.axhline(0, color=st.GREY, linewidth=0.8)
+            axes.errorbar(np.flatnonzero(frames) + 0.5, value, error, **look)
+            nm = 1000 * diagnosis.nominal.problem.wavelength[np.argmax(course.law)]
+            axes.set_ylabel(f"size at {nm:.0f} nm ({'deg' if angle else '%'})")
             axes.set_title(f"{name}\n{course.place}, {course.kind}, any course", loc="left")
             axes.set_xlim(panels[i].get_xlim())
             _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
-
-
-def _course_panel(axes, course, i, frames, nm):
-    """Draw the size of a perturbation in the frames of a dataset that tell it."""
-    angle = course.kind.startswith(ANGLES)
-    scale = np.rad2deg(1) if angle else 100
-    value, error = (scale * values[i][frames] for values in (course.wave, course.std))
-    look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
-    axes.axhline(0, color=st.GREY, linewidth=0.8)
-    axes.errorbar(np.flatnonzero(frames) + 0.5, value, error, **look)
-    axes.set_ylabel(f"size at {nm[np.argmax(course.law)]:.0f} nm ({'deg' if angle else '%'})")
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
@@ -503,7 +500,7 @@ def _curve_panel(axes, model, effect, dependence):
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
     stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    stage = _STAGES.get(stage, stage)
     known = {
         "harmonic": f"angle of the {stage} (deg)",
         "direction": f"last move of the {stage}",

@@ -15,14 +15,12 @@ from astropolcal.units import angle_to_rad
 
 __all__ = ["plot_correlations", "plot_identifiability"]
 
-
 # a singular value and an error belong together if they agree to this share
 _SAME = 0.05
 # a condition number is 1 or more
 _LEFT = 0.8
 # what is named of a direction, as a share of its length, and at most so many
 _WORTH_A_WORD, _MOST_NAMES = 0.15, 3
-
 _COLUMNS = 125
 
 
@@ -137,6 +135,7 @@ def _weak_rows(finding, known, count):
         return []
     covariance, vectors, sigmas = known
     near_null = list(getattr(finding, "near_null", []))
+    # more of those that are nearly open, up to six
     count = max(count, min(len(near_null), 6))
     rows = []
     for vector, sigma in list(zip(vectors, sigmas, strict=True))[::-1][:count]:

@@ -483,7 +483,6 @@ def _draw_mirror(axes, calibration, table, key, reference):
 
 
 # ---- history --------------------------------------------------------------------------------
-
 _MOST_PANELS = 12
 
 

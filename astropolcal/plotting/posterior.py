@@ -14,7 +14,6 @@ __doctest_requires__ = {"plot_corner": ["corner"]}
 # more panels than this cannot be read
 MAX_CORNER = 12
 MAX_TRACES = 16
-
 # behind words that stand on data
 _PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 _MARGIN = 1.35

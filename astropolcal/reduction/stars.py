@@ -470,9 +470,7 @@ def _smoothed(image, good, fwhm):
 _DAMPING = (1e-3, 1e-9, 1e9)
 
 
-class GaussianFits(
-    namedtuple("GaussianFits", "amplitude x y background fwhm elongation converged shape")
-):
+class GaussianFits(namedtuple("Fits", "amplitude x y background fwhm elongation converged shape")):
     """
     What `fit_gaussians` found, one value an image; pixels of the image.
 

@@ -61,7 +61,7 @@ files FILE * Input  observation tables (ECSV)
     Polynomial2D(DEGREE) of two: time (zero on the first day of the tables, or SINCE), x, y,
     wavelength or a stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
-@ prior
+--prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
     or where the fit ends
 @ without

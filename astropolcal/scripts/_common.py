@@ -306,7 +306,6 @@ _SHARED = """
 --timeout MINUTES float  with --archive: give a sequence up after this time
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
---prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --without OPTIC ...  take an optic out of the model
 """
 _SHARED = {re.search(r"--(\w+)", entry)[1]: entry for entry in entries(_SHARED)}
