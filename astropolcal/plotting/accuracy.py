@@ -15,12 +15,9 @@ from astropolcal.plotting import _style as st
 
 __all__ = ["plot_accuracy", "plot_star_check", "plot_target_accuracy"]
 
+_S_RES = f"s_res = √(Σr²/(n {st.MINUS} k)): scatter of one datum about the model"
 _CURVES = {
-    "s_res": (
-        st.VERMILION,
-        "o",
-        f"s_res = √(Σr²/(n {st.MINUS} k)): scatter of one datum about the model",
-    ),
+    "s_res": (st.VERMILION, "o", _S_RES),
     "s_mean": (st.BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
     "s_cv": (st.GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
 }

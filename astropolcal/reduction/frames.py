@@ -27,7 +27,7 @@ from astropolcal.instruments.layout import ANGLES, card_value
 from astropolcal.observations.grid import mean_of_exposures
 from astropolcal.pipeline.headers import told_beam
 from astropolcal.reduction.headers import (
-    FrameHeader,
+    Frame,
     _half_turn,
     add_pointing,
     configured,
@@ -37,46 +37,10 @@ from astropolcal.reduction.headers import (
     read_header,
     tracking_error,
 )
-from astropolcal.reduction.photometry import Photometry, detector_of, evenly_lit, measure_internal
+from astropolcal.reduction.photometry import detector_of, evenly_lit, measure_internal
 from astropolcal.reduction.stars import measure_stars
 
 __all__ = []
-
-
-@dataclass
-class Frame(FrameHeader):
-    """What is known of one file."""
-
-    photometry: Photometry | None = None
-    # of the fluxes, by which copies are recognized
-    digest: str = ""
-
-    @property
-    def usable(self):
-        """Whether there are fluxes, and no error."""
-        return self.photometry is not None and not self.errors
-
-    @property
-    def name(self):
-        """Name of the file without its folder."""
-        return Path(self.path).name
-
-    def to_dict(self):
-        """Return plain numbers and texts, from which `from_dict` makes the same frame."""
-        plain = self.photometry and {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(self.photometry).items()
-        }
-        return vars(self) | {"photometry": plain}
-
-    @classmethod
-    def from_dict(cls, content):
-        """Return the frame that `to_dict` described."""
-        if (plain := content["photometry"]) is not None:
-            others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
-            arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
-            content = content | {"photometry": Photometry(**arrays, **others)}
-        return cls(**content)
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -90,7 +54,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
     try:
         with open_cube(path, layout, masters) as (primary, header, cube, good):
             # the header that is open already
-            vars(frame).update(vars(read_header(path, layout, header=primary, raw=raw)))
+            frame = read_header(path, layout, header=primary, raw=raw)
             _check_header(frame, layout, source)
             # per file: gain and exposure time may change within a night
             detector = detector_of(layout, _unit_of(header, primary), frame.values)
@@ -515,7 +479,7 @@ def _check_one_target(files, frames):
     """Refuse frames with the same data, and warn of frames of different objects."""
     seen, objects = {}, {}
     for file, frame in zip(files, frames, strict=True):
-        first = seen.setdefault(frame.digest, file) if getattr(frame, "digest", "") else file
+        first = seen.setdefault(frame.digest, file) if frame.digest else file
         if first != file:
             raise ObservationError(f"{file}: the same data as {first}; leave one of them out")
         name = frame.values.get("object")
@@ -542,7 +506,7 @@ def _survey(files, layout, raw, find):
 
 def _known(path, layout, raw):
     """Return what is known of a frame whose light is not measured."""
-    frame = Frame(**vars(read_header(path, layout, raw=raw)))
+    frame = read_header(path, layout, raw=raw)
     with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
         # what is not there is refused where it is corrected
         if len(hdus) > layout.cube_extension and hdus[layout.cube_extension].data is not None:

@@ -37,6 +37,7 @@ from astropolcal.instruments.layout import (
 )
 from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, sky_angle
+from astropolcal.reduction.photometry import Photometry
 from astropolcal.units import iso_date
 from astropolcal.words import listed
 
@@ -50,8 +51,8 @@ _SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
 
 @dataclass
-class FrameHeader:
-    """The keywords of a frame in the units of a layout."""
+class Frame:
+    """What is known of one file: its keywords, in the units of a layout, and what was measured."""
 
     path: str
     number: int | None = None
@@ -62,6 +63,36 @@ class FrameHeader:
     doubts: list = field(default_factory=list)
     # of the pixels; None if the header does not say
     unit: str | None = None
+    photometry: Photometry | None = None
+    # of the fluxes, by which copies are recognized
+    digest: str = ""
+
+    @property
+    def usable(self):
+        """Whether there are fluxes, and no error."""
+        return self.photometry is not None and not self.errors
+
+    @property
+    def name(self):
+        """Name of the file without its folder."""
+        return Path(self.path).name
+
+    def to_dict(self):
+        """Return plain numbers and texts, from which `from_dict` makes the same frame."""
+        plain = self.photometry and {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self.photometry).items()
+        }
+        return vars(self) | {"photometry": plain}
+
+    @classmethod
+    def from_dict(cls, content):
+        """Return the frame that `to_dict` described."""
+        if (plain := content["photometry"]) is not None:
+            others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
+            arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
+            content = content | {"photometry": Photometry(**arrays, **others)}
+        return cls(**content)
 
 
 def frame_number(name, layout, header=None):
@@ -114,7 +145,7 @@ def read_header(path, layout, *, header=None, raw=None):
     Keywords that are missing or impossible are in ``errors`` and ``doubts``.
     """
     header = primary_header(path) if header is None else header
-    frame = FrameHeader(str(path), frame_number(path, layout, header))
+    frame = Frame(str(path), frame_number(path, layout, header))
     frame.unit = card_value(header, "BUNIT")
     # what is in the file goes before what a header says of it
     stack = card_value(header, "NAXIS3") if card_value(header, "NAXIS") == 3 else 1
