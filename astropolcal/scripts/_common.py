@@ -320,7 +320,7 @@ def numbers(text, count=None, separator=","):
 
 
 def text_type(words, read, *arguments):
-    """Return the type of an option whose texts are read; of others it is said what they are not."""
+    """Return the type of an option: what ``read`` makes of a text, which else is not ``words``."""
 
     def convert(text):
         with suppress(ValueError):
