@@ -17,9 +17,8 @@ from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.vampires import layout_of, mode_header, slices_of
 from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
-from astropolcal.reduction.cubes import both_states, simulate_cubes
+from astropolcal.reduction.cubes import both_states, expose, simulate_cubes
 from astropolcal.reduction.headers import read_header
-from astropolcal.reduction.images import expose
 from astropolcal.reduction.photometry import Detector, detector_of
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles

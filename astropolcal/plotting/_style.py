@@ -12,22 +12,15 @@ from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import atomic_path
 from astropolcal.units import wavelengths_of
 
-# Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
+# Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines, and the
+# eighth is from P. Tol's "muted" scheme
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
-WINE = "#882255"  # the eighth, from P. Tol's "muted" scheme
-COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, WINE)
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, "#882255")
 # one more than colours: the pairs repeat only after 72 series
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
 GREY = "0.45"
 MINUS, SIGMA = "\N{MINUS SIGN}", "\N{GREEK SMALL LETTER SIGMA}"
-# more names than this do not fit into a title
-_MAX_NAMES = 2
-_DPI = 150
-# a larger ratio between the extremes is drawn on a logarithmic axis
-_LOGARITHMIC_FROM = 6
-# more labels than these do not fit below a panel
-_MAX_GROUPS = 12
 
 _SETTINGS = {
     "font.size": 11,
@@ -85,7 +78,7 @@ def save(figure, path, error=AstropolcalError):
     if path.suffix.removeprefix(".").lower() not in known:
         raise error(f"{path}: the name must end with .{', .'.join(known)}")
     with atomic_path(path, error) as temporary:
-        figure.savefig(temporary, dpi=_DPI)
+        figure.savefig(temporary, dpi=150)
     return path
 
 
@@ -97,7 +90,8 @@ def heading(figure, calibration, what, names=None):
             return
         names = [record.name for record in calibration.datasets]
     state = "" if calibration.converged else "  (FIT NOT CONVERGED)"
-    of = ", ".join(names) if len(names) <= _MAX_NAMES else f"{len(names)} datasets"
+    # more than two names do not fit into a title
+    of = ", ".join(names) if len(names) <= 2 else f"{len(names)} datasets"
     instrument = f"{calibration.instrument}: " if calibration.instrument else ""
     figure.suptitle(f"{what}{state}\n{instrument}{of}")
 
@@ -216,7 +210,8 @@ def scale_axis(axes, values):
     """Use a logarithmic axis where the values need it, with plain numbers on it."""
     # zero stands for what is missing and has no logarithm
     known = values[np.isfinite(values) & (values > 0)]
-    if known.size and known.max() > _LOGARITHMIC_FROM * known.min():
+    # where the largest is more than six times the smallest
+    if known.size and known.max() > 6 * known.min():
         axes.set_yscale("log")
         axes.set_ylim(known.min() / 1.3, known.max() * 1.3)
         plain_numbers(axes)
@@ -262,8 +257,8 @@ def color_bar(figure, drawn, panels, clipped, scale=";"):
 
 def name_groups(axes, ends, labels, label):
     """Name runs of data, which end at these numbers, below their middles, as far as they fit."""
-    # rounded up, so that there are never more labels than fit
-    step = -(-len(ends) // _MAX_GROUPS)
+    # rounded up, so that there are never more than twelve labels, which is what fits
+    step = -(-len(ends) // 12)
     middles = (np.concatenate([[0], ends[:-1]]) + ends) / 2
     axes.set_xticks(middles[::step], labels=labels[::step])
     axes.tick_params(axis="x", length=0)

@@ -15,22 +15,16 @@ from astropolcal.plotting import _style as st
 
 __all__ = ["plot_accuracy", "plot_star_check", "plot_target_accuracy"]
 
+_S_RES = f"s_res = √(Σr²/(n {st.MINUS} k)): scatter of one datum about the model"
 _CURVES = {
-    "s_res": (
-        st.VERMILION,
-        "o",
-        f"s_res = √(Σr²/(n {st.MINUS} k)): scatter of one datum about the model",
-    ),
+    "s_res": (st.VERMILION, "o", _S_RES),
     "s_mean": (st.BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
     "s_cv": (st.GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
 }
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
-_NOT_KNOWN = "{}: not known (too few data or groups)"
-_PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
-_STANDARD_MARKERS = ("D", "v", "P", "X")
-_STANDARD_STYLES = ("-", "--", ":", "-.")
 _DASHES = ("--", ":", "-.")
+_PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
 
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
@@ -124,7 +118,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
             label = _label(key, values, calibration)
             st.draw_line(axes, lam, values, color=color, marker=marker, label=label)
     own = [[e for e in standards if e["source"] == record.source] for record in records]
-    looks = zip(cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False)
+    looks = zip(cycle("DvPX"), cycle(("-", "--", ":", "-.")), strict=False)
     looks = {id(entry): look for entry, look in zip(standards, looks, strict=False)}
     for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
         for entry in entries:
@@ -143,7 +137,7 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
 
 def _label(key, values, calibration):
     label = _CURVES[key][2].format(what_is_left_out(calibration))
-    return label if np.isfinite(values).any() else _NOT_KNOWN.format(key)
+    return label if np.isfinite(values).any() else f"{key}: not known (too few data or groups)"
 
 
 def _reference(label, pair):

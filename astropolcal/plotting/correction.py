@@ -8,8 +8,6 @@ from astropolcal.plotting import _style as st
 
 __all__ = ["plot_images"]
 
-# of the brightest pixels, those beyond this quantile may saturate the colours
-_QUANTILE = 0.995
 _COLORS = {"q": st.BLUE, "u": st.VERMILION, "v": st.GREEN}
 _MARKERS = {"q": "o", "u": "s", "v": "^"}
 # statistical and systematic error of the degree
@@ -138,7 +136,8 @@ def _draw_image(axes, name, image, extent, limit):
 
 def _top(values):
     known = values[np.isfinite(values)]
-    top = np.quantile(known, _QUANTILE) if known.size else 1.0
+    # of the brightest pixels, those beyond this quantile may saturate the colours
+    top = np.quantile(known, 0.995) if known.size else 1.0
     return top if top > 0 else 1.0
 
 

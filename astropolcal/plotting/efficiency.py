@@ -18,7 +18,6 @@ __all__ = ["plot_comparison", "plot_observability"]
 _DEROTATOR = np.arange(0, 181, 2.5)
 _ALTITUDE = np.arange(20, 91, 5.0)
 _PARALLACTIC = np.arange(-180, 181, 10.0)
-_MOST_LINES = 6
 # fewer wavelengths than these are filters: nothing is known in between
 _LEAST_SPECTRUM = 8
 # white contours on the dark end of the colours, black ones on the bright end
@@ -128,7 +127,7 @@ def _degree(angle):
 
 def _lines(ax, lam, angles, values, shown):
     if shown is None:
-        rows = np.unique(np.linspace(0, lam.size - 1, min(_MOST_LINES, lam.size)).astype(int))
+        rows = np.unique(np.linspace(0, lam.size - 1, min(6, lam.size)).astype(int))
     else:
         # two wavelengths asked for may be nearest to the same one
         rows = np.unique(np.abs(st.nanometres(shown)[:, None] - lam).argmin(axis=1))
@@ -268,10 +267,7 @@ def _draw_member(axes, rows, label, color, marker):
 
 # ---- standard stars over a night ---------------------------------------------------------------
 _MOST = 8
-# a marker every so many hours tells the curves apart without colour
-_EVERY = 1.0
 _TICK = 45
-_CROWDED = 405
 
 
 def plot_observability(seen, *, total=None, figure=None):
@@ -352,7 +348,8 @@ def _curve(axes, hours, values, good, color, marker):
     seen = np.where(good, values, np.nan)
     axes.plot(hours, values, color=color, linestyle=":", linewidth=1)
     axes.plot(hours, seen, color=color, linewidth=2)
-    every = max(len(hours) // max(int((hours[-1] - hours[0]) / _EVERY), 1), 1)
+    # a marker every hour tells the curves apart without colour
+    every = max(len(hours) // max(int(hours[-1] - hours[0]), 1), 1)
     axes.plot(hours[::every], seen[::every], color=color, marker=marker, ls="")
 
 
@@ -364,7 +361,7 @@ def _finish(upper, lower, seen):
     low = min(_TICK * np.floor(angles.min() / _TICK), -180)
     high = max(_TICK * np.ceil(angles.max() / _TICK), 180)
     # twice as wide where the labels would crowd
-    step = _TICK if high - low <= _CROWDED else 2 * _TICK
+    step = _TICK if high - low <= 405 else 2 * _TICK
     lower.set(ylabel="parallactic angle (deg)", ylim=(low, high))
     lower.set_yticks(np.arange(low, high + 1, step))
     date = seen[0].table["time"][0].to_value("iso", "date")

@@ -20,12 +20,6 @@ _CHANNELS = {
     "difference": ("normalized difference of the beams", "R\N{MINUS SIGN}L over R+L"),
     "sum": ("logarithm of the sum of the beams", "ln(R+L)"),
 }
-# share of the residuals that the colour scale of the maps covers
-_COVERED = 99.5
-# frames that tell a size so many times worse than the best one are left out
-_UNTOLD = 20.0
-# characters of a dataset's name above a panel
-_LONGEST_NAME = 30
 
 
 def _datasets(diagnosis):
@@ -39,7 +33,8 @@ def _datasets(diagnosis):
     for dataset, channel, pair in zip(problem.datasets, problem.channels, pairs, strict=True):
         # whitened by the same noise before and after, lest the two differ by their lamps
         gaps = (100 * channel.whiten(gap) * channel.sigma for gap in pair)
-        name = shortened(dataset.observations.name, _LONGEST_NAME)
+        # there is room for so many characters above a panel
+        name = shortened(dataset.observations.name, 30)
         gaps = (np.where(channel.valid, gap, np.nan) for gap in gaps)
         found.append((name, dataset.observations, 1000 * problem.wavelength[dataset.bins], *gaps))
     return found
@@ -154,7 +149,8 @@ def plot_gap_frames(diagnosis, *, figure=None):
     datasets, told = _datasets(diagnosis), []
     for course in diagnosis.courses[:1]:
         least = min(std.min() for std in course.std)
-        told = [(i, std < _UNTOLD * least) for i, std in enumerate(course.std)]
+        # frames that tell a size so many times worse than the best one are left out
+        told = [(i, std < 20.0 * least) for i, std in enumerate(course.std)]
         told = [(i, frames) for i, frames in told if frames.any()]
     rows = len(datasets) + len(told)
     with st.canvas(figure, 9, 1.4 + 2.5 * rows) as figure:
@@ -177,22 +173,19 @@ def plot_gap_frames(diagnosis, *, figure=None):
             _frame_axis(axes, observations)
         for axes, (i, frames) in zip(panels[len(datasets) :], told, strict=True):
             name, observations, *_ = datasets[i]
-            _course_panel(axes, course, i, frames, 1000 * diagnosis.nominal.problem.wavelength)
+            # the size in the frames of the dataset that tell it
+            angle = course.kind.startswith(ANGLES)
+            scale = np.rad2deg(1) if angle else 100
+            value, error = (scale * values[i][frames] for values in (course.wave, course.std))
+            look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
+            axes.axhline(0, color=st.GREY, linewidth=0.8)
+            axes.errorbar(np.flatnonzero(frames) + 0.5, value, error, **look)
+            nm = 1000 * diagnosis.nominal.problem.wavelength[np.argmax(course.law)]
+            axes.set_ylabel(f"size at {nm:.0f} nm ({'deg' if angle else '%'})")
             axes.set_title(f"{name}\n{course.place}, {course.kind}, any course", loc="left")
             axes.set_xlim(panels[i].get_xlim())
             _frame_axis(axes, observations)
         return _finish(figure, panels[0], diagnosis, "Residuals of the single differences")
-
-
-def _course_panel(axes, course, i, frames, nm):
-    """Draw the size of a perturbation in the frames of a dataset that tell it."""
-    angle = course.kind.startswith(ANGLES)
-    scale = np.rad2deg(1) if angle else 100
-    value, error = (scale * values[i][frames] for values in (course.wave, course.std))
-    look = {"fmt": "o", "color": st.BLACK, "markersize": 3, "elinewidth": 0.8}
-    axes.axhline(0, color=st.GREY, linewidth=0.8)
-    axes.errorbar(np.flatnonzero(frames) + 0.5, value, error, **look)
-    axes.set_ylabel(f"size at {nm[np.argmax(course.law)]:.0f} nm ({'deg' if angle else '%'})")
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
@@ -239,7 +232,8 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     c, datasets = list(_CHANNELS).index(channel), _datasets(diagnosis)
     gaps = [(before[c], after[c]) for *_, before, after in datasets]
     sizes = np.concatenate([gap.ravel() for pair in gaps for gap in pair])
-    limit, clipped = st.color_limit(sizes, _COVERED)
+    # share of the residuals that the colour scale of the maps covers
+    limit, clipped = st.color_limit(sizes, 99.5)
     with st.canvas(figure, 12, 1.5 + 3.2 * len(datasets)) as figure:
         panels = figure.subplots(len(datasets), 2, sharey="row", squeeze=False)
         for row, pair, (name, observations, nm, *_) in zip(panels, gaps, datasets, strict=True):
@@ -313,12 +307,14 @@ def plot_cause_map(diagnosis, *, figure=None):
         for i, row in enumerate(rows.values()):
             for j, kind in enumerate(shown):
                 chance, words = row.get(kind, (0.0, ""))
-                if chance < _LEAST:
+                # hardly anything is not written
+                if chance < 0.01:
                     continue
-                look = {"ha": "center", "color": "white" if chance > _DARK else st.BLACK}
+                # white where the ground is dark
+                look = {"ha": "center", "color": "white" if chance > 0.65 else st.BLACK}
                 axes.text(j, i - 0.26, share(chance), va="center", weight="bold", **look)
                 # on a telephone a cell is narrow
-                words = textwrap.fill(words, _CELL, break_long_words=False)
+                words = textwrap.fill(words, 8, break_long_words=False)
                 axes.text(j, i - 0.06, words, va="top", fontsize=7.5, linespacing=0.95, **look)
         axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
         words = {"in": "in the {}", "after": "downstream of the {}"}
@@ -338,17 +334,11 @@ def plot_cause_map(diagnosis, *, figure=None):
     return figure
 
 
-# characters of a label beside a panel
-_LABEL = 26
 _STAGES = {"hwp": "half-wave plate"}
 # columns of the map
 _OTHER = "other"
 _FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
 _AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear"}
-# characters of a line in a cell
-_CELL = 8
-# probabilities that are not written, and from which the ground is dark
-_LEAST, _DARK = 0.01, 0.65
 
 
 def _cause_map(diagnosis):
@@ -432,7 +422,8 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
                 continue
             (parameter,) = (p for p in model.added[effect] if p.name == name)
             unit = _size_panel(axes, model.problem, sizes[name], parameter)
-            axes.set_ylabel(f"{textwrap.fill(words[name], _LABEL)} ({unit})")
+            # there is room for so many characters beside a panel
+            axes.set_ylabel(f"{textwrap.fill(words[name], 26)} ({unit})")
             st.wavelength_label(axes)
     return figure
 
@@ -509,7 +500,7 @@ def _curve_panel(axes, model, effect, dependence):
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
     stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    stage = _STAGES.get(stage, stage)
     known = {
         "harmonic": f"angle of the {stage} (deg)",
         "direction": f"last move of the {stage}",

@@ -15,20 +15,12 @@ from astropolcal.units import angle_to_rad
 
 __all__ = ["plot_correlations", "plot_identifiability"]
 
-_WIDTH = 11.0
-_INFINITE = "\N{INFINITY}"
-# singular values below this share of the largest count as zero
-_OPEN_BELOW = 1e-9
-# loadings are written into cells from this on, and in white from that
-_WRITTEN, _PALE = 0.02, 0.6
 # a singular value and an error belong together if they agree to this share
 _SAME = 0.05
 # a condition number is 1 or more
 _LEFT = 0.8
 # what is named of a direction, as a share of its length, and at most so many
 _WORTH_A_WORD, _MOST_NAMES = 0.15, 3
-# directions are the same if the cosine between them is larger; so many near-null ones are shown
-_ALIKE, _MOST_NEAR_NULL = 0.9, 6
 _COLUMNS = 125
 
 
@@ -95,7 +87,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     for row in (row for row in rows if row.words):
         words += textwrap.wrap(f"{row.name}: {row.words}", _COLUMNS, subsequent_indent=" " * 5)
     heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
-    with st.canvas(figure, _WIDTH, sum(heights) + 1.6) as figure:
+    with st.canvas(figure, 11.0, sum(heights) + 1.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
@@ -143,7 +135,8 @@ def _weak_rows(finding, known, count):
         return []
     covariance, vectors, sigmas = known
     near_null = list(getattr(finding, "near_null", []))
-    count = max(count, min(len(near_null), _MOST_NEAR_NULL))
+    # more of those that are nearly open, up to six
+    count = max(count, min(len(near_null), 6))
     rows = []
     for vector, sigma in list(zip(vectors, sigmas, strict=True))[::-1][:count]:
         vector = vector * np.sign(vector[ranked(np.abs(vector))[0]])
@@ -162,7 +155,8 @@ def _near_null_words(near_null, names, units, vector):
         for name, value in direction["parameters"].items():
             at = [names.index(name)] if name in names else places[name]
             change[at] = np.asarray(value) / (0.01 if units[at[0]] is None else 1.0)
-        if abs(change @ vector) > _ALIKE * np.linalg.norm(change):
+        # by the cosine between them
+        if abs(change @ vector) > 0.9 * np.linalg.norm(change):
             return direction["words"]
     return ""
 
@@ -195,7 +189,8 @@ def _draw_values(axes, finding, known, n_weak):
     largest = values.max(initial=0.0) or 1.0
     # the limit of the rank, between the values that it parts
     between = (values[rank] if n_open else 0.0, values[rank - 1] if rank else largest)
-    threshold = float(np.clip(_OPEN_BELOW * largest, *between)) or 1e-12
+    # singular values below this share of the largest count as zero
+    threshold = float(np.clip(1e-9 * largest, *between)) or 1e-12
     # singular values and errors go together where the data count as independent
     sigmas = np.empty(0) if known is None or not rank else known[2]
     if len(sigmas):
@@ -270,7 +265,7 @@ def _draw_loadings(figure, axes, finding, rows):
     axes.set_yticks(range(len(rows)), [row.name for row in rows])
     axes.tick_params(length=0)
     signs = ["+" if len(at) == 1 else "-" for at in places.values()]
-    for i, j in zip(*np.nonzero(np.abs(table) > _WRITTEN), strict=True):
+    for i, j in zip(*np.nonzero(np.abs(table) > 0.02), strict=True):
         _write(axes, j, i, table[i, j], signs[j])
     n_open = sum(row.name.startswith("open") for row in rows)
     if 0 < n_open < len(rows):
@@ -280,7 +275,7 @@ def _draw_loadings(figure, axes, finding, rows):
 
 def _write(axes, x, y, value, sign="-"):
     """Write a number into its cell, in white on dark ground."""
-    color = "white" if abs(value) > _PALE else "black"
+    color = "white" if abs(value) > 0.6 else "black"
     text = f"{value:{sign}.2f}".replace("-", st.MINUS)
     axes.text(x, y, text, color=color, ha="center", va="center", fontsize=9)
 
@@ -319,7 +314,7 @@ def _draw_conditions(axes, finding, angles):
             axes.text(length, i, f" {value:.2g}", va="center")
         else:
             paper = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-            axes.text(1.1, i, f" {_INFINITE}: too few angles", va="center", bbox=paper)
+            axes.text(1.1, i, " \N{INFINITY}: too few angles", va="center", bbox=paper)
     axes.axvline(_POOR, color=st.BLACK, linestyle="--", linewidth=1)
     axes.text(_POOR, -0.62, " poor beyond", va="center", fontsize=9.5, color=st.GREY)
     axes.set(xscale="log", xlim=(_LEFT, top * 8), ylim=(len(values) - 0.5, -0.9))
@@ -337,11 +332,7 @@ def _say(axes, text):
 
 
 # ---- correlations ---------------------------------------------------------------------------
-# a parameter common to all wavelengths is drawn this much wider than one of a wavelength
-_WIDE = 4.0
 _SIZE, _MARGIN = 8.5, 2.6
-# numbers are written into the cells of a matrix that is not larger than this
-_FEW = 12
 
 
 def plot_correlations(calibration, *, figure=None):
@@ -400,7 +391,8 @@ def plot_correlations(calibration, *, figure=None):
             _say(axes, "no parameter has an error by itself")
             return figure
         several = any(count > 1 for _, count in groups)
-        widths = [np.full(n, _WIDE if n == 1 and several else 1.0) for _, n in groups]
+        # a parameter common to all wavelengths is drawn this much wider than one of a wavelength
+        widths = [np.full(n, 4.0 if n == 1 and several else 1.0) for _, n in groups]
         edges = np.concatenate([[0.0], np.cumsum(np.concatenate(widths))])
         axes.grid(False)
         look = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "rasterized": True}
@@ -418,7 +410,8 @@ def plot_correlations(calibration, *, figure=None):
             axes.axvline(border, color="0.25", linewidth=0.6)
         middles = (edges[1:] + edges[:-1]) / 2
         for i, j in zip(*np.nonzero(np.isfinite(matrix)), strict=True):
-            if len(matrix) <= _FEW:
+            # numbers are written into the cells of a matrix that is not larger than this
+            if len(matrix) <= 12:
                 _write(axes, middles[j], middles[i], matrix[i, j])
         figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02, label="correlation")
     return figure

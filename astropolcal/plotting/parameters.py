@@ -36,10 +36,8 @@ _STAGE = "fitted per wavelength (first step of two), modulo 360°"
 _LAW = f"law fitted to all wavelengths, with 1{st.SIGMA} band"
 _LAW_ALONE = "law fitted to all wavelengths (no error: not determined alone)"
 _ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
-_FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
-_TITLE_WIDTH = 58
 
 
 def _entries(calibration):
@@ -94,7 +92,7 @@ def _draw_law(axes, calibration, leaf, known, look):
     lam = np.sort(st.nanometres(calibration.wavelength))
     # a law is smooth between the wavelengths unless its parameters are given at these
     if lam.size > 1 and not any(getattr(leaf, key).size > 1 for key in leaf.param_names):
-        lam = np.linspace(lam[0], lam[-1], _FINE)
+        lam = np.linspace(lam[0], lam[-1], 201)
     found = of_law(calibration, leaf.name, "retardance", lam * u.nm)
     value, std = (x.to_value(u.deg) for x in (found.value, found.std))
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
@@ -112,11 +110,12 @@ def _draw_law(axes, calibration, leaf, known, look):
     for value in stages[:1]:
         value = u.Quantity(value, u.deg).value
         # a turn more or less is the same retarder: draw the one near the law
-        value = value - 360 * np.round((value - _retardance(leaf, grid)) / 360)
+        law = np.atleast_1d(leaf.retardance(grid * u.nm).to_value(u.deg))
+        value = value - 360 * np.round((value - law) / 360)
         axes.plot(grid, value, "o", color=st.GREY, label=_STAGE)
     # lines break between the values alone
     words = ", ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in _words(free or own))
-    axes.set_title("\n".join([f"{leaf.name}: law", *textwrap.wrap(words, _TITLE_WIDTH)]))
+    axes.set_title("\n".join([f"{leaf.name}: law", *textwrap.wrap(words, 58)]))
 
 
 def _words(own):
@@ -125,10 +124,6 @@ def _words(own):
         error = f" ± {float(std):.4f}" if np.ndim(std) == 0 and np.isfinite(std) else ""
         if np.ndim(entry["value"]) == 0:
             yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
-
-
-def _retardance(leaf, lam):
-    return np.atleast_1d(leaf.retardance(lam * u.nm).to_value(u.deg))
 
 
 # ---- legend -----------------------------------------------------------------------
@@ -170,8 +165,6 @@ _RETARDANCES = {
     "circular": r"circular retardance $\Delta_R$",
     "retardance": r"retardance $\Delta$",
 }
-# longer labels do not fit beside a panel
-_LABEL_WIDTH = 28
 
 
 def plot_retardances(calibration, *, figure=None):
@@ -325,7 +318,8 @@ def plot_parameters(calibration, names=None, *, figure=None):
         _draw_entry(axes, calibration, known[name], look)
         optic, _, key = name.rpartition(".")
         parameter = getattr(optics[optic], key)
-        words = textwrap.fill(parameter.__doc__ or parameter.name, _LABEL_WIDTH)
+        # longer labels do not fit beside a panel
+        words = textwrap.fill(parameter.__doc__ or parameter.name, 28)
         if parameter.unit is not None and parameter.unit != u.dimensionless_unscaled:
             words += f" ({'°' if parameter.unit == u.deg else parameter.unit})"
         axes.set(title=name, ylabel=words)
@@ -376,7 +370,6 @@ def _draw_all(figure, calibration, title, panels, draw):
 # dashes of their own: a thin metal line must not look like a fit
 _METAL_LOOKS = dict(zip(METALS, ((st.SKY, "--"), (st.ORANGE, "-."), (st.GREEN, ":")), strict=True))
 _MIRROR_LAW_ALONE = "fitted law, not determined: a choice of the law"
-_MIRROR_LABELS = {"diattenuation": "diattenuation (%)", "retardance": "retardance (°)"}
 
 
 def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
@@ -449,7 +442,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
                     axes.remove()
                     continue
                 _draw_mirror(axes, calibration, table, key, reference.get(table.meta["name"], {}))
-                axes.set_ylabel(_MIRROR_LABELS[key])
+                axes.set_ylabel(f"{key} ({'°' if key == 'retardance' else '%'})")
                 axes.tick_params(labelleft=True)
                 lowest = axes
             lowest.tick_params(labelbottom=True)
@@ -490,12 +483,7 @@ def _draw_mirror(axes, calibration, table, key, reference):
 
 
 # ---- history --------------------------------------------------------------------------------
-_MOST_LINES = 6
-# one tail of a normal law beyond three sigma; of more dates only such differences are marked
-_SEEN, _MOST_MARKS = 0.00135, 8
 _MOST_PANELS = 12
-# share of the time axis over which the wavelengths of one calibration are spread
-_SPREAD = 0.03
 
 
 def plot_history(calibrations, parameters=None, *, shown=None, title=None, figure=None):
@@ -557,7 +545,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
     with st.canvas(figure, 7.2 * columns, 3.6 * -(-len(own) // columns) + 0.6) as fig:
         axes, lowest = st.grid(fig, len(own), columns, sharex=True)
         for ax, (name, rows) in zip(axes, own.items(), strict=True):
-            _draw_history(ax, rows, name, _MOST_LINES if shown is None else shown)
+            _draw_history(ax, rows, name, 6 if shown is None else shown)
             _mark_changes(ax, calibrations, rows, name)
         per_wavelength = np.isfinite(table["wavelength"].value).any()
         aside = "; wavelengths of one date side by side" if per_wavelength else ""
@@ -575,8 +563,9 @@ def _draw_history(ax, own, name, most):
     several = np.isfinite(lam).all()
     if several:
         lam = lam[np.unique(np.linspace(0, lam.size - 1, min(most, lam.size)).astype(int))]
-    # a single date has no range to take a share of: one day
-    width = max(np.ptp(own["date"].mjd), 1.0) * _SPREAD if several else 0.0
+    # the wavelengths of one calibration are spread over a share of the time axis; a single date has
+    # no range to take it of: one day
+    width = max(np.ptp(own["date"].mjd), 1.0) * 0.03 if several else 0.0
     offsets = np.linspace(-width, width, lam.size) if lam.size > 1 else [0.0]
     for wavelength, shift, (color, marker) in zip(lam, offsets, st.looks(lam.size), strict=True):
         here = own[own["wavelength"].value == wavelength] if several else own
@@ -597,21 +586,20 @@ def _draw_history(ax, own, name, most):
 def _mark_changes(ax, calibrations, own, name):
     """Write between neighbours how many sigma they differ by."""
     held = {row["calibration"]: row["date"].mjd for row in own}
-    crowded = len(held) > _MOST_MARKS
+    crowded = len(held) > 8
     for first, second in pairwise(named_by_date(calibrations)):
         try:
             found = significance([first, second], [name])
         except (ParameterError, FitError):
             continue
-        if not found.dof or not {first[0], second[0]} <= set(held):
-            continue
-        if crowded and found.p_value >= _SEEN:
-            # of many, those that changed
+        # one tail of a normal law beyond three sigma; of many dates only such changes are marked
+        sure = found.p_value < 0.00135
+        if not (found.dof and {first[0], second[0]} <= set(held)) or (crowded and not sure):
             continue
         middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
         look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         look |= {"xytext": (0, -4), "ha": "center", "va": "top", "color": st.GREY}
-        look |= {"color": "black", "fontweight": "bold"} if found.p_value < _SEEN else {}
+        look |= {"color": "black", "fontweight": "bold"} if sure else {}
         ax.annotate(f"{found.sigma:.1f} {st.SIGMA}", (middle, 1), **look)
 
 

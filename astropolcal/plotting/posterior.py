@@ -14,9 +14,6 @@ __doctest_requires__ = {"plot_corner": ["corner"]}
 # more panels than this cannot be read
 MAX_CORNER = 12
 MAX_TRACES = 16
-# points of a walker in a trace, and of all walkers, which become a solid band far earlier
-_DRAWN_STEPS, _DRAWN_POINTS = 2000, 50_000
-_INCH = 2.1
 # behind words that stand on data
 _PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 _MARGIN = 1.35
@@ -75,26 +72,17 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         raise ParameterError(f"no corner plot: {', '.join(stuck)} did not move")
     labels, shifts = _labels(posterior, columns, samples)
     marks = posterior.fitted[columns] if fitted and posterior.fitted is not None else None
-    size = 1.2 + _INCH * len(columns)
+    size = 1.2 + 2.1 * len(columns)
     # corner sets margins of its own, which a layout engine would undo
     with canvas(figure, size, size, layout=None) as figure:
-        corner.corner(
-            samples - shifts,
-            fig=figure,
-            labels=labels,
-            label_kwargs={"fontsize": 9.5},
-            labelpad=0.06,
-            quantiles=(0.16, 0.5, 0.84),
-            # the content of 1, 2 and 3 sigma ellipses in two dimensions: 1 - exp(-s^2 / 2)
-            levels=1 - np.exp([-0.5, -2.0, -4.5]),
-            fill_contours=True,
-            plot_datapoints=False,
-            # enough samples in each to draw contours
-            bins=int(np.clip(np.sqrt(len(samples)) / 3, 12, 50)),
-            color=BLUE,
-            max_n_ticks=4,
-            hist_kwargs={"linewidth": 1.5},
-        )
+        look = {"color": BLUE, "quantiles": (0.16, 0.5, 0.84), "hist_kwargs": {"linewidth": 1.5}}
+        look |= {"labelpad": 0.06, "label_kwargs": {"fontsize": 9.5}, "max_n_ticks": 4}
+        look |= {"fill_contours": True, "plot_datapoints": False}
+        # the content of 1, 2 and 3 sigma ellipses in two dimensions: 1 - exp(-s^2 / 2)
+        look["levels"] = 1 - np.exp([-0.5, -2.0, -4.5])
+        # enough samples in each to draw contours
+        look["bins"] = int(np.clip(np.sqrt(len(samples)) / 3, 12, 50))
+        corner.corner(samples - shifts, fig=figure, labels=labels, **look)
         marks = None if marks is None else marks - shifts
         _finish_corner(figure, posterior, columns, samples - shifts, marks)
     return figure
@@ -219,8 +207,8 @@ def plot_traces(posterior, parameters=None, *, figure=None):
         panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
         for (trace, right), column in zip(panels, columns, strict=True):
             chain, steps = posterior.chain[:, :, column], posterior.steps
-            # the larger of both strides keeps either limit
-            every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
+            # so many points of a walker, and of all walkers, which become a solid band far earlier
+            every = max(len(chain) // 2000, chain.size // 50_000, 1)
             trace.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
             middle = np.median(chain[::every], axis=1)
             trace.plot(steps[::every], middle, color=BLACK, linewidth=1.0)

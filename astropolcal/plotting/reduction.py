@@ -7,8 +7,8 @@ import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting import _style as st
+from astropolcal.reduction.cubes import BEAMS
 from astropolcal.reduction.frames import open_cube
-from astropolcal.reduction.images import BEAMS
 
 __all__ = ["plot_apertures"]
 

@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The data of a calibration and its model against angles, and maps of what is left between them."""
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import astropy.units as u
 import numpy as np
@@ -18,15 +18,9 @@ __all__ = ["plot_double_differences"]
 SAME_ANGLE = 0.5
 
 
-@dataclass
-class Series:
-    """Data taken with the same setting of the half-wave plate."""
-
-    label: str
-    #: Which data belong to it, indices on the second axis of the grids.
-    data: np.ndarray
-    #: Mean position (rad) of every stage in each frame of a datum, or None if one moves.
-    positions: dict | None
+# data taken with the same setting of the half-wave plate: which they are, indices on the second
+# axis of the grids, and the mean position (rad) of every stage, or None if one moves
+Series = namedtuple("Series", "label data positions")
 
 
 class DataGrid:
@@ -56,23 +50,18 @@ class DataGrid:
         self.calibrated_um = measurement.wavelength
         self.is_star = is_star(self.part.observations.source) and "altitude" in self.part.positions
         self.derotator = np.rad2deg(self.position("derotator")[0])
-
-    @property
-    def abscissa(self):
-        """What the data are drawn against, in degree, and how that is called."""
+        # what the data are drawn against, in degree, and how that is called
+        self.abscissa, self.label = self.derotator, "derotator angle (°)"
         if self.is_star:
-            return np.rad2deg(self.position("altitude").mean(axis=0)), "altitude of the star (°)"
-        return self.derotator, "derotator angle (°)"
+            self.abscissa = np.rad2deg(self.position("altitude").mean(axis=0))
+            self.label = "altitude of the star (°)"
+        # the observable in words
+        self.quantity = self.observable.name.replace("_", " ")
 
     def _grid(self, flat):
         grid = np.full(self.part.valid.shape, np.nan)
         grid[self.part.valid] = flat
         return grid
-
-    @property
-    def quantity(self):
-        """Name of the observable in words."""
-        return self.observable.name.replace("_", " ")
 
     # ---- where the stages stand -------------------------------------------------
 
@@ -100,9 +89,8 @@ class DataGrid:
             still = now and len(set(angles)) == 1
             label = angles[0] if still else f" {st.MINUS} ".join(angles)
             moving = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
-            positions = {stage: a.mean(axis=1) for stage, a in moving.items()}
-            if any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values()):
-                positions = None
+            moves = any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values())
+            positions = None if moves else {s: a.mean(axis=1) for s, a in moving.items()}
             label = f"{label}, {now}" if now else label
             found.append(Series(label, np.flatnonzero(member), positions))
         return found
@@ -170,9 +158,6 @@ class DataGrid:
 
 
 # ---- observed and modelled differences ------------------------------------------------------
-_PANELS = 4
-# so many that a curve over 180 deg has no corners
-_CURVE_POINTS = 241
 
 
 def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=None):
@@ -226,7 +211,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     4
     """
     drawn = DataGrid(calibration, dataset)
-    bins = drawn.spread_bins(_PANELS) if wavelengths is None else drawn.nearest_bins(wavelengths)
+    bins = drawn.spread_bins(4) if wavelengths is None else drawn.nearest_bins(wavelengths)
     series = drawn.series()
     columns = min(2, len(bins))
     rows = -(-len(bins) // columns)
@@ -234,7 +219,11 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
     with st.canvas(figure, 3.0 + 4.4 * columns, height) as figure:
         pairs = _panels(figure, len(bins), rows, columns)
-        fine = _fine(drawn.abscissa[0])
+        # the curve goes a little beyond the data, ten degrees around a single angle
+        low, high = drawn.abscissa.min(), drawn.abscissa.max()
+        margin = 0.04 * (high - low) if high - low > 1 else 10
+        # so many points that a curve over 180 deg has no corners
+        fine = np.linspace(low - margin, high + margin, 241)
         curves = [None if one.positions is None else drawn.curve(one, bins, fine) for one in series]
         spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
@@ -245,7 +234,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
             if known:
                 bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
             for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
-                angle, points = drawn.abscissa[0][one.data], look | {"linestyle": "none"}
+                angle, points = drawn.abscissa[one.data], look | {"linestyle": "none"}
                 value, residual, sigma = (
                     a[row, one.data] for a in (drawn.observed, drawn.residual, drawn.sigma)
                 )
@@ -259,6 +248,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
                 else:
                     # where a stage moves from datum to datum there is no model between the data
                     top.plot(angle, value - residual, "x", color=look["color"], markersize=8)
+        pairs[0][0].set_xlim(fine[0], fine[-1])
         _label(pairs, drawn, columns)
         st.heading(figure, calibration, drawn.quantity.capitalize(), [drawn.part.observations.name])
         _legend(figure, drawn, series, bins, spread[bins])
@@ -289,23 +279,13 @@ def _looks(count):
     ]
 
 
-def _fine(angle):
-    """Return angles for the curve: a little beyond the data, ten degrees around a single one."""
-    low, high = angle.min(), angle.max()
-    # a single angle would give a curve without a length
-    margin = 0.04 * (high - low) if high - low > 1 else 10
-    return np.linspace(low - margin, high + margin, _CURVE_POINTS)
-
-
 def _label(pairs, grid, columns):
-    fine = _fine(grid.abscissa[0])
-    pairs[0][0].set_xlim(fine[0], fine[-1])
     for i, (top, bottom) in enumerate(pairs):
         last, first = i + columns >= len(pairs), i % columns == 0
         top.tick_params(labelbottom=False, labelleft=first)
         bottom.tick_params(labelbottom=last, labelleft=first)
         if last:
-            bottom.set_xlabel(grid.abscissa[1])
+            bottom.set_xlabel(grid.label)
         if first:
             top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
             bottom.set_ylabel(f"obs. {st.MINUS} model\n(%)")
@@ -342,8 +322,6 @@ def _legend(figure, grid, series, bins, s_res):
 # ---- maps of the residuals -------------------------------------------------------------------
 # share of the residuals that the colour scale covers, so that one outlier does not blank the map
 _COVERED = 99
-# maps have one scale unless those of their own differ by more than this factor
-_ONE_SCALE = 3
 # room above the tallest bar
 _HEADROOM = 1.05
 
@@ -389,7 +367,8 @@ def _scales(grids):
     residuals = [100 * grid.residual.ravel() for grid in grids]
     own = [st.color_limit(one, _COVERED) for one in residuals]
     ends = [limit for limit, _ in own]
-    if max(ends) > _ONE_SCALE * min(ends):
+    # maps have one scale unless those of their own differ by more than this factor
+    if max(ends) > 3 * min(ends):
         return own, False
     return [st.color_limit(np.concatenate(residuals), _COVERED)] * len(grids), True
 

@@ -15,7 +15,6 @@ import warnings
 import zlib
 from collections import namedtuple
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from fnmatch import fnmatchcase
 from functools import partial
@@ -48,8 +47,6 @@ _COLUMNS = (
 # headers that are read at a time by one process
 _BATCH = 64
 _DAY = 86400.0
-# degree; two commanded angles that differ by less are one
-_SAME_ANGLE = 0.3
 
 
 # ---- the index -----------------------------------------------------------------------------------
@@ -70,11 +67,8 @@ class Index:
             words = "another run works on this archive" if "locked" in str(problem) else problem
             raise AstropolcalError(f"{path}: {words}") from None
         except sqlite3.DatabaseError as problem:
-            warnings.warn(
-                f"{path}: not a readable index ({problem}); it is made again",
-                AstropolcalWarning,
-                stacklevel=2,
-            )
+            message = f"{path}: not a readable index ({problem}); it is made again"
+            warnings.warn(message, AstropolcalWarning, stacklevel=2)
             self._base.close()
             self.path.unlink()
             self._connect()
@@ -258,15 +252,10 @@ class _Frame(namedtuple("_Frame", _COLUMNS[:-1])):
         return moment.strftime("%Y%m%dT%H%M%S")
 
 
-@dataclass
-class Sequence:
+class Sequence(namedtuple("Sequence", "name instrument target mode frames")):
     """Frames that are worked on together."""
 
-    name: str
-    instrument: str
-    target: str | None
-    mode: str | None
-    frames: list
+    __slots__ = ()
 
     @property
     def files(self):
@@ -286,7 +275,8 @@ def _cut(frames, gap, cycles):
         # of which night a frame without a time is, nobody knows
         late = end is not None and (frame.mjd is None or frame.mjd - end > gap)
         known = frame.hwp is not None
-        same = [known and abs(_half_turn(frame.hwp - other)) < _SAME_ANGLE for other in seen]
+        # degree; two commanded angles that differ by less are one
+        same = [known and abs(_half_turn(frame.hwp - other)) < 0.3 for other in seen]
         if any(same[:-1]):
             # an angle that was there before the last one begins another cycle
             count, seen, same = count + 1, [], []
@@ -333,11 +323,8 @@ class Manifest:
             raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
         # the last one may have been cut off
         if n_bad > (not line.endswith("\n")):
-            warnings.warn(
-                f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
-                AstropolcalWarning,
-                stacklevel=3,
-            )
+            words = f"{n_bad} of its lines cannot be read; their sequences are done again"
+            warnings.warn(f"{self.path}: {words}", AstropolcalWarning, stacklevel=3)
 
     def add(self, entry):
         """Write down what became of a sequence."""

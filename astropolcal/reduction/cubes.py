@@ -17,8 +17,11 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
+from astropy.stats import gaussian_fwhm_to_sigma
 from astropy.table import QTable
 from astropy.time import Time
+from scipy import ndimage
+from scipy.special import erf
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import (
@@ -32,9 +35,10 @@ from astropolcal.instruments.layout import TEXTS, unit_of
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import offline, tracked
 from astropolcal.progress import shown, steps
-from astropolcal.reduction.images import Scene, expose, number, per_wavelength, pixels
-from astropolcal.simulation import entering_flux, expected_fluxes, simulate
-from astropolcal.units import check_seed
+from astropolcal.reduction.photometry import rectangles, turned
+from astropolcal.reduction.wings import HALO_BETA
+from astropolcal.simulation import check_electrons, entering_flux, expected_fluxes, simulate
+from astropolcal.units import angle_to_rad, check_seed
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -46,9 +50,7 @@ __all__ = [
     "true_observations",
 ]
 
-_SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
-# share of the saturation that a default may fill: there is room for better seeing, uneven pixels
-_FILLED = 0.5
+_SOURCES = ("internal", "star")
 
 
 @dataclass(frozen=True)
@@ -94,20 +96,6 @@ class ImageModel:
     motion: object = 0.0
     seeing: float = 0.0
     margin: float = 6.0
-
-    def _scene(self, layout, source, n_wavelengths):
-        """Return what falls on the detector, of numbers that have been checked."""
-        check_choice("psf", self.psf, _PROFILES, ParameterError)
-        return Scene(
-            layout,
-            source=source,
-            psf=self.psf,
-            fwhm=pixels("fwhm", self.fwhm, layout, n_wavelengths),
-            beta=number("beta", self.beta, above=1.0),
-            halo=number("halo", self.halo, most=1.0),
-            halo_fwhm=pixels("halo_fwhm", self.halo_fwhm, layout, n_wavelengths),
-            margin=number("margin", self.margin),
-        )
 
     def _places(self, rng, scene, layout, n_frames):
         """Return the place of the star and the factor of its width, in each frame."""
@@ -161,12 +149,8 @@ class DetectorModel:
         """Return the way in which the detector is read out, and the background (W, 1, 1)."""
         gain = how.gain if self.gain is None else self.gain
         noise = how.read_noise if self.read_noise is None else self.read_noise
-        how = replace(
-            how,
-            gain=number("gain", gain, above=0.0),
-            read_noise=number("read_noise", noise),
-            saturation=how.saturation if self.saturate else np.inf,
-        )
+        own = {"gain": number("gain", gain, above=0.0), "read_noise": number("read_noise", noise)}
+        how = replace(how, **own, saturation=how.saturation if self.saturate else np.inf)
         return how, per_wavelength("background", self.background, n_wavelengths)[:, None, None]
 
     def _pixels(self, rng, shape):
@@ -311,18 +295,15 @@ def simulate_cubes(
     ...     fits.getdata(paths[0], 1).shape
     (22, 201, 201)
     """
-    image, detector, files = (
-        image or ImageModel(),
-        detector or DetectorModel(),
-        files or CubeFiles(),
-    )
+    image, detector = image or ImageModel(), detector or DetectorModel()
+    files = files or CubeFiles()
     layout, wavelength, more = _of_mode(instrument, wavelength)
     # what is given goes before what the mode says
     more |= files.headers or {}
     check_choice("source", source, _SOURCES, ParameterError)
     frames = _with_headers(frames, layout, source, files.exposure_time, files.start)
     n_frames = len(frames)
-    scene = image._scene(layout, source, len(wavelength))
+    scene = Scene(image, layout, source, len(wavelength))
     ways = _read_outs(frames, layout)
     read = [detector._read_by(way, len(wavelength)) for way in ways]
     light = {"wavelength": wavelength, "source": source, "lamp": lamp, "stokes": stokes}
@@ -331,10 +312,8 @@ def simulate_cubes(
         flux = _usual_flux(chain, instrument, frames, 1e7, **light, **looks)
     beams = _beam_fluxes(chain, frames, flux=flux, **light)
     # a generator for each frame, so that a frame is the same however many are simulated
-    *seeds, of_pixels, of_star = map(
-        np.random.default_rng,
-        np.random.SeedSequence(check_seed(seed, generator=False)).spawn(n_frames + 2),
-    )
+    seeds = np.random.SeedSequence(check_seed(seed, generator=False)).spawn(n_frames + 2)
+    *seeds, of_pixels, of_star = map(np.random.default_rng, seeds)
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)
     flat, bad = detector._pixels(of_pixels, layout.shape)
@@ -352,12 +331,10 @@ def simulate_cubes(
             header = layout.to_header(header_of(frames[i], layout) | more)
             write_cube(*names[i], cube, weight, header, layout)
     if fullest[0] > 1 and not detector.saturate:
-        warnings.warn(
-            f"the brightest pixel has {fullest[1]:.3g} adu, above the saturation of "
-            f"{fullest[2]:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
-            AstropolcalWarning,
-            stacklevel=2,
-        )
+        words = f"{fullest[1]:.3g} adu, above the saturation of {fullest[2]:g} adu"
+        advice = "lower the flux (--flux), or cut pixels off there (--saturate)"
+        message = f"the brightest pixel has {words}: {advice}"
+        warnings.warn(message, AstropolcalWarning, stacklevel=2)
     return [cube for cube, _ in names]
 
 
@@ -367,9 +344,10 @@ def _usual_flux(
     """Return the flux of cubes for which none is given, at most so much."""
     layout, wavelength, _ = _of_mode(instrument, wavelength)
     frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
-    share = image._scene(layout, source, len(wavelength)).peak()
+    share = Scene(image, layout, source, len(wavelength)).peak()
     fluxes = _beam_fluxes(chain, frames, wavelength, source, **light)
-    room = _FILLED * min(way.saturation for way in _read_outs(frames, layout))
+    # a default may fill half of the saturation: room for better seeing, and uneven pixels
+    room = 0.5 * min(way.saturation for way in _read_outs(frames, layout))
     room = room - per_wavelength("background", background, len(wavelength))
     if np.any(room <= 0):
         # no flux is low enough, which is warned of later
@@ -664,3 +642,202 @@ def _value(column, value, layout):
     # value = factor * header + offset, turned round
     factor, offset = layout.transforms.get(column, (1.0, 0.0))
     return float((number - offset) / factor)
+
+
+# ---- images of both beams: field stop, stars, detector ------------------------------------------
+
+# what is simulated are both beams of a Wollaston prism
+BEAMS = ("right", "left")
+
+# three-point Gauss rule over a pixel
+_NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.0, 5.0]) / 18
+
+
+class Scene:
+    """Where the light of each beam falls: the shares of its flux in every pixel."""
+
+    def __init__(self, image, layout, source, n_wavelengths):
+        check_choice("psf", image.psf, ("moffat", "gaussian"), ParameterError)
+        self.shape, self.source, self.psf = layout.shape, source, image.psf
+        self.fwhm = pixels("fwhm", image.fwhm, layout, n_wavelengths)
+        self.beta = number("beta", image.beta, above=1.0)
+        self.halo = number("halo", image.halo, most=1.0)
+        self.halo_fwhm = pixels("halo_fwhm", image.halo_fwhm, layout, n_wavelengths)
+        margin = number("margin", image.margin)
+        left, right, width, height, angle = layout.internal_apertures
+        self.offset = np.asarray(layout.star_offset, dtype=float)
+        # the field stop moves with the star from beam to beam
+        # place in the left beam whose image in the right one is as far off its aperture
+        self.centre = (np.add(left, right) - self.offset) / 2
+        # flux of a lamp is what an aperture of the layout gets, whatever the stop
+        self.area = width * height
+        # margin on all sides: an aperture must not see the edge of the stop
+        size = (width + 2 * margin, height + 2 * margin)
+        self.boxes, self.stops = [], []
+        apertures = rectangles(layout.internal_apertures, layout.shape[1:])
+        places = self.centres(self.centre)
+        for place, (rows, columns, weights) in zip(places, apertures, strict=True):
+            stop = rectangle(layout.shape[1:], place, size, angle)
+            if not stop.any():
+                raise InstrumentError("internal_apertures: a beam lies outside the cube")
+            if source == "internal" and np.any(stop[rows, columns][weights > 0] < 1):
+                raise ParameterError(
+                    f"margin = {margin:g} pixels: the field stop cuts the apertures of the layout"
+                )
+            # a stop fills a part of the image only; profiles are computed inside
+            (box,) = ndimage.find_objects((stop > 0).astype(int))
+            self.boxes.append(box)
+            self.stops.append(stop[box])
+
+    def check_places(self, centres):
+        """Refuse frames whose star lies outside of the image, in either beam."""
+        if self.source != "star":
+            return
+        rows, columns = self.shape[1:]
+        for beam, places in zip(BEAMS, self.centres(centres), strict=True):
+            outside = ((places < 0) | (places > (columns - 1, rows - 1))).any(axis=1)
+            if outside.any():
+                x, y = places[int(np.argmax(outside))]
+                raise ParameterError(
+                    f"the star in the {beam} beam is at ({x:.4g}, {y:.4g}), outside of the image "
+                    f"of {columns} x {rows} pixels"
+                )
+
+    def centres(self, left):
+        """Return the place in the right and in the left beam."""
+        return np.asarray(left) + self.offset, np.asarray(left)
+
+    def peak(self):
+        """Return the largest share of a beam's light in a pixel, one per wavelength or one."""
+        if self.source != "star":
+            return 1 / self.area
+        # in the middle of a pixel it is the largest
+        box = tuple(slice(0, size) for size in self.shape[1:])
+        middle = np.array(self.shape[:0:-1]) // 2
+        return self._star(box, middle, self.fwhm).max(axis=(1, 2))
+
+    def light(self, fluxes, centre, widening):
+        """Return the image of both beams, in the unit of the fluxes."""
+        image = np.zeros(self.shape)
+        places = self.centres(centre)
+        for beam, stop, box, place in zip(fluxes, self.stops, self.boxes, places, strict=True):
+            if self.source == "star":
+                share = stop * self._star(box, place, self.fwhm * widening)
+            else:
+                share = stop / self.area
+            # (W, 1, 1) times (y, x) of a lamp or (W, y, x) of a star; stops may overlap
+            image[(slice(None), *box)] += beam[:, None, None] * share
+        return image
+
+    def _star(self, box, place, fwhm):
+        """Return the share of a star's light in the pixels of a box, (n_wavelengths, y, x)."""
+        # both have the same arguments, of which a Gaussian needs fewer
+        core = moffat if self.psf == "moffat" else gaussian
+        share = _by_width(core, box, place, fwhm, self.beta)
+        if self.halo:
+            halo = _by_width(moffat, box, place, self.halo_fwhm, HALO_BETA)
+            share = (1 - self.halo) * share + self.halo * halo
+        return share
+
+
+def rectangle(shape, centre, size, angle):
+    """Return the part of each pixel within a turned rectangle, its edges a pixel wide."""
+    sides = zip(turned(shape, centre, angle), size, strict=True)
+    # linear over one pixel: the area stays that of the rectangle at any angle
+    return np.prod([np.clip(full / 2 - np.abs(d) + 0.5, 0, 1) for d, full in sides], axis=0)
+
+
+def _by_width(profile, box, place, fwhm, beta):
+    """Return a profile for each wavelength; equal widths are computed once."""
+    widths, which = np.unique(fwhm, return_inverse=True)
+    return np.stack([profile(box, place, width, beta) for width in widths])[which]
+
+
+def gaussian(box, place, fwhm, _beta):
+    """Return the exact integral over every pixel of a Gaussian of unit sum."""
+    # erf(x / (sqrt 2 sigma)) / 2 is the integral of a unit Gaussian from 0 to x
+    scale = np.sqrt(2) * fwhm * gaussian_fwhm_to_sigma
+    parts = []
+    for along, middle in zip(box, (place[1], place[0]), strict=True):
+        edges = np.arange(along.start, along.stop + 1) - 0.5
+        parts.append(0.5 * np.diff(erf((edges - middle) / scale)))
+    return np.outer(*parts)
+
+
+def moffat(box, place, fwhm, beta):
+    """Return the integral over every pixel of a Moffat profile of unit sum."""
+    # alpha, by which r is divided: the profile is 1/2 at r = fwhm / 2
+    core = fwhm / (2 * np.sqrt(2 ** (1 / beta) - 1))
+    squares = []
+    for along, middle in zip(box, (place[1], place[0]), strict=True):
+        # three nodes a pixel and axis, exact for the fifth degree across a pixel
+        nodes = np.arange(along.start, along.stop)[:, None] + _NODES
+        squares.append((nodes.ravel() - middle) ** 2)
+    profile = (1 + np.add.outer(*squares) / core**2) ** -beta
+    rows, columns = (size // 3 for size in profile.shape)
+    # i, j: pixels; a, b: nodes within
+    pixels = np.einsum("iajb,a,b->ij", profile.reshape(rows, 3, columns, 3), _WEIGHTS, _WEIGHTS)
+    # integral over the plane of (1 + r^2/alpha^2)^-beta is pi alpha^2 / (beta - 1)
+    return pixels * (beta - 1) / (np.pi * core**2)
+
+
+def expose(light, how, response, rng):
+    """
+    Return the image in adu that a detector, `ReadOut`, makes of light, and inverse variances.
+
+    Of the light in each pixel, with that of the background; without noise where ``rng`` is None.
+    """
+    electrons = how.gain * response * light
+    # in adu^2; of the expectation, not of what was drawn, so that weights are unbiased
+    variance = (how.excess_noise**2 * electrons + how.read_noise**2) / how.gain**2
+    check_electrons(electrons)
+    if rng is not None:
+        electrons = rng.poisson(electrons)
+        # each becomes an exponentially distributed number of them; F^2 = 1 + the variance of
+        # what one becomes, in units of the gain squared
+        extra = how.excess_noise**2 - 1
+        electrons = extra * rng.gamma(electrons / extra) if extra > 0 else electrons
+        electrons = electrons + how.read_noise * rng.standard_normal(light.shape)
+    # in adu, as the layout gives it
+    image = np.minimum(electrons / how.gain, how.saturation)
+    with np.errstate(divide="ignore"):
+        weight = np.where(variance > 0, 1 / variance, 0.0)
+    return image.astype(np.float32), weight.astype(np.float32)
+
+
+# ---- arguments -----------------------------------------------------------------------------------
+
+
+def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
+    """Return a number within its bounds, of which ``above`` is itself not allowed."""
+    value = float(value)
+    # NaN compares as false and is refused as well
+    if not (np.isfinite(value) and least <= value <= most and value > above):
+        bounds = f"above {above:g}" if above > least or above == least else f"{least:g} and above"
+        raise ParameterError(f"{name} = {value:g}; allowed is {bounds}, up to {most:g}")
+    return value
+
+
+def per_wavelength(name, value, n_wavelengths):
+    """Return numbers that are not negative, one per wavelength, shape (W,)."""
+    value = np.asarray(value, dtype=float)
+    if value.shape not in ((), (n_wavelengths,)) or not np.all(np.isfinite(value) & (value >= 0)):
+        raise ParameterError(
+            f"{name} = {value}; allowed are numbers not negative, of shape () or ({n_wavelengths},)"
+        )
+    return np.broadcast_to(value, (n_wavelengths,))
+
+
+def pixels(name, value, layout, n_wavelengths, least=0.5):
+    """Return a length on the detector in pixels, one per wavelength."""
+    # a plain number, and a Quantity without a unit, are pixels already
+    if isinstance(value, u.Quantity) and value.unit is not u.dimensionless_unscaled:
+        if value.unit.is_equivalent(u.pix):
+            value = value.to_value(u.pix)
+        else:
+            # milliarcsecond in a degree, the unit of a layout's pixel scale
+            value = np.rad2deg(angle_to_rad(value, name)) * 3.6e6 / layout.pixel_scale
+    value = per_wavelength(name, value, n_wavelengths)
+    if value.min() < least:
+        raise ParameterError(f"{name} = {value.min():g} pixels; allowed are {least:g} and above")
+    return value

@@ -4,8 +4,9 @@
 import hashlib
 import re
 import warnings
+from collections import namedtuple
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from astropolcal.instruments.layout import ANGLES, card_value
 from astropolcal.observations.grid import mean_of_exposures
 from astropolcal.pipeline.headers import told_beam
 from astropolcal.reduction.headers import (
-    FrameHeader,
+    Frame,
     _half_turn,
     add_pointing,
     configured,
@@ -36,46 +37,10 @@ from astropolcal.reduction.headers import (
     read_header,
     tracking_error,
 )
-from astropolcal.reduction.photometry import Photometry, detector_of, evenly_lit, measure_internal
+from astropolcal.reduction.photometry import detector_of, evenly_lit, measure_internal
 from astropolcal.reduction.stars import measure_stars
 
 __all__ = []
-
-
-@dataclass
-class Frame(FrameHeader):
-    """What is known of one file."""
-
-    photometry: Photometry | None = None
-    # of the fluxes, by which copies are recognized
-    digest: str = ""
-
-    @property
-    def usable(self):
-        """Whether there are fluxes, and no error."""
-        return self.photometry is not None and not self.errors
-
-    @property
-    def name(self):
-        """Name of the file without its folder."""
-        return Path(self.path).name
-
-    def to_dict(self):
-        """Return plain numbers and texts, from which `from_dict` makes the same frame."""
-        plain = self.photometry and {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(self.photometry).items()
-        }
-        return vars(self) | {"photometry": plain}
-
-    @classmethod
-    def from_dict(cls, content):
-        """Return the frame that `to_dict` described."""
-        if (plain := content["photometry"]) is not None:
-            others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
-            arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
-            content = content | {"photometry": Photometry(**arrays, **others)}
-        return cls(**content)
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -89,7 +54,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
     try:
         with open_cube(path, layout, masters) as (primary, header, cube, good):
             # the header that is open already
-            vars(frame).update(vars(read_header(path, layout, header=primary, raw=raw)))
+            frame = read_header(path, layout, header=primary, raw=raw)
             _check_header(frame, layout, source)
             # per file: gain and exposure time may change within a night
             detector = detector_of(layout, _unit_of(header, primary), frame.values)
@@ -424,20 +389,9 @@ def beam_detectors(path, layout, values, unit=None):
 # ---- science frames, before their light is measured ---------------------------------------------
 
 
-@dataclass
-class Night:
-    """What the headers tell: date (or None) of each frame, and mode and optics of all."""
-
-    moments: dict
-    mode: str | None = None
-    beam: dict = field(default_factory=dict)
-
-    @property
-    def dates(self):
-        """Dates of the first and the last frame."""
-        # ISO dates sort as text; a calibration that holds at both ends holds between them
-        known = sorted(date for date in self.moments.values() if date)
-        return list(dict.fromkeys((known[0], known[-1]))) if known else []
+# what the headers tell: date (or None) of each frame, dates of the first and the last, and mode and
+# optics of all
+Night = namedtuple("Night", "moments dates mode beam")
 
 
 def read_night(files, instrument):
@@ -462,8 +416,11 @@ def read_night(files, instrument):
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
+    # ISO dates sort as text; a calibration that holds at both ends holds between them
+    known = sorted(filter(None, moments.values()))
     beam = told_beam([primary_header(file) for file in files], instrument, files)
-    return Night(moments, next(iter(modes), None), beam)
+    dates = list(dict.fromkeys(known[:1] + known[-1:]))
+    return Night(moments, dates, next(iter(modes), None), beam)
 
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
@@ -522,7 +479,7 @@ def _check_one_target(files, frames):
     """Refuse frames with the same data, and warn of frames of different objects."""
     seen, objects = {}, {}
     for file, frame in zip(files, frames, strict=True):
-        first = seen.setdefault(frame.digest, file) if getattr(frame, "digest", "") else file
+        first = seen.setdefault(frame.digest, file) if frame.digest else file
         if first != file:
             raise ObservationError(f"{file}: the same data as {first}; leave one of them out")
         name = frame.values.get("object")
@@ -531,11 +488,8 @@ def _check_one_target(files, frames):
             objects.setdefault(re.sub(r"[^\w+-]|_", "", name).casefold(), (name, file))
     if len(objects) > 1:
         (one, first), (other, second) = list(objects.values())[:2]
-        warnings.warn(
-            f"{first} is of object {one!r}, {second} of {other!r}: corrected as one",
-            AstropolcalWarning,
-            stacklevel=4,
-        )
+        message = f"{first} is of object {one!r}, {second} of {other!r}: corrected as one"
+        warnings.warn(message, AstropolcalWarning, stacklevel=4)
 
 
 def _survey(files, layout, raw, find):
@@ -552,7 +506,7 @@ def _survey(files, layout, raw, find):
 
 def _known(path, layout, raw):
     """Return what is known of a frame whose light is not measured."""
-    frame = Frame(**vars(read_header(path, layout, raw=raw)))
+    frame = read_header(path, layout, raw=raw)
     with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
         # what is not there is refused where it is corrected
         if len(hdus) > layout.cube_extension and hdus[layout.cube_extension].data is not None:

@@ -37,14 +37,13 @@ from astropolcal.instruments.layout import (
 )
 from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, sky_angle
+from astropolcal.reduction.photometry import Photometry
 from astropolcal.units import iso_date
 from astropolcal.words import listed
 
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
-# days that start, middle and end of an exposure may be apart
-_RAW_APART = 1 / 24
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 # in which the times and the places of targets are understood
@@ -52,8 +51,8 @@ _SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
 
 @dataclass
-class FrameHeader:
-    """The keywords of a frame in the units of a layout."""
+class Frame:
+    """What is known of one file: its keywords, in the units of a layout, and what was measured."""
 
     path: str
     number: int | None = None
@@ -64,6 +63,36 @@ class FrameHeader:
     doubts: list = field(default_factory=list)
     # of the pixels; None if the header does not say
     unit: str | None = None
+    photometry: Photometry | None = None
+    # of the fluxes, by which copies are recognized
+    digest: str = ""
+
+    @property
+    def usable(self):
+        """Whether there are fluxes, and no error."""
+        return self.photometry is not None and not self.errors
+
+    @property
+    def name(self):
+        """Name of the file without its folder."""
+        return Path(self.path).name
+
+    def to_dict(self):
+        """Return plain numbers and texts, from which `from_dict` makes the same frame."""
+        plain = self.photometry and {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self.photometry).items()
+        }
+        return vars(self) | {"photometry": plain}
+
+    @classmethod
+    def from_dict(cls, content):
+        """Return the frame that `to_dict` described."""
+        if (plain := content["photometry"]) is not None:
+            others = {"reasons": list(plain["reasons"]), "outliers": int(plain["outliers"])}
+            arrays = {name: np.array(plain[name], dtype=float) for name in plain.keys() - others}
+            content = content | {"photometry": Photometry(**arrays, **others)}
+        return cls(**content)
 
 
 def frame_number(name, layout, header=None):
@@ -116,7 +145,7 @@ def read_header(path, layout, *, header=None, raw=None):
     Keywords that are missing or impossible are in ``errors`` and ``doubts``.
     """
     header = primary_header(path) if header is None else header
-    frame = FrameHeader(str(path), frame_number(path, layout, header))
+    frame = Frame(str(path), frame_number(path, layout, header))
     frame.unit = card_value(header, "BUNIT")
     # what is in the file goes before what a header says of it
     stack = card_value(header, "NAXIS3") if card_value(header, "NAXIS") == 3 else 1
@@ -177,8 +206,8 @@ def _raw_header(frame, paths, header, layout):
         with suppress(ObservationError):
             told = {key: look_up([one], key, layout)[1] for key in ("mjd", "date", "time")}
             times.append(observation_time(told))
-    # numbers begin again, in other nights
-    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > _RAW_APART:
+    # numbers begin again, in other nights; start, middle and end may be an hour apart
+    if len(times) == 2 and abs(times[0].mjd - times[1].mjd) > 1 / 24:
         ours, theirs = (time.isot for time in times)
         raise ObservationError(f"{names[0]} of the same number is of {theirs}, the cube of {ours}")
     return found
@@ -380,9 +409,6 @@ def _misfits(block, steps, sequence, uneven):
 
 # ---- files of several cameras --------------------------------------------------------------------
 
-# seconds; cameras may start as far apart in exposures shorter than twice that
-_APART = 1.0
-
 
 def sort_beams(files, layout):
     """
@@ -404,7 +430,8 @@ def sort_beams(files, layout):
         for path, (start, length) in groups.get((right, state), {}).items():
             apart = {other: abs(start - begin) for other, (begin, _) in lefts.items()}
             near = min(apart, key=apart.get, default=None)
-            if near is not None and apart[near] <= max(length / 2, _APART):
+            # seconds; cameras may start as far apart in exposures shorter than twice that
+            if near is not None and apart[near] <= max(length / 2, 1.0):
                 partners[path] = near
                 del lefts[near]
     for (camera, state), group in groups.items():

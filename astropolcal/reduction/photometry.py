@@ -67,8 +67,6 @@ class Photometry:
 
 # ---- errors of fluxes ----------------------------------------------------------------------------
 
-# a pixel counts as full from this part of the saturation on
-_FULL = 1 - 5e-7
 # variance of a median over that of a mean, for normal noise and many pixels
 _MEDIAN = np.pi / 2
 
@@ -114,14 +112,9 @@ class Detector:
 
     def in_units_of(self, other):
         """Return the same detector where its electrons count as another one's do."""
-        factor = self.units_of(other)
-        return replace(
-            self,
-            unit=other.unit,
-            gain=other.gain * self.exposures / other.exposures,
-            read_noise=self.read_noise * factor,
-            saturation=self.saturation * factor,
-        )
+        factor, gain = self.units_of(other), other.gain * self.exposures / other.exposures
+        noise, full = self.read_noise * factor, self.saturation * factor
+        return replace(self, unit=other.unit, gain=gain, read_noise=noise, saturation=full)
 
 
 def pixel_unit(unit):
@@ -157,7 +150,7 @@ def detector_of(layout, unit=None, values=None):
     electrons = float((counts * gain).to_value(u.electron))
     # saturation and noise in electrons, which no unit of the file changes; a pixel that is full
     # may be rounded down, as files in other units have it in single precision
-    full, noise = _FULL * how.saturation * how.gain / electrons, how.read_noise / electrons
+    full, noise = (1 - 5e-7) * how.saturation * how.gain / electrons, how.read_noise / electrons
     return Detector(own, electrons, noise, full, how.excess_noise, exposures)
 
 
@@ -194,16 +187,11 @@ def shared_pixels(centre_distance, radius, background_variance):
 # Rectangles keep clear of the edges of the field stop: McIntosh et al. 2026; 't Hart et al. 2021,
 # Proc. SPIE 11833.
 
-_BACKGROUNDS = ("none", "outside")
 # a background pixel is this far, in pixels, from both rectangles
 _CLEAR = 12.0
 # a pixel is far off its neighbours with twice their light, and so many standard deviations and
 # electrons more: where electrons are rare and multiplied, single ones are far off what is around
 _FACTOR, _SIGMAS, _ELECTRONS = 2.0, 10.0, 30.0
-# one pixel in so many tells the level of a rectangle
-_SAMPLED = 5
-# a rectangle whose median pixel has less than this part of the mean one holds a star
-_EVEN = 0.5
 
 
 def turned(shape, centre, angle):
@@ -244,7 +232,7 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The
     options are described in `reduce_run`.
     """
-    check_choice("background", background, _BACKGROUNDS, ParameterError)
+    check_choice("background", background, ("none", "outside"), ParameterError)
     if not 0 <= max_masked < 1:
         raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
     good = np.isfinite(cube) if good is None else good
@@ -298,14 +286,16 @@ def evenly_lit(cube, good, layout):
         beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
     # the brighter one: of light that is all in one polarization the other is dark
     mean, median = max(beams)
-    return bool(median >= _EVEN * mean)
+    # a rectangle whose median pixel has less than this part of the mean one holds a star
+    return bool(median >= 0.5 * mean)
 
 
 # damaged pixels may be beyond all numbers, and are then infinitely far off
 @np.errstate(over="ignore", invalid="ignore")
 def outliers(cut, known, weights, detector, factor=_FACTOR):
     """Return the single pixels far off their neighbours, with more than ``factor`` their light."""
-    sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
+    # one pixel in so many tells the level of a rectangle
+    sample = (slice(None), *(index[::5] for index in np.nonzero(weights)))
     level = _median(cut[sample], known[sample])
     spread = MAD_TO_SIGMA * _median(np.abs(cut[sample] - level[:, None]), known[sample])
 

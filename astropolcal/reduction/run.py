@@ -35,8 +35,6 @@ from astropolcal.words import check_choice, counted
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
-# below this number of files a process, its start costs more than it saves
-_FILES_A_WORKER = 100
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
@@ -177,12 +175,9 @@ def reduce_cubes(files, instrument, **options):
     reduction = reduce_run(files, instrument, **options)
     for words, told in (("left out", reduction.problems), ("doubtful", reduction.doubts)):
         for path, why in list(told.items())[:1]:
-            warnings.warn(
-                f"{counted(len(told), 'file')} {words} (reduce_run lists all); the first is "
-                f"{path}: {'; '.join(why)}",
-                AstropolcalWarning,
-                stacklevel=2,
-            )
+            first = f"the first is {path}: {'; '.join(why)}"
+            message = f"{counted(len(told), 'file')} {words} (reduce_run lists all); {first}"
+            warnings.warn(message, AstropolcalWarning, stacklevel=2)
     return reduction.observations
 
 
@@ -295,18 +290,13 @@ def reduce_run(
     masters = Masters(*(None if path is None else str(path) for path in (dark, flat)))
     # a dark that does not fit is no fault of the frames
     masters.check(layout)
-    task = {
-        "layout": layout,
-        "masters": None if masters == Masters() else masters,
-        "source": photometry,
-        "raw": None if raw is None else raw_frames(raw, layout),
-        "options": options,
-    }
+    raw = None if raw is None else raw_frames(raw, layout)
+    kept = {"options": options, "masters": None if masters == Masters() else masters}
+    task = {"layout": layout, "source": photometry, "raw": raw} | kept
     frames = _measure_all(cubes, task, workers, cluster, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
-    kept = {"options": options, "masters": task["masters"]}
     reduction = Reduction(instrument, photometry, problems=lost, **kept)
     frames = _usable(frames, reduction, layout, hwp_sequence, keep_repeats)
     if not frames:
@@ -399,7 +389,8 @@ def _measure_all(files, task, workers, cluster, resume, progress):
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
     if workers is None:
-        workers = max(1, min(os.cpu_count() or 1, len(todo) // _FILES_A_WORKER))
+        # below this number of files a process, its start costs more than it saves
+        workers = max(1, min(os.cpu_count() or 1, len(todo) // 100))
     if not (isinstance(workers, int) and workers >= 1):
         raise ParameterError(f"workers = {workers!r}; a whole number above zero is needed")
     results = _results(todo, task, min(workers, max(len(todo), 1)), cluster)

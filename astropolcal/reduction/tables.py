@@ -17,7 +17,6 @@ from astropolcal.units import plain_number
 __all__ = ["read_pypolcal"]
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
-_GEOMETRY = {"x": "pix", "y": "pix", "fwhm": "pix", "radius": "pix"}
 
 
 def reduced_table(frames, instrument, meta):
@@ -31,9 +30,8 @@ def reduced_table(frames, instrument, meta):
     if not frames:
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
-    flux, variance, covariance = (
-        _stack(frames, name) for name in ("flux", "variance", "covariance")
-    )
+    flux, variance = _stack(frames, "flux"), _stack(frames, "variance")
+    covariance = _stack(frames, "covariance")
     beams = instrument.files.beams
     names = ["flux"] if len(beams) == 1 else [f"flux_{beam}" for beam in beams]
     columns = dict(zip(names, flux, strict=True))
@@ -100,7 +98,8 @@ def photometry_table(frames, instrument):
     if not frames:
         return table
     failed = np.concatenate([frame.photometry.failed for frame in frames])
-    for name, unit in (_GEOMETRY | {"background": frames[0].unit}).items():
+    units = dict.fromkeys(("x", "y", "fwhm", "radius"), "pix") | {"background": frames[0].unit}
+    for name, unit in units.items():
         for beam, values in zip(instrument.files.beams, _stack(frames, name), strict=True):
             table[f"{name}_{beam}"] = _column(values, failed, u.Unit(unit))
     for name in ("scale", "scale_err"):
@@ -186,10 +185,8 @@ def read_pypolcal(files, meta=None, *, name=None):
         for column, ours in _ERRORS.items():
             table[ours] = _numbers(rows, column) * u.adu
     table.meta.update({"instrument": "SCExAO/CHARIS"} | dict(meta or {}))
-    folder = paths[0].parent.name
-    return Observations.from_table(
-        table, name=name or (folder if len(paths) > 1 else paths[0].stem)
-    )
+    name = name or (paths[0].parent.name if len(paths) > 1 else paths[0].stem)
+    return Observations.from_table(table, name=name)
 
 
 def _rows(files):

@@ -12,7 +12,7 @@ Moffat 1969, A&A 3, 455: the profile. Its exponent is 11/6 in the wings of a
 seeing-limited image (Racine 1996, PASP 108, 699).
 """
 
-from dataclasses import dataclass
+from collections import namedtuple
 from functools import cached_property
 
 import numpy as np
@@ -27,12 +27,7 @@ __all__ = []
 HALO_BETA = 11 / 6
 # full width of the halo: that of the seeing, milliarcsecond, and its relative uncertainty
 _SEEING, _SEEING_SPREAD = 500.0, 0.35
-# full width at half maximum over alpha
-_HALO_WIDTH = 2 * np.sqrt(2 ** (1 / HALO_BETA) - 1)
-# rings up to this multiple of the given radius
-_TO = 1.5
-# part of an aperture that may lie outside of the lit field
-_UNLIT = 0.2
+
 # ln of core width over Gaussian width, 1 / exponent, ln of halo radius, slope of the first
 _START = np.array([np.log(0.6), 0.3, 0.0, 0.0])
 _LOW, _HIGH = np.array([-2.0, 1e-3, -1.2, -0.5]), np.array([1.0, 0.7, 1.2, 0.5])
@@ -59,32 +54,26 @@ def wing_shares(cube, good, photometry, level_variance, detector, layout, *, rea
     """
     if photometry.failed.all():
         return None
-    star = Star.of(cube, good, photometry, level_variance, layout)
-    if star.unlit_part > _UNLIT or (rings := Rings.of(star, reach * _TO)) is None:
+    star = Star(cube, good, photometry, level_variance, layout)
+    # part of an aperture that may lie outside of the lit field
+    if star.unlit_part > 0.2 or (rings := rings_of(star, reach * 1.5)) is None:
         return None
-    seeing = min(_SEEING / layout.pixel_scale, reach)
-    return _fit(star, rings, detector, seeing / _HALO_WIDTH)
+    # full width at half maximum over the radius of the profile
+    width = 2 * np.sqrt(HALO_BETA * (2 ** (1 / HALO_BETA) - 1))
+    return _fit(star, rings, detector, min(_SEEING / layout.pixel_scale, reach) / width)
 
 
 # --- profile ---------------------------------------------------------------------
 
 
-def _core(r, radius, t):
+def _moffat(r, radius, t):
     """Return a Moffat profile of unit sum, t = 1 / beta, alpha^2 = beta radius^2."""
     return np.exp(-np.log1p(t * (r / radius) ** 2) / t) * (1 - t) / (np.pi * radius**2)
 
 
-def _core_beyond(r, radius, t):
+def _beyond(r, radius, t):
+    """Return the part of its light that is farther away than r."""
     return np.exp(np.log1p(t * (r / radius) ** 2) * (1 - 1 / t))
-
-
-def _halo(r, radius):
-    scale = (HALO_BETA - 1) / (np.pi * radius**2)
-    return scale * (1 + (r / radius) ** 2) ** -HALO_BETA
-
-
-def _halo_beyond(r, radius):
-    return (1 + (r / radius) ** 2) ** (1 - HALO_BETA)
 
 
 class _Profile:
@@ -94,59 +83,48 @@ class _Profile:
         self.star, self.rings, self.halo_radius = star, rings, halo_radius
         self.terms = legvander(star.x, min(1, len(star.x) - 1))
         self.area = np.pi * star.radius**2
+        # lit pixels of an aperture, mean of both, and the sums in both with the background
+        level = star.photometry.background[:, star.usable].sum(axis=0)
+        self.pixels, self.sums = self.area.copy(), star.flux.sum(axis=0) + level * self.area
+        for _, k, _, weights, light in star.unlit:
+            self.pixels[k] -= weights.sum() / 2
+            self.sums[k] -= light
 
     def in_rings(self, p):
         """Return the light in the rings, of both beams, that one unit of each number gives."""
-        radius, halo_radius = self._radii(p)
-        flux, core, halo = self.star.flux, 0.0, 0.0
-        seen = [(flux, self.rings.own)]
+        light = self.star.flux[:, :, None]
+        seen = [(light, self.rings.own)]
         # without a stop there is light of the other image
-        seen += [] if self.rings.other is None else [(flux[::-1], self.rings.other)]
-        for light, r in seen:
-            light = light[:, :, None]
-            core = core + (light * _core(r, radius[:, None], p[1]).mean(axis=0)).sum(axis=0)
-            halo = halo + (light * _halo(r, halo_radius).mean(axis=0)).sum(axis=0)
-        return self._columns(core, halo)
+        seen += [] if self.rings.other is None else [(light[::-1], self.rings.other)]
+        parts = []
+        for radius, t in self._components(p):
+            shares = ((own, _moffat(r, radius[:, None], t).mean(axis=0)) for own, r in seen)
+            parts.append(sum((own * share).sum(axis=0) for own, share in shares))
+        return self._columns(parts)
 
     def lacking(self, p):
         """Return the light that the sums of the lit pixels in the apertures lack."""
-        star = self.star
-        radius, halo_radius = self._radii(p)
+        star, parts = self.star, []
         total = star.flux.sum(axis=0)
-        core = total * _core_beyond(star.radius, radius, p[1])
-        halo = total * _halo_beyond(star.radius, halo_radius)
-        if not star.stopped:
-            apart = np.hypot(*(star.places[0] - star.places[1]))
-            # the light of the other image in the aperture, nearly constant over it
-            core = core - total * self.area * _core(apart, radius, p[1])
-            halo = halo - total * self.area * _halo(apart, halo_radius)
-        for beam, k, r, weights, _ in star.unlit:
-            core[k] += star.flux[beam, k] * weights @ _core(r, radius[k], p[1])
-            halo[k] += star.flux[beam, k] * weights @ _halo(r, halo_radius)
-        return self._columns(core, halo)
+        for radius, t in self._components(p):
+            part = total * _beyond(star.radius, radius, t)
+            if not star.stopped:
+                apart = np.hypot(*(star.places[0] - star.places[1]))
+                # the light of the other image in the aperture, nearly constant over it
+                part = part - total * self.area * _moffat(apart, radius, t)
+            for beam, k, r, weights, _ in star.unlit:
+                part[k] += star.flux[beam, k] * weights @ _moffat(r, radius[k], t)
+            parts.append(part)
+        return self._columns(parts)
 
-    def background_in_apertures(self, background):
-        """Return what the true background has in the lit pixels of both apertures together."""
-        pixels = self.area.copy()
-        for _, k, _, weights, _ in self.star.unlit:
-            pixels[k] -= weights.sum() / 2
-        return background * pixels
+    def _components(self, p):
+        """Return radius in each slice and 1 / exponent of core and halo."""
+        core = self.star.width * np.exp(p[0] + p[3] * self.star.x)
+        return (core, p[1]), (np.full(len(core), self.halo_radius * np.exp(p[2])), 1 / HALO_BETA)
 
-    def sums(self):
-        """Return the sums of the lit pixels in both apertures, with the background."""
-        star = self.star
-        level = star.photometry.background[:, star.usable].sum(axis=0)
-        sums = star.flux.sum(axis=0) + level * self.area
-        for _, k, _, _, light in self.star.unlit:
-            sums[k] -= light
-        return sums
-
-    def _radii(self, p):
-        return self.star.width * np.exp(p[0] + p[3] * self.star.x), self.halo_radius * np.exp(p[2])
-
-    def _columns(self, core, halo):
-        along = self.terms.T.reshape(-1, len(core), *(1,) * (core.ndim - 1))
-        return np.concatenate([core * along, halo * along])
+    def _columns(self, parts):
+        along = self.terms.T.reshape(-1, len(parts[0]), *(1,) * (parts[0].ndim - 1))
+        return np.concatenate([part * along for part in parts])
 
 
 # --- fit -------------------------------------------------------------------------
@@ -226,10 +204,9 @@ def _slopes(columns, found):
 def _shares(profile, found, covariance):
     star, (_, c, background) = profile.star, found
     measured = star.flux.sum(axis=0)
-    known = profile.sums() - profile.background_in_apertures(background)
+    known = profile.sums - background * profile.pixels
     total = known + np.tensordot(c, profile.lacking(found[0]), 1)
-    aperture = np.diag(-profile.background_in_apertures(np.ones(len(background))))
-    slopes = np.concatenate([_slopes(profile.lacking, found), aperture])
+    slopes = np.concatenate([_slopes(profile.lacking, found), np.diag(-profile.pixels)])
     noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
     relative = measured / total**2
     return measured / total, noise * np.outer(relative, relative)
@@ -237,75 +214,39 @@ def _shares(profile, found, covariance):
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
 
-# rings from this many full widths on; further in the profile need not be a Moffat
-_FROM = 1.2
 _FEWEST_PIXELS, _FEWEST_RINGS = 10, 8
 
 
-@dataclass(frozen=True)
 class Star:
-    """
-    The slices of a star that can be used, and what was measured in them.
+    """The slices of a star that have not failed, and what was measured in them."""
 
-    ``lit`` are the pixels of each beam, ``stopped`` says that a stop hides the light of the other
-    one there.
-    """
-
-    cube: np.ndarray
-    good: np.ndarray
-    photometry: object
-    level_variance: np.ndarray
-    usable: np.ndarray
-    lit: np.ndarray
-    stopped: bool
-
-    @classmethod
-    def of(cls, cube, good, photometry, level_variance, layout):
-        """Return the slices that have not failed."""
-        usable = np.flatnonzero(~photometry.failed)
-        shape, stopped = cube.shape[1:], len(layout.internal_apertures) == 5
-        # one map for all slices
-        if stopped:
-            lit = np.zeros((2, *shape), dtype=bool)
+    def __init__(self, cube, good, photometry, level_variance, layout):
+        self.usable = usable = np.flatnonzero(~photometry.failed)
+        self.cube, self.good, self.photometry = cube, good, photometry
+        self.level_variance = level_variance[:, usable]
+        # whether a stop hides the light of the other image, and the lit pixels of each beam
+        self.stopped = len(layout.internal_apertures) == 5
+        # both images (beam, x or y, K), their fluxes (2, K), and the radii of the apertures (K,)
+        self.places = np.stack([photometry.x, photometry.y], axis=1)[..., usable]
+        self.flux, self.radius = photometry.flux[:, usable], photometry.radius[0, usable]
+        # number of the slice, from -1 to 1
+        n = len(usable)
+        self.x = np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
+        # of the Gaussians of both beams, which see one atmosphere, smooth over the slices, (K,)
+        width = photometry.fwhm[:, usable].mean(axis=0)
+        self.width = legval(self.x, legfit(self.x, width, min(2, n - 1)))
+        # one map of the lit pixels for all slices
+        self.lit, shape = np.zeros((2, *cube.shape[1:]), dtype=bool), cube.shape[1:]
+        if self.stopped:
             beams = rectangles(layout.internal_apertures, shape)
-            for own, (rows, columns, weights) in zip(lit, beams, strict=True):
+            for own, (rows, columns, weights) in zip(self.lit, beams, strict=True):
                 # pixels wholly inside; those on the edge are dark in part
                 own[rows, columns] = weights > 0.999
         else:
             rows, columns = np.ogrid[: shape[0], : shape[1]]
-            middle = [a[:, usable].mean(axis=1) for a in (photometry.x, photometry.y)]
             # without a stop a pixel belongs to the image whose mean place is nearer
-            right, left = (np.hypot(columns - x, rows - y) for x, y in zip(*middle, strict=True))
-            lit = np.stack([right < left, left < right])
-        return cls(cube, good, photometry, level_variance[:, usable], usable, lit, stopped)
-
-    @cached_property
-    def x(self):
-        """Number of the slice, from -1 to 1."""
-        n = len(self.usable)
-        return np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
-
-    @cached_property
-    def flux(self):
-        """Of both beams, (2, K)."""
-        return self.photometry.flux[:, self.usable]
-
-    @cached_property
-    def radius(self):
-        """Of the apertures, (K,)."""
-        return self.photometry.radius[0, self.usable]
-
-    @cached_property
-    def width(self):
-        """Of the Gaussians, smooth over the slices, (K,)."""
-        # of both beams, which see one atmosphere
-        width = self.photometry.fwhm[:, self.usable].mean(axis=0)
-        return legval(self.x, legfit(self.x, width, min(2, len(width) - 1)))
-
-    @cached_property
-    def places(self):
-        """Of both images, (beam, x or y, K)."""
-        return np.stack([self.photometry.x, self.photometry.y], axis=1)[..., self.usable]
+            right, left = (np.hypot(columns - x, rows - y) for x, y in self.places.mean(axis=2))
+            self.lit = np.stack([right < left, left < right])
 
     @cached_property
     def unlit(self):
@@ -330,14 +271,12 @@ class Star:
                 if not dark.any():
                     continue
                 rows, columns = np.nonzero(dark)
-                r = np.hypot(
-                    columns + inside[1].start - place[0], rows + inside[0].start - place[1]
-                )
+                x, y = columns + inside[1].start - place[0], rows + inside[0].start - place[1]
                 # (pixels in the dark part,) of the slice
                 values, known = (a[self.usable[k]][inside][dark] for a in (self.cube, self.good))
                 weights = mask.data[part][dark]
                 light = float(weights @ np.where(known, values, 0.0))
-                found.append((beam, k, r, weights, light))
+                found.append((beam, k, np.hypot(x, y), weights, light))
         return found
 
     @property
@@ -347,40 +286,32 @@ class Star:
         return max(parts, default=0.0)
 
 
-@dataclass(frozen=True)
-class Rings:
-    """
-    Mean values in rings of a pixel's width, and their pixels; (beam, slice, ring).
+# mean values in rings of a pixel's width, and their pixels; (beam, slice, ring)
+# distances from the own and the other image are mean less and plus standard deviation (first
+# axis): the mean of a smooth profile over a ring is that of its values at both
+Rings = namedtuple("Rings", "values counts own other")
 
-    Distances from the own and the other image are mean less and plus standard deviation (first
-    axis): the mean of a smooth profile over a ring is that of its values at both.
-    """
 
-    values: np.ndarray
-    counts: np.ndarray
-    own: np.ndarray
-    other: np.ndarray | None
-
-    @classmethod
-    def of(cls, star, outer):
-        """Return the rings that are seen in all slices; None if there are too few."""
-        # from the innermost place at which all slices are in their wings
-        edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
-        if len(edges) <= _FEWEST_RINGS:
-            return None
-        found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
-        # one set of rings for all slices and beams, or the profile could not be common
-        full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
-        if full.sum() < _FEWEST_RINGS:
-            return None
-        # (quantity, beam, slice, ring)
-        counts, values, *moments = found[..., full]
-        points = []
-        for mean, square in zip(moments[::2], moments[1::2], strict=True):
-            # rounding may leave a variance below zero
-            spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-            points.append(np.stack([mean - spread, mean + spread]))
-        return cls(values, counts, points[0], None if star.stopped else points[1])
+def rings_of(star, outer):
+    """Return the rings that are seen in all slices; None if there are too few."""
+    # from the innermost place at which all slices are in their wings, beyond 1.2 full widths:
+    # further in the profile need not be a Moffat
+    edges = np.arange(np.floor(np.minimum(1.2 * star.width, star.radius).max()), outer + 1)
+    if len(edges) <= _FEWEST_RINGS:
+        return None
+    found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
+    # one set of rings for all slices and beams, or the profile could not be common
+    full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
+    if full.sum() < _FEWEST_RINGS:
+        return None
+    # (quantity, beam, slice, ring)
+    counts, values, *moments = found[..., full]
+    points = []
+    for mean, square in zip(moments[::2], moments[1::2], strict=True):
+        # rounding may leave a variance below zero
+        spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+        points.append(np.stack([mean - spread, mean + spread]))
+    return Rings(values, counts, points[0], None if star.stopped else points[1])
 
 
 def _means(star, beam, edges):

@@ -10,7 +10,7 @@ import time
 import warnings
 from collections import Counter
 from contextlib import closing, redirect_stderr
-from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -47,10 +47,9 @@ def is_archive(arguments, single):
             raise ParameterError("-o FILE is needed, or --archive DIR for a whole archive")
         return False
     for name in ("output", *single):
-        if getattr(arguments, name, None) is not None:
-            label = "-o" if name == "output" else f"--{name}"
+        if (value := getattr(arguments, name)) is not None:
             raise ParameterError(
-                f"{label} {getattr(arguments, name)}: names one file; --archive has a product for "
+                f"{common.label_of(name)} {value}: names one file; --archive has a product for "
                 "each sequence"
             )
     for name in ("gap", "cycles", "timeout"):
@@ -73,7 +72,7 @@ def run_archive(command, arguments):
         value = getattr(arguments, name, None)
         if value is not None:
             setattr(settled, name, type(value)(os.path.abspath(value)))
-    work = _Work(command, settled, os.path.abspath(folder), _source(arguments))
+    settings, source = _settings(settled), _source(arguments)
     where = {"workers": arguments.workers, "cluster": arguments.cluster}
     with closing(Index(folder / "index.sqlite")) as index:
         manifest = Manifest(folder / "manifest.jsonl")
@@ -82,8 +81,8 @@ def run_archive(command, arguments):
         def sequences():
             options = {"cycles": arguments.cycles, "target": arguments.target}
             for sequence in index.sequences(gap=60 * arguments.gap, **options):
-                key = sequence.key(work.settings)
-                yield sequence, key, manifest.state(sequence.name, key, work.source)
+                key = sequence.key(settings)
+                yield sequence, key, manifest.state(sequence.name, key, source)
 
         skipped = ("done",) if arguments.retry else ("done", "failed")
         before = Counter(state for *_, state in sequences())
@@ -101,12 +100,13 @@ def run_archive(command, arguments):
 
         preload = [f"astropolcal.{name}" for name in _PRELOADED]
         limit = None if arguments.timeout is None else 60 * arguments.timeout
+        work = partial(_worked, command, settled, os.path.abspath(folder))
         ended = ended_tasks(work, todo(), timeout=limit, preload=preload, **where)
         with closing(ended), counting(total, "sequences", total - rest) as add:
             for each in ended:
                 name, key, _, files, _ = each.task
                 entry = {"name": name, "key": key, "n_files": len(files), "first": files[0]}
-                entry |= {"source": work.source, "state": "done"} | (each.result or {})
+                entry |= {"source": source, "state": "done"} | (each.result or {})
                 if each.reason is not None:
                     entry |= {"state": "failed", "reason": each.reason}
                 manifest.add(entry)
@@ -144,63 +144,55 @@ def _indexed(index, arguments, where):
     return {"n_files": n_files, "n_headers_read": n_read, "index_seconds": round(seconds, 3)}
 
 
-@dataclass
-class _Work:
-    """Corrects or reduces a sequence, in any process that sees the files."""
+def _settings(arguments):
+    """Return what a product depends on besides its files."""
+    given = {k: v for k, v in vars(arguments).items() if k not in _DRIVING}
+    # what is no path is refused later
+    masters = [str(given.get(name) or "") for name in ("dark", "flat")]
+    if changed := [os.stat(p).st_mtime_ns for p in masters if os.path.isfile(p)]:
+        given["changed"] = changed
+    return json.loads(json.dumps(given, sort_keys=True, default=str))
 
-    command: str
-    arguments: object
-    folder: str
-    source: str | None = None
 
-    @property
-    def settings(self):
-        """What a product depends on besides its files."""
-        given = {k: v for k, v in vars(self.arguments).items() if k not in _DRIVING}
-        # what is no path is refused later
-        masters = [str(given.get(name) or "") for name in ("dark", "flat")]
-        if changed := [os.stat(p).st_mtime_ns for p in masters if os.path.isfile(p)]:
-            given["changed"] = changed
-        return json.loads(json.dumps(given, sort_keys=True, default=str))
+def _worked(command, arguments, folder, task):
+    """Correct or reduce a sequence, in any process that sees the files; return what was made."""
+    from astropolcal.pipeline.store import sha256_of
+    from astropolcal.scripts.main import earth
 
-    def __call__(self, task):
-        from astropolcal.pipeline.store import sha256_of
-        from astropolcal.scripts.main import earth
-
-        name, _, instrument, files, before = task
-        started, arguments = time.monotonic(), copy.copy(self.arguments)
-        product = os.path.join(self.folder, f"{name}{_SUFFIX[self.command]}")
-        arguments.cubes, arguments.output, arguments.quiet = files, product, True
-        arguments.json = os.path.join(self.folder, f"{name}.json")
-        arguments.cluster, arguments.workers = None, 1 if self.command == "reduce" else None
-        if os.path.isdir(getattr(arguments, "calibration", "")):
-            arguments.instrument = arguments.instrument or instrument
-        said = io.StringIO()
-        with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            warnings.filterwarnings("ignore", message="ERFA function")
-            command = import_module(f"astropolcal.scripts._{self.command}")
-            with earth(arguments):
-                if before:
-                    *_, made = command.choose_calibration(arguments, files)
-                    if made["calibration_hash"] == before.get("calibration_hash"):
-                        return {k: v for k, v in before.items() if k not in _OF_ENTRY}
-                command.work(arguments)
-        doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
-        with open(arguments.json, encoding="utf-8") as stream:
-            summary = json.load(stream)
-        state = os.stat(product)
-        return {
-            "product": os.path.basename(product),
-            "size": state.st_size,
-            "changed": state.st_mtime_ns,
-            "sha256": sha256_of(product),
-            "calibration": summary.get("calibration"),
-            "calibration_hash": summary.get("calibration_hash"),
-            "seconds": round(time.monotonic() - started, 3),
-            "megabytes": _megabytes(),
-            "warnings": [one_line(words) for words in dict.fromkeys(doubts)][:_MOST_DOUBTS],
-        }
+    name, _, instrument, files, before = task
+    started, arguments = time.monotonic(), copy.copy(arguments)
+    product = os.path.join(folder, f"{name}{_SUFFIX[command]}")
+    arguments.cubes, arguments.output, arguments.quiet = files, product, True
+    arguments.json = os.path.join(folder, f"{name}.json")
+    arguments.cluster, arguments.workers = None, 1 if command == "reduce" else None
+    if os.path.isdir(getattr(arguments, "calibration", "")):
+        arguments.instrument = arguments.instrument or instrument
+    said = io.StringIO()
+    with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        warnings.filterwarnings("ignore", message="ERFA function")
+        module = import_module(f"astropolcal.scripts._{command}")
+        with earth(arguments):
+            if before:
+                *_, made = module.choose_calibration(arguments, files)
+                if made["calibration_hash"] == before.get("calibration_hash"):
+                    return {k: v for k, v in before.items() if k not in _OF_ENTRY}
+            module.work(arguments)
+    doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
+    with open(arguments.json, encoding="utf-8") as stream:
+        summary = json.load(stream)
+    state = os.stat(product)
+    return {
+        "product": os.path.basename(product),
+        "size": state.st_size,
+        "changed": state.st_mtime_ns,
+        "sha256": sha256_of(product),
+        "calibration": summary.get("calibration"),
+        "calibration_hash": summary.get("calibration_hash"),
+        "seconds": round(time.monotonic() - started, 3),
+        "megabytes": _megabytes(),
+        "warnings": [one_line(words) for words in dict.fromkeys(doubts)][:_MOST_DOUBTS],
+    }
 
 
 def _megabytes():

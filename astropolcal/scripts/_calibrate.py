@@ -15,8 +15,6 @@ from astropolcal.observations.observables import get_observable
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 
-# so that a first call without any data shows what comes out
-_EXAMPLE = Path(__file__).parents[1] / "data" / "charis_example.ecsv"
 HELP = "fit an instrument's chain of optics to observation tables"
 DESCRIPTION = """\
 Fit an instrument's chain of optics to observation tables. Without files,
@@ -63,7 +61,7 @@ files FILE * Input  observation tables (ECSV)
     Polynomial2D(DEGREE) of two: time (zero on the first day of the tables, or SINCE), x, y,
     wavelength or a stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
-@ prior
+--prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
     or where the fit ends
 @ without
@@ -93,9 +91,9 @@ def run(arguments):
     targets = [_target(text) for text in arguments.target] or TARGETS
     files = arguments.files
     if not files:
-        files = [_EXAMPLE]
-        words = "No files given: this is the packaged example, a simulated run\n"
-        common.say(arguments, words)
+        # so that a first call without any data shows what comes out
+        files = [Path(__file__).parents[1] / "data" / "charis_example.ecsv"]
+        common.say(arguments, "No files given: this is the packaged example, a simulated run\n")
     datasets = common.read_datasets(files)
     standards = common.read_datasets(arguments.standard)
     for path, standard in zip(arguments.standard, standards, strict=True):
@@ -214,13 +212,11 @@ def _held(arguments, chains):
     from astropolcal.measurement import parameter_table
 
     # a --prior frees one parameter of an optic that --fix holds
-    held, loose = (
-        {text.partition("=")[0] for text in texts} for texts in (arguments.fix, arguments.prior)
-    )
+    held = {text.partition("=")[0] for text in arguments.fix}
+    loose = {text.partition("=")[0] for text in arguments.prior}
     own = {name: {name, name.partition(".")[0]} for name in parameter_table(chains)}
-    return (
-        dict.fromkeys(n for n, names in own.items() if names & held and not names & loose) or None
-    )
+    found = [name for name, names in own.items() if names & held and not names & loose]
+    return dict.fromkeys(found) or None
 
 
 def _target(text):

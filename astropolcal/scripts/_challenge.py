@@ -49,7 +49,7 @@ folders FOLDER *  of the cases, and of the answers
 
 
 TYPES = {
-    "range": common.numbers_type("of the form LOW:HIGH", 2, ":"),
+    "range": common.text_type("of the form LOW:HIGH", common.numbers, 2, ":"),
     "kinds": lambda text: text.split(","),
 }
 
@@ -73,17 +73,13 @@ def run(arguments):
     if action == "score":
         result = score_cases(*folders)
     else:
-        options = {
-            "n": arguments.count,
-            "seed": arguments.seed,
-            "snr": arguments.snr,
-            "kinds": arguments.kinds or tuple(KINDS),
-            "setup": Setup(
-                instrument=arguments.instrument,
-                n_wavelengths=arguments.wavelengths,
-                n_derotator=arguments.derotator_angles,
-            ),
-        }
+        setup = Setup(
+            instrument=arguments.instrument,
+            n_wavelengths=arguments.wavelengths,
+            n_derotator=arguments.derotator_angles,
+        )
+        options = {"n": arguments.count, "seed": arguments.seed, "snr": arguments.snr}
+        options |= {"kinds": arguments.kinds or tuple(KINDS), "setup": setup}
         # processes are started once for all challenges
         with _workers(arguments.workers) as client:
             if action == "make":

@@ -33,10 +33,7 @@ from astropolcal.observations import Observations
 from astropolcal.observations.pointings import sky_angle
 from astropolcal.progress import clear
 from astropolcal.units import mjd_of, plain_number
-from astropolcal.words import HEIGHT, counted, did_you_mean, listed, shortened
-
-# what a terminal has that nobody made wider
-_COLUMNS = 80
+from astropolcal.words import HEIGHT, WIDTH, counted, did_you_mean, listed, shortened
 
 # the first bytes of files that may be taken for tables, and where they belong instead
 _NO_TABLES = {
@@ -98,11 +95,11 @@ def check_paths(arguments):
     for option, path in outputs:
         _check_output(path)
         if isinstance(path, Drawing):
-            check_suffix(_label(option), path, *(f".{kind}" for kind in _FIGURES))
+            check_suffix(label_of(option), path, *(f".{kind}" for kind in _FIGURES))
     inputs += [(o, left) for o, path in _named(arguments, Frames) for left in _left_files(path)]
     replaced = getattr(arguments, "may_replace", {})
     for number, (option, path) in enumerate(outputs):
-        label = _label(option)
+        label = label_of(option)
         # what is written to a folder is of another kind than what is read from it
         for name, other in [] if isinstance(path, Folder) else inputs:
             if name == replaced.get(option):
@@ -119,7 +116,7 @@ def check_paths(arguments):
         for name, other in outputs[:number]:
             if _collide(path, other) or _collide(other, path):
                 raise AstropolcalError(
-                    f"{label} {path}: cannot be written beside {_label(name)} {other}, "
+                    f"{label} {path}: cannot be written beside {label_of(name)} {other}, "
                     "which takes the same name; name another file"
                 )
 
@@ -138,7 +135,8 @@ def _left_files(path):
     return [Input(layout.left_file(path)) for layout in pairs if layout.beam_files[0] in name]
 
 
-def _label(option):
+def label_of(option):
+    """Return how an option is typed."""
     return "-o" if option == "output" else f"--{option.replace('_', '-')}"
 
 
@@ -308,7 +306,6 @@ _SHARED = """
 --timeout MINUTES float  with --archive: give a sequence up after this time
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
---prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --without OPTIC ...  take an optic out of the model
 """
 _SHARED = {re.search(r"--(\w+)", entry)[1]: entry for entry in entries(_SHARED)}
@@ -322,12 +319,12 @@ def numbers(text, count=None, separator=","):
     return found
 
 
-def numbers_type(words, count=None, separator=","):
-    """Return the type of an option that takes such numbers."""
+def text_type(words, read, *arguments):
+    """Return the type of an option: what ``read`` makes of a text, which else is not ``words``."""
 
     def convert(text):
         with suppress(ValueError):
-            return numbers(text, count, separator)
+            return read(text, *arguments)
         raise argparse.ArgumentTypeError(f"{text!r} is not {words}")
 
     return convert
@@ -351,16 +348,13 @@ def sky_position(text, option):
 def number_or(*words, kind=float):
     """Return the type of an option that takes one of some words or a number."""
 
-    def convert(text):
-        with suppress(ValueError):
-            return text if text in words else plain_number(text, kind)
-        allowed = f"{', '.join(words)} or a number"
-        raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}")
+    def read(text):
+        return text if text in words else plain_number(text, kind)
 
-    return convert
+    return text_type(f"{', '.join(words)} or a number", read)
 
 
-_TYPES = {"float": float, "int": int, "angles": numbers_type("a list of angles in degree")}
+_TYPES = {"float": float, "int": int, "angles": text_type("a list of angles in degree", numbers)}
 _TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Drawing, Folder)}
 
 
@@ -392,13 +386,8 @@ def check_suffix(option, path, *suffixes):
 
 def wrapped(line, indent=0):
     """Break a line at 80 columns, the further ones indented; words stay whole."""
-    return textwrap.fill(
-        line,
-        _COLUMNS,
-        subsequent_indent=" " * indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    whole = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(line, WIDTH, subsequent_indent=" " * indent, **whole)
 
 
 def write_json(content, path):

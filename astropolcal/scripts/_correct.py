@@ -128,7 +128,7 @@ def _with_error(text):
 TYPES = {
     "star": _star,
     "names": lambda text: [name.strip() for name in text.split(",") if name.strip()],
-    "point": common.numbers_type("X,Y", 2),
+    "point": common.text_type("X,Y", common.numbers, 2),
     "sigma": common.number_or("infinite", "ignore"),
 }
 
@@ -174,17 +174,11 @@ def work(arguments):
         date=None,
         mode=calibration.validity.mode,
     )
-    result = correct(
-        calibration,
-        frames,
-        chain=chain,
-        brightness="measured" if arguments.brightness == "measured" else "given",
-        weights="variance" if arguments.weights == "variance" else None,
-        any_date=True,
-        n_samples=arguments.samples,
-        provenance=provenance,
-        **{name: getattr(arguments, name) for name in _PASSED_ON},
-    )
+    options = {name: getattr(arguments, name) for name in _PASSED_ON}
+    options["brightness"] = "measured" if arguments.brightness == "measured" else "given"
+    options["weights"] = "variance" if arguments.weights == "variance" else None
+    options |= {"any_date": True, "n_samples": arguments.samples, "provenance": provenance}
+    result = correct(calibration, frames, chain=chain, **options)
     # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
     if arguments.subtract_star is not None:
@@ -349,16 +343,13 @@ def _summary(result, star, arguments, n_frames):
         spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
     summary = {
         "output": str(arguments.output),
-        "calibration": result.provenance["calibration"],
-        "calibration_hash": result.provenance["calibration_hash"],
-        "mode": result.mode,
-        "observable": result.observable,
-        "components": result.components,
+        **{key: result.provenance[key] for key in ("calibration", "calibration_hash")},
+        **{key: getattr(result, key) for key in ("mode", "observable", "components")},
         "n_frames": n_frames,
         "north_up": result.north_up,
         "wavelength_nm": result.wavelength.to_value(u.nm),
         "condition": result.condition,
-        "poorly_determined": dict((str(i), words) for i, words in enumerate(result.weak) if words),
+        "poorly_determined": {str(i): words for i, words in enumerate(result.weak) if words},
         "leakage_q": result.leakage[:, 1],
         "leakage_u": result.leakage[:, 2],
         "held": [] if result.systematic is None else result.systematic.held,
@@ -386,17 +377,17 @@ def _words(summary, systematic, arguments):
         lines.append(f"  condition number of the solution for {summary['components']}: {limits}")
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
-        lines += common.wrapped(line, indent=4).split("\n")
+        lines.append(common.wrapped(line, indent=4))
     star, is_open = summary["aperture"], systematic is not None and systematic.is_open
     lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
     found, accuracy, lost = _polarization(star, is_open)
     lines += found
     if held := summary.get("held"):
         line = f"  without error, as not free in the calibration: {', '.join(held)}"
-        lines += common.wrapped(line, indent=4).split("\n")
+        lines.append(common.wrapped(line, indent=4))
     if not summary.get("north_up", True):
         line = "Q_phi and U_phi are made as if north were up, which --rotation none does not know"
-        lines += common.wrapped(f"  {line}", indent=4).split("\n")
+        lines.append(common.wrapped(f"  {line}", indent=4))
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n = len(summary["wavelength_nm"])
@@ -410,15 +401,10 @@ def _words(summary, systematic, arguments):
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
     elif good < n:
         verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
-    ends = common.ending(
-        verdict,
-        f"{accuracy} (statistical + systematic)",
-        f"{summary['components']} at {good} of {n} wavelengths",
-        advice,
-        common.written_lines(
-            [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
-        ),
-    )
+    written = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
+    determined = f"{summary['components']} at {good} of {n} wavelengths"
+    accuracy = f"{accuracy} (statistical + systematic)"
+    ends = common.ending(verdict, accuracy, determined, advice, common.written_lines(written))
     return common.with_ending(lines, ends, arguments.full)
 
 

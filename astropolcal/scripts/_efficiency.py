@@ -25,11 +25,7 @@ from astropolcal.scripts import _common as common
 from astropolcal.units import iso_date
 from astropolcal.words import counted
 
-# what is printed as more than 1
-_ABOVE_ONE = 1.0005
 _TITLE = "Polarimetric efficiency of {}"
-# from which efficiency on V is solved for, too
-_MODULATED = 0.1
 HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
 DESCRIPTION = """\
 Share of the linear polarization that an observation measures, over
@@ -74,16 +70,16 @@ def run(arguments):
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
     arguments.parallactic = arguments.parallactic or 0.0
     instrument, chain, grid, settings = _chain(arguments)
+    found = None
     if not has_plate(chain):
-        _any_modulation(arguments, instrument, chain, grid, settings)
-        return
-    content, lines = _table(arguments, instrument, chain, grid)
-    best = None
-    if planned:
-        best, content["best_derotator"], words = _best(arguments, instrument, chain, grid)
-        lines = [*lines, "", *words] if tabulated else words
+        content, lines, found = _any_modulation(arguments, instrument, chain, grid, settings)
+    else:
+        content, lines = _table(arguments, instrument, chain, grid)
+        if planned:
+            found, content["best_derotator"], words = _best(arguments, instrument, chain, grid)
+            lines = [*lines, "", *words] if tabulated else words
     if arguments.output:
-        _draw(arguments, instrument, chain, grid, best)
+        _draw(arguments, instrument, chain, grid, found)
     common.give(arguments, lines, content, arguments.output, arguments.json)
 
 
@@ -110,7 +106,7 @@ def _chain(arguments):
 
 
 def _any_modulation(arguments, instrument, chain, grid, settings):
-    """Give the efficiencies of the frames that were calibrated, of any modulator."""
+    """Return the efficiencies of the frames that were calibrated, of any modulator."""
     from astropolcal.calibration.identifiability.sky import chain_from_sky, sequence_of
 
     for option in ("derotator", "target", "night", "law"):
@@ -135,22 +131,15 @@ def _any_modulation(arguments, instrument, chain, grid, settings):
     found = demodulation(chain, grid, frames, components="IQU")
     with suppress(ParameterError):
         whole = demodulation(chain, grid, frames)
-        found = whole if whole.efficiency[:, 3].min() > _MODULATED else found
+        found = whole if whole.efficiency[:, 3].min() > 0.1 else found
     rows = _rows(arguments.wavelength, grid)
     content = {"instrument": instrument.name, "n_frames": len(frames)}
     content |= {f"{key}_deg": angle.value for key, angle in pointing.items()}
     content |= {"wavelength_nm": grid.to_value(u.nm)[rows], "components": list(found.components)}
     content["efficiency"] = found.efficiency.T[:, rows]
-    if arguments.output:
-        from astropolcal.plotting._style import save
-        from astropolcal.plotting.efficiency import plot_efficiencies
-
-        figure = plot_efficiencies(found, grid, title=_TITLE.format(instrument.name))
-        save(figure, arguments.output)
     words = f"Efficiencies of {counted(len(frames), 'frame')} of {instrument.name} "
     words += "(del Toro Iniesta & Collados 2000)"
-    lines = _table_lines(words, " ", found.components, content)
-    common.give(arguments, lines, content, arguments.output, arguments.json)
+    return content, _table_lines(words, " ", found.components, content), found
 
 
 def _table_lines(title, corner, names, content):
@@ -195,7 +184,8 @@ def _table(arguments, instrument, chain, grid):
         corner, names = "derotator", [f"{angle:8.2f} " for angle in derotator]
     title = f"{_TITLE.format(instrument.name)} {where.format_map(content)}"
     lines = _table_lines(title, corner, names, content)
-    if np.max(values) >= _ABOVE_ONE:
+    # what is printed as more than 1
+    if np.max(values) >= 1.0005:
         lines.append("Above 1: optics before the analyzer add polarization of their own.")
     return content, lines
 
@@ -287,18 +277,22 @@ def _times(text):
     return moments
 
 
-def _draw(arguments, instrument, chain, grid, best=None):
+def _draw(arguments, instrument, chain, grid, found):
+    """Draw what was found: the efficiencies of any modulator, of derotator offsets, or the map."""
+    from astropolcal.plotting import efficiency
     from astropolcal.plotting._style import save
-    from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
     title = _TITLE.format(instrument.name)
-    if best is not None:
+    if not has_plate(chain):
+        figure = efficiency.plot_efficiencies(found, grid, title=title)
+    elif found is not None:
         title = f"{title}\ntarget {arguments.target}, {arguments.night}"
-        save(plot_derotator_offsets(best, title=title), arguments.output)
-        return
-    pointing = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
-    shown = None if arguments.wavelength is None else arguments.wavelength * u.um
-    # one angle a figure, the last that was asked for
-    settings = {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
-    settings |= {"instrument": instrument, "mode": _mode(arguments, instrument), "title": title}
-    save(plot_polarimetric_efficiency(chain, grid, **pointing, **settings), arguments.output)
+        figure = efficiency.plot_derotator_offsets(found, title=title)
+    else:
+        settings = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
+        shown = None if arguments.wavelength is None else arguments.wavelength * u.um
+        # one angle a figure, the last that was asked for
+        settings |= {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
+        settings |= {"instrument": instrument, "mode": _mode(arguments, instrument)}
+        figure = efficiency.plot_polarimetric_efficiency(chain, grid, title=title, **settings)
+    save(figure, arguments.output)

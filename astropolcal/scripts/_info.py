@@ -78,21 +78,15 @@ def run(arguments):
     common.give(arguments, lines, content)
 
 
-def _wrapped(lines, content):
-    return [common.wrapped(line, indent=4) for line in lines], content
+def _wrapped(lines, content, indent=4):
+    return [common.wrapped(line, indent) for line in lines], content
 
 
 def _installation():
-    content = {
-        "astropolcal": version,
-        "instruments": instruments.names(),
-        "optics": sorted(OPTICS),
-        "observables": sorted(OBSERVABLES),
-    }
-    lines = [f"astropolcal {version}"]
-    for key in ("instruments", "optics", "observables"):
-        lines.append(common.wrapped(f"  {key + ':':<13}{', '.join(content[key])}", indent=15))
-    return lines, content
+    known = {"instruments": instruments.names(), "optics": sorted(OPTICS)}
+    known["observables"] = sorted(OBSERVABLES)
+    lines = [f"  {key + ':':<13}{', '.join(names)}" for key, names in known.items()]
+    return _wrapped([f"astropolcal {version}", *lines], {"astropolcal": version} | known, 15)
 
 
 def _calibration(path, arguments):
@@ -205,11 +199,10 @@ def _observations(path):
     paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
     pairs = observations.pairs() if paired else ()
+    told = {key: getattr(observations, key) for key in ("instrument", "source", "n_frames")}
     content = {
         "file": str(path),
-        "instrument": observations.instrument,
-        "source": observations.source,
-        "n_frames": observations.n_frames,
+        **told,
         "n_wavelengths": observations.n_bins,
         "n_masked": int(observations.mask.sum()),
         "n_pairs": len(pairs),
@@ -217,7 +210,7 @@ def _observations(path):
         "content_hash": observations.content_hash,
     }
     lines = [*observations.summary().splitlines(), f"Next: {common.following('calibrate', path)}"]
-    return [common.wrapped(line, indent=2) for line in lines], content
+    return _wrapped(lines, content, indent=2)
 
 
 def _told(values):
@@ -259,9 +252,7 @@ def _describe_product(path, product):
         "shape": list(product.stokes.shape),
         "unit": product.unit.to_string(),
         "wavelength_nm": wavelength,
-        "mode": product.mode,
-        "observable": product.observable,
-        "north_up": product.north_up,
+        **{key: getattr(product, key) for key in ("mode", "observable", "north_up")},
         # at a wavelength all components must be
         "n_determined": int(np.sum(product.determined.all(axis=-1))),
         "statistical": product.covariance is not None,

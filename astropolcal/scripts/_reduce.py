@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal reduce``: from FITS cubes to an observation table."""
 
-import argparse
 import sys
 from collections import Counter
 from contextlib import suppress
@@ -65,11 +64,11 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 def _pair(text):
     key, equal, value = text.partition("=")
     if not (equal and key.strip() and value.strip()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not KEY=VALUE")
+        raise ValueError
     return key.strip(), value.strip()
 
 
-TYPES = {"pair": _pair, "radius": common.number_or("fwhm", "growth")}
+TYPES = {"pair": common.text_type("KEY=VALUE", _pair), "radius": common.number_or("fwhm", "growth")}
 
 
 def run(arguments):
@@ -148,14 +147,13 @@ def _report(reduction, arguments, figures):
     told += [f"{counted(n_doubtful, 'file')} doubtful"] if n_doubtful else []
     if told:
         verdict += ("; " if lost else ": ") + ", ".join(told)
-    masked = f"{n_masked} of {counted(n_cells, 'cell')} masked"
-    ends = common.ending(
-        verdict,
-        _accuracy(reduction.table),
-        f"{counted(summary['n_frames'], 'frame')}, {masked}",
-        "astropolcal info FILE tells of a cube" if lost else common.following("calibrate", output),
-        common.written_lines([arguments.output, arguments.json], len(figures), arguments.quicklook),
+    determined = f"{counted(summary['n_frames'], 'frame')}, {n_masked} of "
+    determined += f"{counted(n_cells, 'cell')} masked"
+    advice = (
+        "astropolcal info FILE tells of a cube" if lost else common.following("calibrate", output)
     )
+    written = common.written_lines([output, arguments.json], len(figures), arguments.quicklook)
+    ends = common.ending(verdict, _accuracy(reduction.table), determined, advice, written)
     flags = summary["flags"].items()
     body = [f"  masked, {reason}: {counted(count, 'cell')}" for reason, count in flags]
     common.say(arguments, *common.with_ending(body, ends, arguments.full))

@@ -15,8 +15,6 @@ from astropolcal.words import counted
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
-# double differences of Q, then of U: the order in which stars are observed
-_STAR_CYCLE = [0, 45, 22.5, 67.5]
 
 HELP = "simulate an observation table or image cubes, with photon and read noise"
 DESCRIPTION = """\
@@ -91,7 +89,7 @@ def run(arguments):
     common.check_suffix("-o", arguments.output, ".ecsv")
     for name, default in _USUAL.items():
         if not arguments.cubes and getattr(arguments, name) != default:
-            raise AstropolcalError(f"--{name.replace('_', '-')}: is for --cubes DIR")
+            raise AstropolcalError(f"{common.label_of(name)}: is for --cubes DIR")
     instrument = instruments.get(arguments.instrument)
     chain, wavelength, meta = _truth(arguments, instrument)
     # free and prior mean nothing for what is true
@@ -143,9 +141,9 @@ def _frames(arguments, chain):
     from astropolcal.reduction.cubes import both_states
 
     star = arguments.source == "star"
-    hwp = arguments.hwp or (_STAR_CYCLE if star else None)
-    given = {"derotator": arguments.derotator or _DEROTATOR}
-    given |= {"hwp": hwp} if hwp else {}
+    # double differences of Q, then of U: the order in which stars are observed
+    hwp = arguments.hwp or ([0, 45, 22.5, 67.5] if star else None)
+    given = {"derotator": arguments.derotator or _DEROTATOR} | ({"hwp": hwp} if hwp else {})
     frames = half_wave_plate_cycles(**{k: v * u.deg for k, v in given.items()})
     for name in ("altitude", "parallactic"):
         ends = getattr(arguments, name)
@@ -172,22 +170,17 @@ def _truth(arguments, instrument):
     else:
         chain, wavelength = instrument.published(), instrument.wavelength
         meta = instrument.published_meta()
-    if arguments.source == "star":
-        chain = _behind_telescope(chain, instrument, wavelength)
-        meta |= {"source": "star"}
-    elif "parallactic" in stages(chain):
-        raise AstropolcalError("the chain begins on sky; give --source star and where it points")
-    return chain, wavelength, meta
-
-
-def _behind_telescope(chain, instrument, wavelength):
-    """Return the chain with star and telescope in the place of the internal source."""
     # a calibration of stars has its telescope already
-    if "parallactic" in stages(chain):
-        return chain
-    if not any(leaf.stage == "hwp" for leaf in leaves(chain)):
-        raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
-    # its first optic is the source
-    star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
-    # the telescope as published, behind a star of its own polarization
-    return join([star, *leaves(instrument.on_sky(chain))])
+    on_sky = "parallactic" in stages(chain)
+    if arguments.source != "star":
+        if on_sky:
+            words = "the chain begins on sky; give --source star and where it points"
+            raise AstropolcalError(words)
+        return chain, wavelength, meta
+    if not on_sky:
+        if not any(leaf.stage == "hwp" for leaf in leaves(chain)):
+            raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
+        # its first optic is the source, behind which the telescope is as published
+        star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
+        chain = join([star, *leaves(instrument.on_sky(chain))])
+    return chain, wavelength, meta | {"source": "star"}

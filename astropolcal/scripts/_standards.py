@@ -35,13 +35,8 @@ name NAME ?  a star, such as 'HD 293396'
 --plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
 """
-TYPES = {"pair": common.numbers_type("2 numbers with a comma between them", 2)}
-# R, J, H and K, for what a calibration assumes of a star
-_BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
-# more stars than this make a figure unreadable
-_DRAWN = 5
-# of a night, whose list is ordered by how good a star is, so that its end is of no use
-_LISTED = 20
+TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.numbers, 2)}
+
 
 EXAMPLES = """\
 examples:
@@ -92,20 +87,20 @@ def _one(arguments):
     (low, high), (first, last) = seen.altitude.value, seen.parallactic.value
     content |= {"site": arguments.site, "night": seen.night, "hours": seen.hours.value}
     content |= {"transit": seen.transit.iso, "altitude_deg": [low, high]}
-    content |= {"parallactic_deg": [first, last]}
     # of 32 frames, as in the table of a night
-    content["m3_error"] = seen.information(32).diattenuation
+    error = seen.information(32).diattenuation
+    content |= {"parallactic_deg": [first, last], "m3_error": error}
     # hours and minutes of an ISO time
     start, end = (seen.table["time"][seen.table["observable"]][i].iso[11:16] for i in (0, -1))
     lines += [
         "",
         f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg",
-        f"  observable   {start} to {end} UTC, {content['hours']:.1f} h",
+        f"  observable   {start} to {end} UTC, {seen.hours.value:.1f} h",
         f"  highest      {seen.transit.iso[:16]} UTC",
         # the format z: what rounds to zero has no sign
         f"  altitude     {low:z.1f} to {high:z.1f} deg",
         f"  parallactic  {first:z.1f} to {last:z.1f} deg",
-        f"  M3 error     {_pair(content['m3_error'], '.3f')} of one frame's error (32 frames)",
+        f"  M3 error     {_pair(error, '.3f')} of one frame's error (32 frames)",
     ]
     return lines, content, [seen], 1
 
@@ -119,13 +114,9 @@ def _describe(star, known):
     """Return the lines that say what is known of a star, and what a calibration assumes of it."""
     place = star.coord.to_string("hmsdms", sep=":", precision=1)
     bright = "  ".join(f"{b} {m.value:g}" for b, m in star.magnitudes.items())
-    facts = {
-        "position": f"{place} (ICRS, +-{star.position_error.value:g} arcsec)",
-        "also": ", ".join(star.aliases),
-        "magnitudes": bright or "not known",
-        "type": star.spectral_type,
-        "note": star.note,
-    }
+    facts = {"position": f"{place} (ICRS, +-{star.position_error.value:g} arcsec)"}
+    facts |= {"also": ", ".join(star.aliases), "magnitudes": bright or "not known"}
+    facts |= {"type": star.spectral_type, "note": star.note}
     facts = [f"  {name:<11} {words}" for name, words in facts.items() if words]
     lines = [f"{star.name}: {star.kind} standard star"]
     lines += [common.wrapped(fact, indent=14) for fact in facts]
@@ -171,33 +162,27 @@ def _pair(value, form, error=math.nan):
 
 
 def _many(arguments):
-    site = None if arguments.site is None else _site(arguments.site)
-    radius = 15.0 if arguments.radius is None else arguments.radius
-    near = {}
+    wanted = {key: getattr(arguments, key) for key in ("kind", "band", "magnitude", "night")}
+    wanted["site"] = None if arguments.site is None else _site(arguments.site)
     if arguments.near:
-        near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
-    found = standards.search(
-        **near,
-        kind=arguments.kind,
-        band=arguments.band,
-        magnitude=arguments.magnitude,
-        site=site,
-        night=arguments.night,
-        min_altitude=arguments.min_altitude * u.deg,
-    )
+        radius = 15.0 if arguments.radius is None else arguments.radius
+        wanted["center"] = common.sky_position(arguments.near, "--near")
+        wanted["radius"] = radius * u.deg
+    found = standards.search(**wanted, min_altitude=arguments.min_altitude * u.deg)
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")
     # a machine gets all unless it asks for fewer
     rows = [_row(row) for row in found[: arguments.limit]]
     content = {"site": arguments.site, "night": arguments.night, "stars": rows}
-    shown = found[: arguments.limit or (_LISTED if arguments.night else None)]
+    # of a night, whose list is ordered by how good a star is, so that its end is of no use
+    shown = found[: arguments.limit or (20 if arguments.night else None)]
     lines = _night_table(shown) if arguments.night else _table(shown, arguments.band)
     lines += _band_lines(shown, arguments)
     if more := len(found) - len(shown):
         lines += ["", f"{counted(more, 'more star')}; --limit {len(found)} lists all"]
-    # ordered by the score already
-    best = shown["name"][:_DRAWN] if arguments.plot else []
+    # ordered by the score already; more than five make a figure unreadable
+    best = shown["name"][:5] if arguments.plot else []
     if 0 < len(best) < len(shown):
         lines += ["", f"The figure shows the first {len(best)} of {len(shown)} stars."]
     return lines, content, [_observability(str(name), arguments) for name in best], len(shown)
@@ -290,7 +275,8 @@ def _facts(star):
         "dec_deg": star.coord.dec.deg,
         "magnitudes": {band: m.value for band, m in star.magnitudes.items()},
         "law": law,
-        "known": assumed_polarization(star, _BANDS),
+        # R, J, H and K, for what a calibration assumes of a star
+        "known": assumed_polarization(star, [0.65, 1.25, 1.65, 2.2] * u.um),
         "measurements": [_row(row) for row in star.polarization],
         "checked": star.checked,
     }

@@ -17,6 +17,7 @@ from functools import partial
 from importlib import import_module
 
 from astropolcal.version import version
+from astropolcal.words import did_you_mean
 
 __all__ = ["main"]
 
@@ -57,14 +58,14 @@ class _OneLineParser(argparse.ArgumentParser):
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             # here, where the command is known: argparse complains in the name of the whole program
-            hint = _did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
+            hint = did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return namespace, unknown
 
     def error(self, message):
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if wrong:
-            message += _did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+            message += did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
         # argparse prints the usage in several lines before its complaint
         self.exit(2, f"astropolcal: error: {_one_line(message)} (see {self.prog} --help)\n")
 
@@ -89,12 +90,6 @@ class _PrintCompletion(argparse.Action):
                 action.complete = shtab.DIRECTORY if folder else shtab.FILE
         print(shtab.complete(parser, shell))
         parser.exit()
-
-
-def _did_you_mean(text, known):
-    from astropolcal.words import did_you_mean
-
-    return did_you_mean(text, known)
 
 
 def build_parser():
@@ -200,12 +195,11 @@ def _run(argv):
             with earth(arguments), shown(not getattr(arguments, "quiet", False)):
                 return arguments.run(arguments) or 0
         except AstropolcalError as error:
-            print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
-            return 2
+            words = _one_line(error)
         except MemoryError as error:
-            words = _one_line(error) or "give it less to do at a time"
-            print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
-            return 2
+            words = f"not enough memory: {_one_line(error) or 'give it less to do at a time'}"
+        print(f"astropolcal: error: {words}", file=sys.stderr)
+        return 2
 
 
 def earth(arguments):

@@ -14,8 +14,8 @@ from photutils.psf import fit_2dgaussian
 from timing import fastest
 
 from astropolcal import instruments
-from astropolcal.reduction.finding import fit_gaussians
 from astropolcal.reduction.photometry import detector_of, measure_internal
+from astropolcal.reduction.stars import fit_gaussians
 
 N_SLICES = 22
 

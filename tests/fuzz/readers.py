@@ -692,7 +692,7 @@ class Header(Reader):
         from astropolcal.fitscheck import primary_header
         from astropolcal.pipeline.headers import FrameAngles, describe
         from astropolcal.reduction.headers import (
-            FrameHeader,
+            Frame,
             add_pointing,
             observation_time,
             read_header,
@@ -705,7 +705,7 @@ class Header(Reader):
         assert set(raw.values) <= set(frame.values)
         for ask in (
             observation_time,
-            lambda v: add_pointing([FrameHeader("x", values=dict(v))], small_layout()),
+            lambda v: add_pointing([Frame("x", values=dict(v))], small_layout()),
         ):
             try:
                 ask(frame.values)

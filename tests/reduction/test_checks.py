@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.reduction.images import number, per_wavelength, pixels
+from astropolcal.reduction.cubes import number, per_wavelength, pixels
 
 # CHARIS: 16.15 milliarcsecond a pixel
 LAYOUT = SimpleNamespace(pixel_scale=16.15)

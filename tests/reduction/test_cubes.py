@@ -23,7 +23,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction import images as _images
+from astropolcal.reduction import cubes as _images
 from astropolcal.reduction.cubes import (
     CubeFiles,
     DetectorModel,
@@ -466,8 +466,7 @@ def test_missing_folder_and_layout_are_named(tmp_path):
 
 def test_layout_of_charis_gives_both_beams_room():
     layout = instruments.get("charis").files
-    scene = _images.Scene(layout, source="internal", psf="moffat", fwhm=np.ones(22), beta=3.0,
-                         halo=0.0, halo_fwhm=np.ones(22), margin=6.0)  # fmt: skip
+    scene = _images.Scene(ImageModel(fwhm=1.0, halo_fwhm=1.0), layout, "internal", 22)
     apart = np.subtract(*scene.centres(scene.centre))
     assert tuple(apart) == pytest.approx(layout.star_offset)
     image = scene.light(np.ones((2, 22)), scene.centre, 1.0)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reduction_lab import star_image
 
-from astropolcal.reduction.finding import find_star
+from astropolcal.reduction.stars import find_star
 
 SHAPE, OFFSET = (60, 90), (40.0, 12.0)
 

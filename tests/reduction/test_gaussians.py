@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.reduction.finding import _model, _step, fit_gaussians
+from astropolcal.reduction.stars import _model, _step, fit_gaussians
 
 SIZE = 25
 GRID = tuple(axis.ravel().astype(float) for axis in np.indices((SIZE, SIZE))[::-1])

@@ -17,7 +17,7 @@ from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import CHARIS
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction.headers import (
-    FrameHeader,
+    Frame,
     add_pointing,
     check_sequence,
     frame_number,
@@ -161,7 +161,7 @@ def test_raw_folder_without_frames(tmp_path):
 
 def pointing(values, site):
     """Return altitude and parallactic angle of a frame whose header has neither."""
-    frame = FrameHeader("cube.fits", values=dict(values))
+    frame = Frame("cube.fits", values=dict(values))
     add_pointing([frame], replace(LAYOUT, site=site))
     if frame.errors:
         raise ObservationError(frame.errors[0])

@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.cubes import ImageModel, simulate_cubes
-from astropolcal.reduction.images import Scene, expose, gaussian, moffat, rectangle
+from astropolcal.reduction.cubes import (
+    ImageModel,
+    Scene,
+    expose,
+    gaussian,
+    moffat,
+    rectangle,
+    simulate_cubes,
+)
 from astropolcal.simulation import half_wave_plate_cycles
 
 # two upright rectangles of 20 x 16 pixels, side by side
@@ -25,9 +32,8 @@ WHOLE = (slice(0, 61), slice(0, 61))
 
 
 def scene(source="star", layout=LAYOUT, **options):
-    how = {"psf": "gaussian", "fwhm": np.array([3.0, 4.0]), "beta": 3.0, "halo": 0.0}
-    how |= {"halo_fwhm": np.array([20.0, 20.0]), "margin": 2.0}
-    return Scene(layout, source=source, **how | options)
+    how = {"psf": "gaussian", "fwhm": np.array([3.0, 4.0]), "halo_fwhm": 20.0, "margin": 2.0}
+    return Scene(ImageModel(**how | options), layout, source, layout.shape[0])
 
 
 # ---- light ---------------------------------------------------------------------------
@@ -123,8 +129,12 @@ def test_aperture_may_touch_the_edge():
 
 
 def test_stop_must_not_cut_the_apertures():
-    with pytest.raises(ParameterError, match="margin = -3 pixels: the field stop cuts the apert"):
-        scene("internal", margin=-3.0)
+    # the images of the stop are farther apart than the apertures
+    layout = replace(LAYOUT, star_offset=(46.0, 0.0))
+    with pytest.raises(ParameterError, match="margin = 2 pixels: the field stop cuts the apert"):
+        scene("internal", layout)
+    with pytest.raises(ParameterError, match="margin = -3; allowed is 0 and above"):
+        scene(margin=-3.0)
 
 
 def test_star_outside_of_the_image_is_named():

@@ -13,15 +13,14 @@ from photutils.aperture import CircularAperture, aperture_photometry
 from reduction_lab import Small, expose, pair, star_image
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.reduction.finding import find_star, fit_gaussians
-from astropolcal.reduction.images import moffat
+from astropolcal.reduction.cubes import moffat
 from astropolcal.reduction.photometry import (
     detector_of,
     measure_internal,
     rectangles,
     shared_pixels,
 )
-from astropolcal.reduction.stars import growth_radius, measure_stars
+from astropolcal.reduction.stars import find_star, fit_gaussians, growth_radius, measure_stars
 
 LAYOUT = Small.files
 DETECTOR = detector_of(LAYOUT)

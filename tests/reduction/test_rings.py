@@ -8,7 +8,7 @@ import pytest
 
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction.photometry import Photometry
-from astropolcal.reduction.wings import Rings, Star
+from astropolcal.reduction.wings import Star, rings_of
 
 SHAPE = (81, 161)
 OPEN = FileLayout({}, (3, *SHAPE), star_offset=(80.0, 0.0))
@@ -27,7 +27,7 @@ def star(image, layout=OPEN, *, good=None, radius=8.0, width=4.0, failed=()):
     for k in failed:
         photometry.flag(np.arange(n) == k, "saturated")
     good = np.ones(cube.shape, dtype=bool) if good is None else good
-    return Star.of(cube, good, photometry, np.zeros((2, n)), layout)
+    return Star(cube, good, photometry, np.zeros((2, n)), layout)
 
 
 def distance(x, y=40.0):
@@ -60,7 +60,7 @@ def test_failed_slices_are_left_out():
 def test_mean_of_a_smooth_profile_is_that_at_two_radii():
     """Rings of a pixel's width, with the mean and scatter of the distances of their pixels."""
     profile = 1e3 * (1 + (distance(120.0) / 6) ** 2) ** -2.0
-    rings = Rings.of(star(profile), outer=30)
+    rings = rings_of(star(profile), outer=30)
     seen = rings.values[0, 0]
     two = 1e3 * (1 + (rings.own[:, 0, 0] / 6) ** 2) ** -2.0
     np.testing.assert_allclose(two.mean(axis=0), seen, rtol=2e-3)
@@ -70,7 +70,7 @@ def test_mean_of_a_smooth_profile_is_that_at_two_radii():
 
 
 def test_counts_are_the_areas_of_rings():
-    rings = Rings.of(star(np.zeros(SHAPE)), outer=35)
+    rings = rings_of(star(np.zeros(SHAPE)), outer=35)
     radius = rings.own[:, 0, 0].mean(axis=0)
     np.testing.assert_allclose(rings.counts[0, 0], 2 * np.pi * radius, rtol=0.25)
     assert rings.counts[0, 0].sum() == pytest.approx(np.pi * (35**2 - 4**2), rel=0.01)
@@ -80,7 +80,7 @@ def test_counts_are_the_areas_of_rings():
 def test_rings_begin_in_the_wings():
     """At 1.2 full widths, but never beyond the aperture."""
     for width, radius, first in ((4.0, 8.0, 4.0), (10.0, 8.0, 8.0), (10.0, 30.0, 12.0)):
-        rings = Rings.of(star(np.zeros(SHAPE), width=width, radius=radius), outer=35)
+        rings = rings_of(star(np.zeros(SHAPE), width=width, radius=radius), outer=35)
         assert np.floor(rings.own[:, 0, 0, 0].mean()) == first
 
 
@@ -88,14 +88,14 @@ def test_bad_pixels_do_not_count():
     image = np.full(SHAPE, 7.0)
     good = np.ones((3, *SHAPE), dtype=bool)
     image[40, 130], good[:, 40, 130] = 1e6, False
-    full, fewer = (Rings.of(star(image, good=g), outer=20) for g in (None, good))
+    full, fewer = (rings_of(star(image, good=g), outer=20) for g in (None, good))
     np.testing.assert_allclose(fewer.values, 7.0)
     assert (full.counts - fewer.counts).sum() == 3
 
 
 def test_distance_of_the_other_image_matters_without_a_stop_only():
     for layout in [OPEN, STOPPED]:
-        rings = Rings.of(star(np.zeros(SHAPE), layout), outer=20)
+        rings = rings_of(star(np.zeros(SHAPE), layout), outer=20)
         assert (rings.other is None) == (layout is STOPPED), layout
         if rings.other is not None:
             # the images are 80 pixels apart
@@ -103,9 +103,9 @@ def test_distance_of_the_other_image_matters_without_a_stop_only():
 
 
 def test_too_few_rings_are_none():
-    assert Rings.of(star(np.zeros(SHAPE)), outer=10) is None
+    assert rings_of(star(np.zeros(SHAPE)), outer=10) is None
     good = np.zeros((3, *SHAPE), dtype=bool)
-    assert Rings.of(star(np.zeros(SHAPE), good=good), outer=30) is None
+    assert rings_of(star(np.zeros(SHAPE), good=good), outer=30) is None
 
 
 def test_aperture_that_reaches_out_of_the_field_lists_its_dark_pixels():

@@ -12,9 +12,9 @@ from scipy.integrate import quad
 
 from astropolcal.instruments import CHARIS
 from astropolcal.instruments.layout import ReadOut
-from astropolcal.reduction import images
+from astropolcal.reduction import cubes
 from astropolcal.reduction import wings as module
-from astropolcal.reduction.images import Scene
+from astropolcal.reduction.cubes import ImageModel, Scene
 from astropolcal.reduction.photometry import Photometry, detector_of
 from astropolcal.reduction.stars import measure_stars
 from astropolcal.reduction.wings import wing_shares
@@ -37,10 +37,8 @@ PROFILES = {
 
 def scene(psf, fwhm, beta, halo, *, layout=LAYOUT):
     """A star behind the field stop of CHARIS."""
-    fwhm = np.broadcast_to(np.asarray(fwhm, dtype=float), (layout.shape[0],))
-    halo_fwhm = np.full(layout.shape[0], 30.0)
-    return Scene(layout, source="star", psf=psf, fwhm=fwhm, beta=beta, halo=halo,
-                 halo_fwhm=halo_fwhm, margin=6.0)  # fmt: skip
+    image = ImageModel(psf=psf, fwhm=fwhm, beta=beta, halo=halo)
+    return Scene(image, layout, "star", layout.shape[0])
 
 
 def exposure(stage, seed, *, noise=True, flux=5e5, background=5.0):
@@ -50,7 +48,7 @@ def exposure(stage, seed, *, noise=True, flux=5e5, background=5.0):
     true = flux / 2 * np.linspace(1.2, 0.8, n) * np.array([[1.01], [0.99]])
     place = stage.centre + rng.standard_normal(2)
     light = stage.light(true, place, np.exp(0.05 * rng.standard_normal()))
-    return images.expose(light + background, detector, 1.0, rng if noise else None)[0], true
+    return cubes.expose(light + background, detector, 1.0, rng if noise else None)[0], true
 
 
 def pulls_of(profile, seeds, **options):
@@ -196,16 +194,13 @@ def test_nothing_usable_gives_nothing():
 @settings(max_examples=20)
 @given(radius=st.floats(1, 20), t=st.floats(1e-3, 0.65), edge=st.floats(0, 60))
 def test_light_beyond_a_circle_is_the_integral_of_the_profile(radius, t, edge):
-    for profile, beyond, own in (
-        (module._core, module._core_beyond, (radius, t)),
-        (module._halo, module._halo_beyond, (radius,)),
-    ):
-        inside, _ = quad(lambda r: 2 * np.pi * r * profile(r, *own), 0, edge, limit=200)  # noqa: B023
-        assert inside + beyond(edge, *own) == pytest.approx(1.0, abs=1e-6)
+    for own in ((radius, t), (radius, 1 / module.HALO_BETA)):
+        inside, _ = quad(lambda r: 2 * np.pi * r * module._moffat(r, *own), 0, edge, limit=200)  # noqa: B023
+        assert inside + module._beyond(edge, *own) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_flat_cores_become_gaussians():
     r = np.linspace(0, 10, 20)
     np.testing.assert_allclose(
-        module._core(r, 3.0, 1e-6), np.exp(-(r**2) / 9) / (np.pi * 9), rtol=1e-4
+        module._moffat(r, 3.0, 1e-6), np.exp(-(r**2) / 9) / (np.pi * 9), rtol=1e-4
     )

@@ -41,9 +41,10 @@ from astropolcal.scripts._common import (
     instrument_of,
     is_quiet,
     number_or,
-    numbers_type,
+    numbers,
     read_datasets,
     say,
+    text_type,
     wrapped,
     write_json,
 )
@@ -252,14 +253,14 @@ def test_lines_break_at_80_columns_and_words_stay_whole():
 
 
 def test_lists_of_numbers_and_words_or_a_number():
-    angles = numbers_type("a list of angles in degree")
+    angles = text_type("a list of angles in degree", numbers)
     assert angles("0,22.5,-45") == [0.0, 22.5, -45.0]
     for text in ("", "0,", "a", "0;45", "0,nan"):
         with pytest.raises(argparse.ArgumentTypeError, match="is not a list of angles in degree"):
             angles(text)
-    assert numbers_type("X,Y", 2)("69.9, 1e2") == [69.9, 100.0]
+    assert text_type("X,Y", numbers, 2)("69.9, 1e2") == [69.9, 100.0]
     with pytest.raises(argparse.ArgumentTypeError, match="'7' is not X,Y"):
-        numbers_type("X,Y", 2)("7")
+        text_type("X,Y", numbers, 2)("7")
     convert = number_or("fwhm", "growth")
     assert [convert("growth"), convert("3e1")] == ["growth", 30.0]
     with pytest.raises(argparse.ArgumentTypeError, match="'wide' is not fwhm, growth or a number"):

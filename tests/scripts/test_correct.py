@@ -26,7 +26,7 @@ from astropolcal.reduction.cubes import (
     simulate_cubes,
 )
 from astropolcal.reduction.frames import configured, read_night, survey_frames
-from astropolcal.reduction.headers import FrameHeader
+from astropolcal.reduction.headers import Frame
 from astropolcal.scripts import _correct
 from astropolcal.scripts._correct import (
     _WAYS,
@@ -296,9 +296,7 @@ def told(monkeypatch):
         monkeypatch.setattr(
             frame_files,
             "_survey",
-            lambda *_: [
-                FrameHeader(f, values=dict(known[f]), unit=known[f].get("unit")) for f in files
-            ],
+            lambda *_: [Frame(f, values=dict(known[f]), unit=known[f].get("unit")) for f in files],
         )
         return survey_frames(files, CHARIS.files, centre=centre)
 
@@ -376,7 +374,7 @@ def test_frames_are_checked_where_the_place_of_the_star_is_known(tmp_path):
 def test_star_that_is_not_found_names_the_file(monkeypatch):
     def frame(file):
         x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
-        found = FrameHeader(file, values={"hwp": 0.0})
+        found = Frame(file, values={"hwp": 0.0})
         found.photometry = SimpleNamespace(x=x, y=x + 15.0)
         return found
 
@@ -392,7 +390,7 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
 
 def test_copies_and_other_objects_among_science_frames(monkeypatch):
     def told(*frames):
-        found = [SimpleNamespace(errors=[], unit="adu", **one) for one in frames]
+        found = [Frame(f"{i}.fits", unit="adu", **one) for i, one in enumerate(frames)]
         monkeypatch.setattr(frame_files, "_survey", lambda *_: found)
         return survey_frames([f"{i}.fits" for i in range(len(found))], CHARIS.files, centre=(5, 5))
 
