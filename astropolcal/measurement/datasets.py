@@ -89,9 +89,7 @@ class Dataset:
         #: Position of each stage in the frames of each datum, radian,
         #: (frames_per_datum, n_groups); the mean over the nodes of an exposure.
         self.positions = {
-            stage: (angle.mean(axis=0) if angle.ndim == 2 else angle)[columns].reshape(
-                self.frames.T.shape
-            )
+            stage: np.atleast_2d(angle).mean(axis=0)[self.frames.T]
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
@@ -230,10 +228,7 @@ class Dataset:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
             # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them
-            if np.ndim(where):
-                out[where, each] += slope
-            else:
-                out[where] += slope
+            out[where, each] += slope
         out = self.observable.gathered(out, right, left)
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
 

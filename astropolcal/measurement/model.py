@@ -144,11 +144,10 @@ class Measurement(ScalarParameters):
         self._param_names = tuple(self.free.labels)
         #: Factor of each parameter from its unit to the canonical one.
         self._factors = self.free.factors()
-        units = [slot.unit for slot in self.free.slots for _ in range(slot.size)]
         bounds = _bounds(*(x / self._factors for x in self.free.bounds()))
         # astropy sets a parameter to its default
         start = (self.free.start() / self._factors).tolist()
-        entries = zip(self._param_names, start, units, bounds, strict=True)
+        entries = zip(self._param_names, start, self.free.units, bounds, strict=True)
         for label, value, unit, bound in entries:
             parameter = LinearlyTied(name=label, default=value, unit=unit, bounds=bound)
             parameter.model = self
@@ -180,11 +179,6 @@ class Measurement(ScalarParameters):
             raise ParameterError(f"{values.size} values for {len(self._param_names)} parameters")
         for label, value in zip(self._param_names, values.tolist(), strict=True):
             self.__dict__[label].value = value
-
-    @property
-    def has_fixed(self):
-        """Whether a scalar parameter is fixed."""
-        return any(self.__dict__[label].fixed for label in self._param_names)
 
     @property
     def sync_constraints(self):

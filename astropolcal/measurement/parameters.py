@@ -33,6 +33,8 @@ __all__ = ["Normal", "Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
+# ``optic.parameter[3]`` as an attribute
+_AS_IDENTIFIER = str.maketrans(".[", "__", "]")
 # share of a value, or of one, by which rounding alone may take it beyond a bound
 _ROUNDING = 1e-9
 
@@ -102,16 +104,15 @@ class Slot:
         """Whether there is one value per wavelength."""
         return self.size > 1
 
-    @property
-    def labels(self):
-        """Identifiers of the elements, fit for attribute access."""
-        stem = self.name.replace(".", "_")
-        return [stem] if self.size == 1 else [f"{stem}_{i}" for i in range(self.size)]
-
     def canonical_bounds(self):
         """Return lower and upper bound as canonical floats, infinite where open."""
         low, high = limits(self.bounds)
         return low * self.factor, high * self.factor
+
+
+def element_names(name, size):
+    """Return readable names of the elements of a parameter, such as ``derotator.horizontal[3]``."""
+    return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
 
 
 def limits(bounds):
@@ -314,16 +315,12 @@ class FreeParameters:
     @property
     def labels(self):
         """Identifiers of the elements of the flat vector, fit for attribute access."""
-        return [label for slot in self.slots for label in slot.labels]
+        return [name.translate(_AS_IDENTIFIER) for name in self.names]
 
     @property
     def names(self):
         """Readable names of the elements, such as ``derotator.horizontal[3]``."""
-        return [
-            slot.name if slot.size == 1 else f"{slot.name}[{i}]"
-            for slot in self.slots
-            for i in range(slot.size)
-        ]
+        return [name for slot in self.slots for name in element_names(slot.name, slot.size)]
 
     @property
     def units(self):
@@ -345,9 +342,8 @@ class FreeParameters:
         return vector
 
     def bounds(self):
-        """Return lower and upper bounds, shape (n_free,) each."""
-        low, high = self._bounds
-        return low.copy(), high.copy()
+        """Return lower and upper bounds, shape (2, n_free)."""
+        return self._bounds.copy()
 
     def at_bounds(self, vector):
         """Return which elements of a vector sit at a bound, or beyond it; shape (n_free,)."""
@@ -358,13 +354,13 @@ class FreeParameters:
 
     def _limits(self):
         pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
-        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
+        low, high = both = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
         for slot, prior in self.priors:
             start, end = prior.support
             # where the density is zero there is a bound, whichever is tighter
             low[slot.slice] = np.maximum(low[slot.slice], start)
             high[slot.slice] = np.minimum(high[slot.slice], end)
-        return low, high
+        return both
 
     def check_priors(self):
         """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
@@ -582,18 +578,7 @@ class BoundPrior:
 
     def log_densities(self, canonical):
         """Return the log density per declared unit at each value."""
-        canonical = np.asarray(canonical, dtype=float)
-        value = canonical / self.factor
-        if self._is_normal:
-            mean, std = self._moments
-            # scipy's logpdf checks its arguments at every call, which
-            # a sampler makes a million times
-            return self._log_peak - 0.5 * ((value - mean) / std) ** 2
-        if self.is_flat:
-            low, high = self.support
-            inside = (canonical >= low) & (canonical <= high)
-            return np.where(inside, self._log_peak, -np.inf)
-        return self.distribution.logpdf(value)
+        return self._log_peak - 0.5 * self.residual(canonical) ** 2
 
     def residual(self, canonical):
         """Return signed residuals whose half square is minus the log density, less its least."""
