@@ -24,13 +24,13 @@ from astropy.modeling.fitting import TRFLSQFitter
 
 from astropolcal.calibration.fit.strategies import (
     BinProblem,
-    fit_once,
     joint,
     known_noises,
     outside_bounds,
     sequential,
     two_step,
     undecided_signs,
+    until_settled,
 )
 from astropolcal.calibration.identifiability.analysis import complete, physical_scale
 from astropolcal.calibration.identifiability.sky import view_of_measurement
@@ -207,7 +207,15 @@ def calibrate(
     given = weights if strategy == "sequential" else weighting
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
-        outcome, weighting = _robust(measurement, fitter, loss, outcome)
+        # iteratively reweighted least squares, which every fitter can do
+        outcome, weighting = until_settled(
+            measurement,
+            robust_weighting(measurement, loss),
+            fitter,
+            lambda _: robust_weighting(measurement, loss),
+            _ROBUST_ROUNDS,
+            "the weights of the robust fit",
+        )
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
@@ -295,20 +303,6 @@ def _check_derivatives(measurement):
                 f"{slot.name}: the derivative that the optic gives is not that of its matrix: "
                 f"data change by up to {change[worst]:.4g} a step, not {told[worst]:.4g}"
             )
-
-
-def _robust(measurement, fitter, loss, outcome):
-    """Fit with the weights of a robust loss until they settle."""
-    before = None
-    for _ in range(_ROBUST_ROUNDS):
-        # iteratively reweighted least squares, which every fitter can do
-        weighting = robust_weighting(measurement, loss)
-        if before is not None and weighting.agrees(before):
-            return outcome, weighting
-        outcome = fit_once(measurement, weighting, fitter)
-        before = weighting
-    message = f"the weights of the robust fit did not settle in {_ROBUST_ROUNDS} fits"
-    return outcome | {"converged": False, "message": message}, weighting
 
 
 # ---- choice of a gauge: one of the solutions that the data cannot tell apart ----

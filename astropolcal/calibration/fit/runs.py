@@ -32,10 +32,7 @@ from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.analysis import physical_scale
-from astropolcal.calibration.identifiability.linearized import (
-    STILL,
-    Whitened,
-)
+from astropolcal.calibration.identifiability.linearized import STILL, Whitened
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance

@@ -38,6 +38,7 @@ from astropolcal.calibration.identifiability.sky import (
     consequences_along,
     consequences_of,
     matters,
+    seen_with,
     sky_words,
     view_of_measurement,
 )
@@ -397,10 +398,7 @@ def mirror_branches(measurement, vector, view):
         if inside and change < _SAME and not np.allclose(other, vector):
             sky = None
             if view is not None:
-                # the chain from the sky, with those optics that are in the other solution
-                known = {o.name: o for chain in measurement.put_back(other) for o in leaves(chain)}
-                chain = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
-                sky = consequences_of(view, chain)
+                sky = consequences_of(view, seen_with(view, measurement.put_back(other)))
             branches.append({"words": words, "sky": sky})
     if not any(_SAME_DATA in branch["words"] for branch in branches):
         branches += _other_instrument(measurement, vector, view)

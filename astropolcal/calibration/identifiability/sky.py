@@ -275,6 +275,12 @@ def consequences_of(view, chain):
     return _consequences(change[np.isfinite(change).all(axis=(-2, -1))], _whole)
 
 
+def seen_with(view, chains):
+    """Return the chain of a view, with the optics of other chains where they have them."""
+    known = {leaf.name: leaf for chain in chains for leaf in leaves(chain)}
+    return join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
+
+
 def mean_errors(view, chain):
     """Return the mean squares of errors of q and u of taking another chain for the true one.
 
