@@ -274,9 +274,8 @@ def _positions(chain, observations, positions):
 
 def _columns(observations, chain):
     # where the true angle of a stage is known, it is that at which it stands
-    known, found = observations.frames.colnames, stages(chain)
-    true = {stage: f"{stage}_true" for stage in found if f"{stage}_true" in known}
-    return {stage: observations.position(true.get(stage, stage)) for stage in found}
+    known, true = observations.frames.colnames, {s: f"{s}_true" for s in stages(chain)}
+    return {s: observations.position(t if t in known else s) for s, t in true.items()}
 
 
 def _node_weights(positions, observations):

@@ -149,11 +149,10 @@ def sequence_of(wanted, settings):
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
-    if not own or not {*own} <= {*settings}:
+    known = [settings.get(stage) for stage in own]
+    if not own or None in known or len({*map(len, known)}) > 1:
         return None
-    if len({len(settings[stage]) for stage in own}) > 1:
-        return None
-    frames = np.unique(np.transpose([settings[stage] for stage in own]), axis=0)
+    frames = np.unique(np.transpose(known), axis=0)
     frames = _spread_out(frames, _LONGEST)
     count = _MOST if set(_POINTINGS) & set(wanted) else 1
     placed = dict(zip(own, np.tile(frames, (count, 1)).T, strict=True))

@@ -78,6 +78,15 @@ class NoiseEstimate:
     sigma_of_data: np.ndarray
     independent: object = 1.0
 
+    def of_data(self, measurement):
+        """Return the noise of every datum; refuse an estimate from another measurement."""
+        if self.sigma_of_data.shape != (measurement.n_data,):
+            raise FitError(
+                f"the noise is that of {self.sigma_of_data.size} data, the measurement has "
+                f"{measurement.n_data}; estimate it from this measurement"
+            )
+        return self.sigma_of_data
+
 
 def data_by_wavelength(measurement):
     """Return number of the dataset, wavelength, and indices of unmasked data of each cell.

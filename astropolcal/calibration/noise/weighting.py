@@ -313,13 +313,8 @@ def first_weighting(measurement, weights):
     if isinstance(weights, Weighting):
         return weights
     if isinstance(weights, NoiseEstimate):
-        sigma = weights.sigma_of_data
-        if sigma.shape != (measurement.n_data,):
-            raise FitError(
-                f"the noise is that of {sigma.size} data, the measurement has "
-                f"{measurement.n_data}; estimate it from this measurement"
-            )
-        return _known(GIVEN, sigma, f"noise from {weights.method}: ", "have none")
+        sigma, before = weights.of_data(measurement), f"noise from {weights.method}: "
+        return _known(GIVEN, sigma, before, "have none")
     if weights is not None and not isinstance(weights, str):
         sigma = given_noise(measurement, weights)
         if np.median(sigma) > _LARGEST:

@@ -105,10 +105,10 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     if not np.isfinite(problem.noise):
         # as many data as parameters tell no noise, against which a prior could weigh
         problem.noise = 0.0
-    linear = _Linear(problem) if len(members) > _MANY else None
+    without = _without(problem) if len(members) > _MANY else None
     for out in steps(members, "groups left out"):
-        if linear is not None:
-            predicted, blind = linear.without(out)
+        if without is not None:
+            predicted, blind = without(out)
         else:
             _, blind = _undetermined(problem, out)
         if groups is not None and blind.any():
@@ -119,7 +119,7 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
                 f"cross-validation: without group {labels[out[0]]} ({out.size} data) the others do "
                 f"not determine {listed(moved, most=_MOST_NAMES)}; group by something else"
             )
-        if linear is None:
+        if without is None:
             counts = np.ones(measurement.n_data)
             counts[out] = 0.0
             fitted, _, _ = problem.fit(problem.solution, counts)
@@ -129,23 +129,20 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     return held_out
 
 
-class _Linear:
-    """What a fit without each of many groups predicts, by one step of linear algebra.
+def _without(problem):
+    """Return what says what a fit without a group predicts, by one step of linear algebra.
 
     The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
     for a linear model, and a small group moves no parameter far.
     """
+    weights, root = problem.weights, problem.around().slopes
+    weighted = problem.measurement.residuals(problem.solution) * weights
 
-    def __init__(self, problem):
-        whitened, self._weights = problem.around(), problem.weights
-        self._root = whitened.along(whitened.rows)
-        self._residuals = problem.measurement.residuals(problem.solution) * self._weights
-
-    def without(self, out):
+    def predicted(out):
         """Return the residuals of a group, and which of them the others do not determine."""
         # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
         # eigenvalues are those of R^T R, (rank, rank)
-        own, residuals = self._root[out], self._residuals[out]
+        own, residuals = root[out], weighted[out]
         values, axes = np.linalg.eigh(own.T @ own)
         seen = own @ axes
         # along these the others determine nothing
@@ -154,7 +151,9 @@ class _Linear:
         gain = np.where(alone, 0.0, 1 / np.where(alone, 1.0, 1 - values))
         # (1 - R R^T)^-1 = 1 + R (1 - R^T R)^-1 R^T
         change = seen @ (gain * (seen.T @ residuals))
-        return (residuals + change) / self._weights[out], blind
+        return (residuals + change) / weights[out], blind
+
+    return predicted
 
 
 def _checked(measurement, groups):
@@ -292,16 +291,12 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     True
     """
     noise = noise_from_errors(measurement) if noise is None else noise
-    if noise.sigma_of_data.shape != (measurement.n_data,):
-        raise FitError(
-            f"the noise is that of {noise.sigma_of_data.size} data, the measurement has "
-            f"{measurement.n_data}; estimate it from this measurement"
-        )
+    sigma = noise.of_data(measurement)
     if hasattr(vector, "measurement"):
         fitted = vector.measurement is measurement
         vector, weights = None, weighting_of(vector).weight if fitted else None
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    hat = _Hat.of(measurement, vector, noise.sigma_of_data, weights, whitened) if fitted else None
+    hat = _Hat.of(measurement, vector, sigma, weights, whitened) if fitted else None
     table, whole = _test_by_wavelength(measurement, vector, noise, hat)
     priors = _test_of_priors(measurement, vector, hat)
     chi2, expected, p_value = _together(table, whole, noise, priors)
@@ -517,12 +512,18 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 def predicted_measurement(calibration, chain, observations, positions=None, sources=False):
     """Return the measurement of a standard with the values of a calibration."""
     predicted = _predicted_chain(calibration, chain, observations, sources)
+    return measurement_with(calibration, predicted, observations, positions)
+
+
+def measurement_with(calibration, chain, observations, positions=None, wavelength=None):
+    """Return the measurement of new observations as a calibration observes, of a chain as it is."""
     return Measurement(
-        predicted,
+        chain,
         observations,
         observable=calibration.settings["observable"],
         positions=None if positions is None else [positions],
-        ties=ties_among(calibration.ties, parameter_table([predicted])),
+        ties=ties_among(calibration.ties, parameter_table([chain])),
+        wavelength=wavelength,
     )
 
 
