@@ -83,7 +83,6 @@ class Dataset:
         if self.descends:
             free.check_order(observations.name)
         self.frames = self.observations.groups(self.observable.frames_per_datum)
-        columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)
         self._node_weights = _node_weights(given, observations)
         #: Position of each stage in the frames of each datum, radian,
@@ -93,12 +92,11 @@ class Dataset:
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
-        self._place(chain, columns)
+        self._place(chain)
         self._plan(chain, free)
-        self._observe(columns)
 
-    def _place(self, chain, columns):
-        n_nodes = self._node_weights.size
+    def _place(self, chain):
+        n_nodes, columns = self._node_weights.size, self.frames.T.ravel()
         # node after node, each with all columns: (n_nodes *
         # n_columns,) is the frame axis of a sweep
         placed = {
@@ -112,6 +110,7 @@ class Dataset:
             self.propagator = Propagator(chain, obs.wavelength.to_value(u.um), placed)
         except WavelengthRangeError as error:
             raise WavelengthRangeError(f"{obs.name}: {error}") from None
+        self._observe(columns)
 
     def inputs(self):
         """Return the lowest and highest of each position in the frames that are used."""
@@ -124,9 +123,7 @@ class Dataset:
         new = copy.copy(self)
         new.frames = self.frames[groups]
         new.positions = {stage: angle[:, groups] for stage, angle in self.positions.items()}
-        columns = new.frames.T.ravel()
-        new._place(chain, columns)
-        new._observe(columns)
+        new._place(chain)
         return new
 
     # ---- data ----------------------------------------------------------------

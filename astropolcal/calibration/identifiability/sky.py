@@ -12,6 +12,7 @@ matters the more the fainter the polarization is.
 """
 
 import warnings
+from contextlib import suppress
 from functools import cached_property
 
 import astropy.units as u
@@ -20,7 +21,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.calibration.system import Rows, free_of, from_first_stage, inverse_rows
 from astropolcal.chain import join, leaves, stages, standing
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES, LinearPolarizer
@@ -119,16 +120,14 @@ def view_of_calibration(calibration):
 def _view(chains, free, lam, metas, name, settings):
     instrument = known_instrument(name)
     date = max((str(meta["date"]) for meta in metas if meta.get("date")), default=None)
-    try:
-        with warnings.catch_warnings():
+    for known in ((instrument, lam * u.um, date), ()):
+        with suppress(AstropolcalError), warnings.catch_warnings():
             # the published telescope of a coating that nobody states is named as such
             warnings.simplefilter("ignore", AstropolcalWarning)
-            chain, telescope = chain_from_sky(chains, instrument, lam * u.um, date)
-    except AstropolcalError:
-        try:
-            chain, telescope = chain_from_sky(chains)
-        except ChainError:
-            return None
+            chain, telescope = chain_from_sky(chains, *known)
+            break
+    else:
+        return None
     wanted, site = stages(chain), None
     if "hwp" not in wanted or any("=" in stage for stage in wanted):
         placed = sequence_of(wanted, settings)

@@ -291,19 +291,15 @@ def _replicate_scatter(part, residuals, tolerance):
     """Return deviations from the mean of the same settings, and freedom at each wavelength."""
     dense, present = np.zeros(part.valid.shape), part.valid.T.astype(float)
     dense[part.valid] = residuals
-    setting = _same_settings(part, tolerance)
+    columns = [_states(part.observations)[part.frames[:, 0]]]
+    columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
+    # a number for the settings of every group of frames
+    setting = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
     member = (setting[:, None] == np.arange(setting.max() + 1)).astype(float)
     count = member.T @ present
     mean = member.T @ dense.T / np.maximum(count, 1)
     off = present * (dense.T - member @ mean)
     return off, (present.sum(axis=0) - (count > 0).sum(axis=0)).astype(int)
-
-
-def _same_settings(part, tolerance):
-    """Return a number for the settings of every group of frames of a dataset."""
-    columns = [_states(part.observations)[part.frames[:, 0]]]
-    columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
-    return np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
 def _states(observations):

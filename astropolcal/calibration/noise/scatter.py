@@ -167,14 +167,10 @@ class _Part:
         present = self.dense(np.ones((len(self.pair), 1)))[..., 0]
         alone, diagonal = present.T @ present, np.sum(self.patterns**2, axis=1)
         mixed = present.T @ (diagonal[:, None] * present)
-        # the square of the correlation of the pairs at a setting
-        setting = [self.patterns[:, i::2] for i in (0, 1)] if self.patterns.shape[1] else []
-        both = np.zeros_like(alone)
-        for i, first in enumerate(setting):
-            for second in setting[i:]:
-                crossed = (first * second).T @ present
-                both += (1 if second is first else 2) * crossed.T @ crossed
-        parts = list(self.components())
+        # the square of the correlation of the pairs at a setting: q with q, u with u, and q with u
+        q, u = self.patterns[:, 0::2], self.patterns[:, 1::2]
+        crossed = np.hstack([q * q, u * u, np.sqrt(2) * q * u]).T @ present
+        both, parts = crossed.T @ crossed, list(self.components())
         pairs = {(True, True): both, (False, False): alone}
         return np.array(
             [[np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts]
