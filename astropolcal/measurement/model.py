@@ -225,8 +225,8 @@ class Measurement(ScalarParameters):
         chosen = [_drawn(dataset.frames.shape[0], most) for dataset in self.datasets]
         new, parts = copy_module.deepcopy(self), list(zip(self.datasets, chosen, strict=True))
         new.datasets = [
-            dataset.thinned(chain, groups)
-            for chain, (dataset, groups) in zip(self._chains, parts, strict=True)
+            d if len(groups) == len(d.frames) else d.thinned(chain, groups)
+            for chain, (d, groups) in zip(self._chains, parts, strict=True)
         ]
         new._finish(self.name)
         # the thinned measurement starts where this one stands, not where the chains do

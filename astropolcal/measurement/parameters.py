@@ -110,6 +110,24 @@ class Slot:
         return low * self.factor, high * self.factor
 
 
+def step_of(unit):
+    """Return the step of a parameter in canonical units, its size and its unit in words."""
+    if unit is None:
+        return 0.01, 0.01, ""
+    if u.Unit(unit).is_equivalent(u.rad):
+        # canonical is radian: one degree is the step that a user has a feeling for
+        return np.deg2rad(1.0), 1.0, " deg"
+    if not u.Unit(unit).is_equivalent(u.um):
+        # a coefficient of a law, such as one in deg / day
+        return canonical_factor(unit), 1.0, f" {unit}"
+    return 1.0, 1.0, " um"
+
+
+def declared_step(unit):
+    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
+    return step_of(unit)[0] / canonical_factor(unit)
+
+
 def element_names(name, size):
     """Return readable names of the elements of a parameter, such as ``derotator.horizontal[3]``."""
     return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
@@ -375,6 +393,12 @@ class FreeParameters:
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
+
+    @property
+    def steps(self):
+        """One degree, micrometre or percent of each element, canonical."""
+        kinds = [step_of(slot.unit)[0] for slot in self.slots]
+        return np.repeat(kinds, [slot.size for slot in self.slots])
 
     def prior_residuals(self, vector):
         """Return the residuals of the priors that are not flat, one an element of theirs."""

@@ -32,7 +32,7 @@ from astropolcal.calibration.fit.strategies import (
     undecided_signs,
     until_settled,
 )
-from astropolcal.calibration.identifiability.analysis import complete, physical_scale
+from astropolcal.calibration.identifiability.analysis import complete
 from astropolcal.calibration.identifiability.sky import view_of_measurement
 from astropolcal.calibration.noise.estimates import noise_as_given, rms
 from astropolcal.calibration.noise.scatter import Scatter, model_error
@@ -293,7 +293,7 @@ def _check_derivatives(measurement):
     free, vector = measurement.free, measurement.vector()
     for slot in (s for s in free.slots if s.name.partition(".")[0] in foreign):
         step = np.zeros(free.size)
-        step[slot.slice] = _DIFFERENCE * physical_scale(free)[slot.slice]
+        step[slot.slice] = _DIFFERENCE * free.steps[slot.slice]
         change = (measurement.predict(vector + step) - measurement.predict(vector - step)) / 2
         told = step @ measurement.jacobian(vector)
         worst = int(np.argmax(np.abs(change - told)))
@@ -345,7 +345,7 @@ def settled(problem, origin):
     """
     measurement = problem.measurement
     free, vector = measurement.free, measurement.vector()
-    scale, (low, high) = physical_scale(free), free.bounds()
+    scale, (low, high) = free.steps, free.bounds()
     # the elements whose moves are to be small: those common to all wavelengths
     leaders = [slot.start for slot in free.slots if not slot.per_wavelength]
     leaders = np.array(leaders or range(free.size), dtype=int)
@@ -382,7 +382,7 @@ def open_parameters(free, whitened):
 
 def hold_silent(measurement, origin):
     """Put back to the start what ended elsewhere although it changes no datum."""
-    vector, scale = measurement.vector(), physical_scale(measurement.free)
+    vector, scale = measurement.vector(), measurement.free.steps
     slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
     still = (slopes < _SILENT) & (vector != origin)
     for slot, prior in measurement.free.priors:

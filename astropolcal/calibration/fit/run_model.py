@@ -23,7 +23,6 @@ from astropolcal.calibration.fit.evidence import (
     waves_of,
     weigh,
 )
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
 from astropolcal.exceptions import ParameterError
 from astropolcal.progress import stage
@@ -57,7 +56,7 @@ class Model:
         self.work, self.dates, self.terms = work, dates, []
         frees = [shape.free for shape in work.shapes]
         self.names = [free.names for free in frees]
-        self.scales = [physical_scale(free) for free in frees]
+        self.scales = [free.steps for free in frees]
         count = Counter(name for names in self.names for name in names)
         _check_known(own, count, "own")
         self.own = [

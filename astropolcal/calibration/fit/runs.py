@@ -31,7 +31,6 @@ from astropolcal.calibration.fit.calibrate import ERRORS, _result
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import STILL, Whitened
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
@@ -246,7 +245,7 @@ class _Run:
         measurement.note_inputs()
         if not measurement.free.size:
             raise FitError("nothing to fit: every parameter is fixed or tied")
-        self.scale = physical_scale(measurement.free)
+        self.scale = measurement.free.steps
         weighting = first_weighting(measurement, None)
         if known is None:
             self._fit(start, weighting, options)

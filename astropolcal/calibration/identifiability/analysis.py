@@ -31,7 +31,6 @@ from astropolcal.calibration.identifiability.linearized import (
     led,
     near_null_directions,
     open_directions,
-    step_of,
 )
 from astropolcal.calibration.identifiability.sky import (
     LEFT_OUT,
@@ -180,7 +179,7 @@ def examine(measurement, weights=None):
     """
     vector, free = measurement.vector(), measurement.free
     data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
-    whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector, for_errors=True))
+    whitened = Whitened(data, free.steps, free.prior_jacobian(vector, for_errors=True))
     level = np.nan if weights is None else 1.0
     name = measurement.datasets[0].observations.instrument
     view = view_of_measurement(measurement, vector, name)
@@ -197,7 +196,7 @@ def complete(measurement, whitened, level, view):
     finding = finding_of(free, whitened)
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
     # one degree, micrometre or percent of the leading parameter
-    canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
+    canonical = np.array(scaled).reshape(-1, free.size) * free.steps
     for direction, sky in zip(finding.directions, consequences_along(view, canonical), strict=True):
         if sky is not None:
             direction["sky"] = sky
@@ -227,12 +226,6 @@ def complete(measurement, whitened, level, view):
     finding.branches = mirror_branches(measurement, vector, view)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     return finding
-
-
-def physical_scale(free):
-    """Return one degree, micrometre or percent of each free parameter, in canonical units."""
-    kinds = [step_of(slot.unit)[0] for slot in free.slots]
-    return np.repeat(kinds, [slot.size for slot in free.slots])
 
 
 # ---- what stars leave open of the telescope's mirrors, and what would determine it ----

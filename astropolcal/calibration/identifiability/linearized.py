@@ -4,12 +4,11 @@
 from collections import defaultdict
 from functools import cached_property
 
-import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.sky import sky_words
 from astropolcal.files import plain
-from astropolcal.units import canonical_factor
+from astropolcal.measurement.parameters import step_of
 
 __all__ = []
 
@@ -207,24 +206,6 @@ def ranked(values, equal=None):
         smaller = np.diff(falling, prepend=falling[:1]) < -equal
     # by groups of equal ones, and by place within a group
     return order[np.lexsort((order, np.cumsum(smaller)))]
-
-
-def step_of(unit):
-    """Return the step of a parameter in canonical units, its size and its unit in words."""
-    if unit is None:
-        return 0.01, 0.01, ""
-    if u.Unit(unit).is_equivalent(u.rad):
-        # canonical is radian: one degree is the step that a user has a feeling for
-        return np.deg2rad(1.0), 1.0, " deg"
-    if not u.Unit(unit).is_equivalent(u.um):
-        # a coefficient of a law, such as one in deg / day
-        return canonical_factor(unit), 1.0, f" {unit}"
-    return 1.0, 1.0, " um"
-
-
-def declared_step(unit):
-    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
-    return step_of(unit)[0] / canonical_factor(unit)
 
 
 # ---- open directions ----------------------------------------------------------------------

@@ -15,7 +15,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, triangle
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
@@ -244,7 +243,7 @@ class Problem:
         vector, free = self.solution if vector is None else vector, self.measurement.free
         data = self.measurement.jacobian(vector) * self.weights
         priors = free.prior_jacobian(vector, for_errors=True) * self.noise
-        return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
+        return Whitened(data, free.steps, priors, free.at_bounds(vector))
 
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
         """Return the vector, chi-square, and what scipy says of the fit.

@@ -11,7 +11,6 @@ import warnings
 
 import numpy as np
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.weighting import (
     GIVEN,
     Problem,
@@ -156,7 +155,7 @@ class LogPosterior:
 
     def physical_scale(self):
         """Return a degree, a micrometre or a percent of what varies, canonical."""
-        return physical_scale(self.measurement.free)[self.sampled]
+        return self.measurement.free.steps[self.sampled]
 
 
 def _elements(free, parameters):

@@ -16,7 +16,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
 from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
@@ -112,7 +111,7 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
         else:
             _, blind = _undetermined(problem, out)
         if groups is not None and blind.any():
-            share = np.abs(_undetermined(problem, out)[0] / physical_scale(measurement.free))
+            share = np.abs(_undetermined(problem, out)[0] / measurement.free.steps)
             slots = measurement.free.slots
             moved = [s.name for s in slots if share[:, s.slice].max() > _WORTH_A_WORD]
             raise FitError(
@@ -173,7 +172,7 @@ def _checked(measurement, groups):
 
 def _undetermined(problem, out):
     """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
-    measurement, scale = problem.measurement, physical_scale(problem.measurement.free)
+    measurement, scale = problem.measurement, problem.measurement.free.steps
     jacobian = measurement.jacobian(problem.solution)
     kept = np.delete(problem.jacobian(problem.solution), out, axis=0)
     null = Whitened(kept.T, scale).data.null * scale
@@ -492,7 +491,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     # open directions of the calibration, as far as the standard's chain follows them
     free, moved = free_of(calibration), np.zeros((1, measurement.n_data))
     null = np.reshape(calibration.identifiability.null_vectors, (-1, free.size))
-    null, jacobian = null * physical_scale(free), measurement.jacobian(measurement.vector())
+    null, jacobian = null * free.steps, measurement.jacobian(measurement.vector())
     for slot in measurement.free.slots:
         own, factor, _ = free.lookup(slot.name)
         columns = own.start + (np.sort(rows) if own.per_wavelength else np.zeros(1, dtype=int))
