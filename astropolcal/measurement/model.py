@@ -181,6 +181,11 @@ class Measurement(ScalarParameters):
             self.__dict__[label].value = value
 
     @property
+    def has_fixed(self):
+        """Whether a scalar parameter is fixed."""
+        return any(self.__dict__[label].fixed for label in self._param_names)
+
+    @property
     def sync_constraints(self):
         """Whether astropy reads constraints from the parameters each time; not in a fit."""
         return self.__dict__.get("_sync_constraints", True)

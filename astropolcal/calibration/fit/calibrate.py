@@ -54,7 +54,7 @@ from astropolcal.calibration.uncertainty.covariance import (
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
+from astropolcal.exceptions import AstropolcalWarning, FitError
 from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
@@ -498,10 +498,7 @@ def _lack_of_fit(calibration, whitened):
         # all errors stand on it alone
         noises.insert(0, noise_as_given(measurement, weighting.sigma))
     for noise in noises:
-        try:
-            test = lack_of_fit(measurement, calibration, noise, whitened=whitened)
-        except AstropolcalError:
-            continue  # too few data: nothing to hold against
+        test = lack_of_fit(measurement, calibration, noise, whitened=whitened)
         # unknown where no degree of freedom is left
         ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(

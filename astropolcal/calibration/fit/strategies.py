@@ -209,8 +209,6 @@ def search_branches(problem, vector, origin=None):
     A bin keeps its own valley unless another is clearly (1 %) better. Scans begin at the
     per-wavelength parameters of ``origin``, by default at ``vector``.
     """
-    if not problem.slots:
-        return vector, np.zeros(problem.n_bins, dtype=bool)
     # in the wrong valley a bin drives its other parameters astray: scan from the origin
     start = vector.copy()
     if origin is not None:

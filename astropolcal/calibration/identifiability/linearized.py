@@ -246,8 +246,6 @@ def led(free, null):
 
     Those common to all wavelengths come first.
     """
-    if not len(null):
-        return
     several = np.repeat([s.per_wavelength for s in free.slots], [s.size for s in free.slots])
     order, n_single = np.argsort(several, kind="stable"), int(np.sum(~several))
     columns, leads = null.copy(), []

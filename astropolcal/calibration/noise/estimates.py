@@ -107,6 +107,12 @@ def rms(values):
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
+def mean_of_known(values):
+    """Return means of what is known along the last axis, NaN of nothing."""
+    with np.errstate(invalid="ignore"):
+        return np.nansum(values, axis=-1) / np.isfinite(values).sum(axis=-1)
+
+
 def _of_data(measurement, sigma, dof, method, words, independent=1.0):
     """Return an estimate with a noise for each datum, (n_data,)."""
     numbers, wavelength, rows = data_by_wavelength(measurement)

@@ -358,9 +358,8 @@ def model_error(measurement, scatter, signs):
             settings.append(scatter.parts[i].patterns.shape[1] // 2)
     found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
     for key, rows in squares.items():
-        known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
-        count = known.sum(axis=0)
-        total = np.where(known, rows if rows else 0.0, 0.0).sum(axis=0)
+        rows = np.reshape(rows, (-1, measurement.wavelength.size))
+        count, total = np.isfinite(rows).sum(axis=0), np.nansum(rows, axis=0)
         found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
         if not count.any():
             found["missing"].append(key)

@@ -36,14 +36,7 @@ from astropolcal.words import html
 __all__ = ["Calibration", "with_validity"]
 
 # what is known of each element of a parameter, and what is said of those without an error
-_OF_ELEMENTS = (
-    "std",
-    "identifiable",
-    "at_bound",
-    "std_inward",
-    "conditional_on",
-    "std_released",
-)
+_OF_ELEMENTS = ("std", "identifiable", "at_bound", "std_inward", "conditional_on", "std_released")
 _UNKNOWN = (np.nan, False, False, np.nan, "", np.nan)
 
 

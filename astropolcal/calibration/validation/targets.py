@@ -13,7 +13,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
-from astropolcal.calibration.noise.estimates import rms
+from astropolcal.calibration.noise.estimates import mean_of_known, rms
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
@@ -450,11 +450,9 @@ def _tables_of_kinds(calibration, column):
         rows = np.full((len(several), grid.size), np.nan)
         for row, (own, square) in zip(rows, several, strict=True):
             row[np.abs(own[:, None] - grid).argmin(axis=1)] = square
-        known = np.isfinite(rows)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
         if kind is not None and several:
-            tables[kind] = QTable({"wavelength": grid, column: np.sqrt(mean) * u.percent})
+            mean = np.sqrt(mean_of_known(rows.T)) * u.percent
+            tables[kind] = QTable({"wavelength": grid, column: mean})
     return tables
 
 
