@@ -51,8 +51,6 @@ class Rows:
         Of a parameter given per wavelength it is that to the value at the wavelength of the row.
         """
         wanted = {place: name for place, name in self._named.items() if self._slot(name)}
-        if not wanted:
-            return {}
         values, shape = self._values(None), self._light[0].shape
         result = {name: np.empty((2, *self._shape, n)) for name in wanted.values()}
         ones, zeros = np.ones(shape), np.zeros(shape)
@@ -138,10 +136,8 @@ def model_error(fit, lam, n=3):
     a share of the intensity, at all wavelengths together, as what the model lacks is smooth. So
     do signs of retardances that the data do not tell.
     """
-    known = (fit or {}).get("model_error")
-    if not known:
-        return np.zeros((0, len(lam), n, n))
-    own = np.asarray(known["wavelength_nm"], dtype=float) / 1e3
+    known = (fit or {}).get("model_error") or {}
+    own = np.array(known.get("wavelength_nm", ()), dtype=float) / 1e3
     order = np.argsort(own)
     directions = []
     both = (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY))
@@ -154,7 +150,7 @@ def model_error(fit, lam, n=3):
                 direction = np.zeros((len(lam), n, n))
                 direction[:, row, column] = np.interp(lam, own[order], values)
                 directions.append(direction)
-    return np.array(directions)
+    return np.reshape(directions, (-1, len(lam), n, n))
 
 
 # ---- pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors ----

@@ -282,8 +282,6 @@ def _node_weights(positions, observations):
         raise ObservationError(
             f"{observations.name}: the stages have different numbers of nodes: {counts}"
         )
-    if not counts:
-        return np.ones(1)
-    _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
+    _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values()), 1))
     # Gauss-Legendre weights on (-1, 1) sum to 2, the length of that interval
     return weights / 2

@@ -162,8 +162,7 @@ def _elements(free, parameters):
     """Return the elements of the flat vector that the names stand for, in their order."""
     if not free.size:
         raise ParameterError("nothing to sample: every parameter is fixed or tied")
-    if parameters is None:
-        return np.arange(free.size)
+    parameters = free.names if parameters is None else parameters
     parameters = [parameters] if isinstance(parameters, str) else list(parameters)
     by_name = {name: [i] for i, name in enumerate(free.names)}
     by_name |= {slot.name: list(range(slot.start, slot.start + slot.size)) for slot in free.slots}

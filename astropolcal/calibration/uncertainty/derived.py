@@ -457,9 +457,7 @@ def _by_name(calibration, value, slopes, axis):
 def _grid(calibration, wavelength):
     """Return the wavelengths of a matrix; those of the calibration if parameters are on them."""
     grid = calibration.wavelength
-    if wavelength is None:
-        return grid
-    lam = wavelengths_of(wavelength)
+    lam = grid if wavelength is None else wavelengths_of(wavelength)
     several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
     if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=SAME_WAVELENGTH)):
         raise ParameterError(
