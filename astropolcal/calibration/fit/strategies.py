@@ -176,17 +176,16 @@ class BinProblem(Problem):
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""
-        seen, found = set(), []
+        found = {}
         for row, slot in enumerate(self.slots):
             optic, key = slot.name.split(".")
             low, high = slot.canonical_bounds()
             # only a phase that may go round has mirror branches; an
             # orientation is within its bounds
             is_phase = key != "theta" and slot.unit is not None and slot.unit.is_equivalent(u.rad)
-            if is_phase and high - low > np.pi and optic not in seen:
-                seen.add(optic)
-                found.append((row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
-        return found
+            if is_phase and high - low > np.pi:
+                found.setdefault(optic, (row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
+        return list(found.values())
 
     def valleys(self, vector, row, low, high):
         """Return the best values of one slot from a scan over its bounds, (n_valleys, n_bins)."""

@@ -593,10 +593,9 @@ def derived_sky(calibration, q, u, positions, *, wavelength=None, chain=None, da
             "such as 0 and 22.5 deg"
         )
     slopes = {}
-    for name in numerator:
-        if name:
-            change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
-            slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
+    for name in filter(None, numerator):
+        change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
+        slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
     return _by_name(calibration, value, slopes, -2)
 
