@@ -392,13 +392,16 @@ class FreeParameters:
 
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
-        return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
+        return self.spread([slot.factor for slot in self.slots])
 
     @property
     def steps(self):
         """One degree, micrometre or percent of each element, canonical."""
-        kinds = [step_of(slot.unit)[0] for slot in self.slots]
-        return np.repeat(kinds, [slot.size for slot in self.slots])
+        return self.spread([step_of(slot.unit)[0] for slot in self.slots])
+
+    def spread(self, values):
+        """Return a value of each slot for all of its elements, shape (n_free,)."""
+        return np.repeat(values, [slot.size for slot in self.slots])
 
     def prior_residuals(self, vector):
         """Return the residuals of the priors that are not flat, one an element of theirs."""

@@ -246,7 +246,7 @@ def led(free, null):
 
     Those common to all wavelengths come first.
     """
-    several = np.repeat([s.per_wavelength for s in free.slots], [s.size for s in free.slots])
+    several = free.spread([slot.per_wavelength for slot in free.slots])
     order, n_single = np.argsort(several, kind="stable"), int(np.sum(~several))
     columns, leads = null.copy(), []
     while len(leads) < len(null):
@@ -312,10 +312,8 @@ def near_null_directions(free, whitened, level, sky_of):
     # each row is a principal direction, as long as its standard error at the noise of the fit
     singular, errors = found.singular[: found.rank], whitened.factor() * level
     condition = found.singular[:1] / singular
-    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
-    times_large = np.abs(errors) / np.repeat(
-        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
-    )
+    kinds = (step_of(slot.unit)[1:] for slot in free.slots)
+    times_large = np.abs(errors) / free.spread([LARGE[unit] / size for size, unit in kinds])
     bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
     leads = np.array([ranked(row)[0] for row in times_large], dtype=int)
     # the sign of a singular vector is arbitrary: the worst parameter goes up
