@@ -187,8 +187,6 @@ class Weighting:
 
     def started(self, measurement):
         """Return one level for all data, from the residuals before the first fit."""
-        if not self.from_residuals:
-            return self
         freedom = max(measurement.n_data - measurement.free.size, 1)
         level = np.sqrt(np.sum(measurement.residuals() ** 2) / freedom) or 1.0
         return Weighting(self.choice, np.full(measurement.n_data, level))
