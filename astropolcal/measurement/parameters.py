@@ -566,7 +566,6 @@ class BoundPrior:
     where its density is largest, ``factor`` leads from the declared to the canonical unit.
     """
 
-    name: str
     distribution: object
     factor: float
     mode: float
@@ -661,7 +660,7 @@ def bind_prior(prior, name, unit, bounds):
             f"prior of {name} peaks at {worst:g} on ({start:g}, {end:g}), outside the bounds "
             f"{low:g} to {high:g} {unit or ''}".rstrip()
         )
-    return BoundPrior(name, distribution, canonical_factor(unit), mode)
+    return BoundPrior(distribution, canonical_factor(unit), mode)
 
 
 def normal_per_wavelength(prior, unit):

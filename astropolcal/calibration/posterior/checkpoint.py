@@ -124,9 +124,9 @@ class Chain:
         h5py = need("h5py", "a checkpoint")
         arrays = {key: np.asarray(array).tolist() for key, array in arrays.items()}
         stated = {"description": description, "arrays": arrays, "room": len(self._steps)}
-        stated, block = json.dumps(stated).encode(), _LEAST_BLOCK
-        while block < len(stated) + 100:
-            block *= 2
+        stated = json.dumps(stated).encode()
+        # a power of two, with room for the first lines beside the text
+        block = max(_LEAST_BLOCK, 1 << (len(stated) + 99).bit_length())
         image = io.BytesIO()
         with h5py.File(image, "w", libver="earliest", userblock_size=block) as file:
             self._start = file.create_dataset("steps", data=self._steps).id.get_offset()
