@@ -83,6 +83,7 @@ class Dataset:
         if self.descends:
             free.check_order(observations.name)
         self.frames = self.observations.groups(self.observable.frames_per_datum)
+        columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)
         self._node_weights = _node_weights(given, observations)
         #: Position of each stage in the frames of each datum, radian,
@@ -92,11 +93,12 @@ class Dataset:
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
-        self._place(chain)
+        self._place(chain, columns)
         self._plan(chain, free)
+        self._observe(columns)
 
-    def _place(self, chain):
-        n_nodes, columns = self._node_weights.size, self.frames.T.ravel()
+    def _place(self, chain, columns):
+        n_nodes = self._node_weights.size
         # node after node, each with all columns: (n_nodes *
         # n_columns,) is the frame axis of a sweep
         placed = {
@@ -110,7 +112,6 @@ class Dataset:
             self.propagator = Propagator(chain, obs.wavelength.to_value(u.um), placed)
         except WavelengthRangeError as error:
             raise WavelengthRangeError(f"{obs.name}: {error}") from None
-        self._observe(columns)
 
     def inputs(self):
         """Return the lowest and highest of each position in the frames that are used."""
@@ -123,7 +124,9 @@ class Dataset:
         new = copy.copy(self)
         new.frames = self.frames[groups]
         new.positions = {stage: angle[:, groups] for stage, angle in self.positions.items()}
-        new._place(chain)
+        columns = new.frames.T.ravel()
+        new._place(chain, columns)
+        new._observe(columns)
         return new
 
     # ---- data ----------------------------------------------------------------
