@@ -208,14 +208,11 @@ def calibrate(
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
         # iteratively reweighted least squares, which every fitter can do
-        outcome, weighting = until_settled(
-            measurement,
-            robust_weighting(measurement, loss),
-            fitter,
-            lambda _: robust_weighting(measurement, loss),
-            _ROBUST_ROUNDS,
-            "the weights of the robust fit",
-        )
+        def again(_=None):
+            return robust_weighting(measurement, loss)
+
+        how = again(), fitter, again, _ROBUST_ROUNDS, "the weights of the robust fit"
+        outcome, weighting = until_settled(measurement, *how)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2

@@ -282,9 +282,8 @@ class _Run:
 
     def around(self, vector):
         """Return the rows of the run around canonical values, in steps of a degree or so."""
-        measurement, n = self.measurement, self.measurement.n_data
-        residual = measurement.observed - measurement.predict(vector)
-        problem = Whitened(measurement.jacobian(vector)[:, :n], self.scale)
+        residual = self.measurement.residuals(vector)
+        problem = Whitened(self.measurement.jacobian(vector), self.scale)
         found = problem.data
         along = problem.rows @ found.half.T
         middle = np.eye(found.rank) * self.level**2

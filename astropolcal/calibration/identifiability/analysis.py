@@ -303,12 +303,10 @@ _POOR = 10.0
 
 def harmonic_conditions(angles):
     """Return the condition number of each set of harmonics for plate angles in radian."""
-    found = {}
+    found, angles = {}, np.asarray(angles, float)
     for harmonics, _ in SETS:
         # the frames' brightness or polarization as a Fourier series of the plate angle
-        waves = [
-            wave(k * np.asarray(angles, float)) for k in harmonics for wave in (np.cos, np.sin)
-        ]
+        waves = [wave(k * angles) for k in harmonics for wave in (np.cos, np.sin)]
         # harmonic 0 has no sine
         columns = np.column_stack(waves[:1] + waves[2:])
         singular = np.linalg.svd(columns, compute_uv=False)

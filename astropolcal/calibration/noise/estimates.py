@@ -202,10 +202,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
         gain, read_noise = _number("gain", gain, False), _number("read_noise", read_noise, True)
         parts = []
         for part in measurement.datasets:
-            obs = part.observations
-            fluxes = [
-                np.moveaxis(f.T[:, part.frames], 2, 0) for f in (obs.flux_right, obs.flux_left)
-            ]
+            beams = part.observations.flux_right, part.observations.flux_left
+            fluxes = [np.moveaxis(flux.T[:, part.frames], 2, 0) for flux in beams]
             # Poisson: var(F) = F / gain, plus the read noise in the same units
             variances = [flux / gain + (read_noise / gain) ** 2 for flux in fluxes]
             with np.errstate(invalid="ignore", divide="ignore"):
