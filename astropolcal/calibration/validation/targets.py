@@ -18,6 +18,7 @@ from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
+    add_percent,
     held_out_residuals,
     refuse_fitted,
 )
@@ -526,14 +527,10 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         for part in measurement.datasets:
             refuse_fitted(calibration, part.observations)
         name = ", ".join(part.observations.name for part in measurement.datasets)
-        wavelength = result["wavelength"]
-        residuals = measurement.residuals()
-        own = measurement.wavelength[measurement.bins]
-        found = [
-            residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
-            for value in wavelength.to_value(u.um)
-        ]
-        result["s_standard"] = 100 * np.array([rms(r) for r in found]) * u.percent
+        residuals, own = measurement.residuals(), measurement.wavelength[measurement.bins]
+        grid = result["wavelength"].to_value(u.um)
+        near = (np.abs(own - lam) <= SAME_WAVELENGTH * lam for lam in grid)
+        add_percent(result, s_standard=[rms(residuals[one]) for one in near])
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
