@@ -28,6 +28,12 @@ class Rows:
         self.chain, self.free = chain, free
         self._leaves = leaves(chain)
         self._own = [leaf.canonical_values() for leaf in self._leaves]
+        # by place among the optics, and among the parameters of the optic
+        self._named = {
+            (i, j): f"{leaf.name}.{key}"
+            for i, leaf in enumerate(self._leaves)
+            for j, key in enumerate(leaf.param_names)
+        }
         self._mix, self._nodes = np.eye(len(lam)) if mix is None else mix, np.asarray(nodes)
         # fluxes of I, Q, U and V alone: a flux is linear in the light, these are its coefficients
         self._light = [Propagator(chain, lam, placed, source) for source in np.eye(4)]
@@ -44,13 +50,7 @@ class Rows:
 
         Of a parameter given per wavelength it is that to the value at the wavelength of the row.
         """
-        places = [
-            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
-        ]
-        named = zip(places, self._names(), strict=True)
-        wanted = {place: name for place, name in named if self._slot(name) is not None}
-        if not wanted:
-            return {}
+        wanted = {place: name for place, name in self._named.items() if self._slot(name)}
         values, shape = self._values(None), self._light[0].shape
         result = {name: np.empty((2, *self._shape, n)) for name in wanted.values()}
         ones, zeros = np.ones(shape), np.zeros(shape)
@@ -65,11 +65,6 @@ class Rows:
                     result[name][beam, ..., k] = self._over_nodes(slope)
         return result
 
-    def spread(self, slopes):
-        """Return derivatives to the free parameters on a last axis, see `spread_out`."""
-        shape = next(iter(slopes.values())).shape if slopes else self._shape
-        return spread_out(self.free, slopes, shape, self._mix)
-
     def changes(self, gain, n=3, scale=1.0):
         r"""Return how the Stokes parameters that a solution finds change with the free parameters.
 
@@ -82,33 +77,25 @@ class Rows:
             name: -np.einsum("wkbf,bwfs->wks", gain, (slope * scale)[..., :n], optimize=True)
             for name, slope in self.derivatives(max(n, 3)).items()
         }
-        if not slopes:
-            return np.zeros((len(gain), gain.shape[1], n, self.free.size))
-        return self.spread(slopes)
-
-    def _names(self):
-        return [f"{leaf.name}.{key}" for leaf in self._leaves for key in leaf.param_names]
+        return spread_out(self.free, slopes, (*gain.shape[:2], n), self._mix)
 
     def _slot(self, name):
         return None if self.free is None else self.free.lookup(name)[0]
 
     def _values(self, vector):
         """Return the values of every optic at the wavelengths of the data."""
-        names, size, values = iter(self._names()), self._mix.shape[1], []
-        for own in self._own:
-            values.append([])
-            for value in own:
-                name = next(names)
-                if vector is not None and self._slot(name) is not None:
-                    # a tied parameter follows its source: value = factor * source + offset
-                    slot, factor, offset = self.free.lookup(name)
-                    value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
-                if value.size not in (1, size):
-                    raise ParameterError(
-                        f"{name} has {value.size} values; allowed are 1 or {size}, one per "
-                        "wavelength"
-                    )
-                values[-1].append(self._mix @ value if value.size > 1 else value.reshape(()))
+        values, size = [list(own) for own in self._own], self._mix.shape[1]
+        for (i, j), name in self._named.items():
+            value = values[i][j]
+            if vector is not None and self._slot(name):
+                # a tied parameter follows its source: value = factor * source + offset
+                slot, factor, offset = self.free.lookup(name)
+                value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
+            if value.size not in (1, size):
+                raise ParameterError(
+                    f"{name} has {value.size} values; allowed are 1 or {size}, one per wavelength"
+                )
+            values[i][j] = self._mix @ value if value.size > 1 else value.reshape(())
         return values
 
     def _over_nodes(self, array):
@@ -149,10 +136,8 @@ def model_error(fit, lam, n=3):
     a share of the intensity, at all wavelengths together, as what the model lacks is smooth. So
     do signs of retardances that the data do not tell.
     """
-    known = (fit or {}).get("model_error")
-    if not known:
-        return np.zeros((0, len(lam), n, n))
-    own = np.asarray(known["wavelength_nm"], dtype=float) / 1e3
+    known = (fit or {}).get("model_error") or {}
+    own = np.array(known.get("wavelength_nm", ()), dtype=float) / 1e3
     order = np.argsort(own)
     directions = []
     both = (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY))
@@ -165,7 +150,7 @@ def model_error(fit, lam, n=3):
                 direction = np.zeros((len(lam), n, n))
                 direction[:, row, column] = np.interp(lam, own[order], values)
                 directions.append(direction)
-    return np.array(directions)
+    return np.reshape(directions, (-1, len(lam), n, n))
 
 
 # ---- pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors ----

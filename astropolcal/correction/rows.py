@@ -87,7 +87,7 @@ class RowModel(Rows):
     @property
     def held(self):
         """Names of parameters of optics in the chain that have no error: they were not free."""
-        return [name for name in self._names() if self._slot(name) is None]
+        return [name for name in self._named.values() if self._slot(name) is None]
 
 
 def measurement_rows(calibration, positions, wavelength, *, chain=None, interpolate=False):

@@ -4,9 +4,4 @@
 from astropolcal.measurement.model import Measurement
 from astropolcal.measurement.parameters import Normal, Tie, parameter_table
 
-__all__ = [
-    "Measurement",
-    "Normal",
-    "Tie",
-    "parameter_table",
-]
+__all__ = ["Measurement", "Normal", "Tie", "parameter_table"]

@@ -89,9 +89,7 @@ class Dataset:
         #: Position of each stage in the frames of each datum, radian,
         #: (frames_per_datum, n_groups); the mean over the nodes of an exposure.
         self.positions = {
-            stage: (angle.mean(axis=0) if angle.ndim == 2 else angle)[columns].reshape(
-                self.frames.T.shape
-            )
+            stage: np.atleast_2d(angle).mean(axis=0)[self.frames.T]
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
@@ -230,10 +228,7 @@ class Dataset:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
             # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them
-            if np.ndim(where):
-                out[where, each] += slope
-            else:
-                out[where] += slope
+            out[where, each] += slope
         out = self.observable.gathered(out, right, left)
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
 
@@ -279,9 +274,8 @@ def _positions(chain, observations, positions):
 
 def _columns(observations, chain):
     # where the true angle of a stage is known, it is that at which it stands
-    known, found = observations.frames.colnames, stages(chain)
-    true = {stage: f"{stage}_true" for stage in found if f"{stage}_true" in known}
-    return {stage: observations.position(true.get(stage, stage)) for stage in found}
+    known, true = observations.frames.colnames, {s: f"{s}_true" for s in stages(chain)}
+    return {s: observations.position(t if t in known else s) for s, t in true.items()}
 
 
 def _node_weights(positions, observations):
@@ -291,8 +285,6 @@ def _node_weights(positions, observations):
         raise ObservationError(
             f"{observations.name}: the stages have different numbers of nodes: {counts}"
         )
-    if not counts:
-        return np.ones(1)
-    _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
+    _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values()), 1))
     # Gauss-Legendre weights on (-1, 1) sum to 2, the length of that interval
     return weights / 2

@@ -144,11 +144,10 @@ class Measurement(ScalarParameters):
         self._param_names = tuple(self.free.labels)
         #: Factor of each parameter from its unit to the canonical one.
         self._factors = self.free.factors()
-        units = [slot.unit for slot in self.free.slots for _ in range(slot.size)]
         bounds = _bounds(*(x / self._factors for x in self.free.bounds()))
         # astropy sets a parameter to its default
         start = (self.free.start() / self._factors).tolist()
-        entries = zip(self._param_names, start, units, bounds, strict=True)
+        entries = zip(self._param_names, start, self.free.units, bounds, strict=True)
         for label, value, unit, bound in entries:
             parameter = LinearlyTied(name=label, default=value, unit=unit, bounds=bound)
             parameter.model = self
@@ -229,15 +228,14 @@ class Measurement(ScalarParameters):
         drawn at random, always the same ones. Free parameters and current values are the same.
         """
         chosen = [_drawn(dataset.frames.shape[0], most) for dataset in self.datasets]
-        new = copy_module.deepcopy(self)
-        new.datasets = list(self.datasets)
-        for i, groups in enumerate(chosen):
-            if len(groups) < self.datasets[i].frames.shape[0]:
-                new.datasets[i] = self.datasets[i].thinned(self._chains[i], groups)
+        new, parts = copy_module.deepcopy(self), list(zip(self.datasets, chosen, strict=True))
+        new.datasets = [
+            d if len(groups) == len(d.frames) else d.thinned(chain, groups)
+            for chain, (d, groups) in zip(self._chains, parts, strict=True)
+        ]
         new._finish(self.name)
         # the thinned measurement starts where this one stands, not where the chains do
         new.stand_at(self.vector())
-        parts = zip(self.datasets, chosen, strict=True)
         kept = [np.isin(dataset.group_of_datum, groups) for dataset, groups in parts]
         return new, np.concatenate(kept)
 
@@ -311,23 +309,19 @@ class Measurement(ScalarParameters):
             )
         return values[..., index.astype(int)]
 
-    def fit_arguments(self, weights=None, noise=1.0, keep=None):
+    def fit_arguments(self, weights=None, noise=1.0):
         """
         Return what a fitter takes: index, data and weights, with the priors as data after them.
 
         ``weights`` of the data may be None for equal ones, ``noise`` is the standard deviation of
-        a datum of weight one, which sets how much a prior weighs against the data, and ``keep`` is
-        True for the data that take part.
+        a datum of weight one, which sets how much a prior weighs against the data.
         """
-        take = np.ones(self.n_data, dtype=bool) if keep is None else keep
-        index, observed = self.index[take], self.observed[take]
-        weights = None if weights is None else weights[take]
         if not self.n_priors:
-            return index, observed, weights
-        weights = np.ones(index.size) if weights is None else weights
+            return self.index, self.observed, weights
+        weights = np.ones(self.n_data) if weights is None else weights
         return (
-            np.concatenate([index, self.n_data + np.arange(self.n_priors)]),
-            np.concatenate([observed, np.zeros(self.n_priors)]),
+            np.arange(self.n_data + self.n_priors, dtype=float),
+            np.concatenate([self.observed, np.zeros(self.n_priors)]),
             # a prior's residual is in units of its own width; times
             # the noise it is in those of a datum
             np.concatenate([weights, np.full(self.n_priors, noise)]),

@@ -33,6 +33,8 @@ __all__ = ["Normal", "Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
+# ``optic.parameter[3]`` as an attribute
+_AS_IDENTIFIER = str.maketrans(".[", "__", "]")
 # share of a value, or of one, by which rounding alone may take it beyond a bound
 _ROUNDING = 1e-9
 
@@ -102,16 +104,33 @@ class Slot:
         """Whether there is one value per wavelength."""
         return self.size > 1
 
-    @property
-    def labels(self):
-        """Identifiers of the elements, fit for attribute access."""
-        stem = self.name.replace(".", "_")
-        return [stem] if self.size == 1 else [f"{stem}_{i}" for i in range(self.size)]
-
     def canonical_bounds(self):
         """Return lower and upper bound as canonical floats, infinite where open."""
         low, high = limits(self.bounds)
         return low * self.factor, high * self.factor
+
+
+def step_of(unit):
+    """Return the step of a parameter in canonical units, its size and its unit in words."""
+    if unit is None:
+        return 0.01, 0.01, ""
+    if u.Unit(unit).is_equivalent(u.rad):
+        # canonical is radian: one degree is the step that a user has a feeling for
+        return np.deg2rad(1.0), 1.0, " deg"
+    if not u.Unit(unit).is_equivalent(u.um):
+        # a coefficient of a law, such as one in deg / day
+        return canonical_factor(unit), 1.0, f" {unit}"
+    return 1.0, 1.0, " um"
+
+
+def declared_step(unit):
+    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
+    return step_of(unit)[0] / canonical_factor(unit)
+
+
+def element_names(name, size):
+    """Return readable names of the elements of a parameter, such as ``derotator.horizontal[3]``."""
+    return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
 
 
 def limits(bounds):
@@ -314,16 +333,12 @@ class FreeParameters:
     @property
     def labels(self):
         """Identifiers of the elements of the flat vector, fit for attribute access."""
-        return [label for slot in self.slots for label in slot.labels]
+        return [name.translate(_AS_IDENTIFIER) for name in self.names]
 
     @property
     def names(self):
         """Readable names of the elements, such as ``derotator.horizontal[3]``."""
-        return [
-            slot.name if slot.size == 1 else f"{slot.name}[{i}]"
-            for slot in self.slots
-            for i in range(slot.size)
-        ]
+        return [name for slot in self.slots for name in element_names(slot.name, slot.size)]
 
     @property
     def units(self):
@@ -345,9 +360,8 @@ class FreeParameters:
         return vector
 
     def bounds(self):
-        """Return lower and upper bounds, shape (n_free,) each."""
-        low, high = self._bounds
-        return low.copy(), high.copy()
+        """Return lower and upper bounds, shape (2, n_free)."""
+        return self._bounds.copy()
 
     def at_bounds(self, vector):
         """Return which elements of a vector sit at a bound, or beyond it; shape (n_free,)."""
@@ -358,13 +372,13 @@ class FreeParameters:
 
     def _limits(self):
         pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
-        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
+        low, high = both = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
         for slot, prior in self.priors:
             start, end = prior.support
             # where the density is zero there is a bound, whichever is tighter
             low[slot.slice] = np.maximum(low[slot.slice], start)
             high[slot.slice] = np.minimum(high[slot.slice], end)
-        return low, high
+        return both
 
     def check_priors(self):
         """Refuse a prior of what is tied, unless it is that of what leads and says the same."""
@@ -378,7 +392,16 @@ class FreeParameters:
 
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
-        return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
+        return self.spread([slot.factor for slot in self.slots])
+
+    @property
+    def steps(self):
+        """One degree, micrometre or percent of each element, canonical."""
+        return self.spread([step_of(slot.unit)[0] for slot in self.slots])
+
+    def spread(self, values):
+        """Return a value of each slot for all of its elements, shape (n_free,)."""
+        return np.repeat(values, [slot.size for slot in self.slots])
 
     def prior_residuals(self, vector):
         """Return the residuals of the priors that are not flat, one an element of theirs."""
@@ -543,7 +566,6 @@ class BoundPrior:
     where its density is largest, ``factor`` leads from the declared to the canonical unit.
     """
 
-    name: str
     distribution: object
     factor: float
     mode: float
@@ -582,18 +604,7 @@ class BoundPrior:
 
     def log_densities(self, canonical):
         """Return the log density per declared unit at each value."""
-        canonical = np.asarray(canonical, dtype=float)
-        value = canonical / self.factor
-        if self._is_normal:
-            mean, std = self._moments
-            # scipy's logpdf checks its arguments at every call, which
-            # a sampler makes a million times
-            return self._log_peak - 0.5 * ((value - mean) / std) ** 2
-        if self.is_flat:
-            low, high = self.support
-            inside = (canonical >= low) & (canonical <= high)
-            return np.where(inside, self._log_peak, -np.inf)
-        return self.distribution.logpdf(value)
+        return self._log_peak - 0.5 * self.residual(canonical) ** 2
 
     def residual(self, canonical):
         """Return signed residuals whose half square is minus the log density, less its least."""
@@ -649,7 +660,7 @@ def bind_prior(prior, name, unit, bounds):
             f"prior of {name} peaks at {worst:g} on ({start:g}, {end:g}), outside the bounds "
             f"{low:g} to {high:g} {unit or ''}".rstrip()
         )
-    return BoundPrior(name, distribution, canonical_factor(unit), mode)
+    return BoundPrior(distribution, canonical_factor(unit), mode)
 
 
 def normal_per_wavelength(prior, unit):

@@ -9,21 +9,18 @@ from astropolcal import optics
 from astropolcal.calibration.identifiability.analysis import (
     Identifiability,
     finding_of,
-    physical_scale,
     telescope_words,
 )
 from astropolcal.calibration.identifiability.linearized import (
     LARGE,
     Whitened,
-    declared_step,
     first_of_each_kind,
     led,
     near_null_directions,
     open_directions,
-    step_of,
 )
 from astropolcal.measurement import Normal
-from astropolcal.measurement.parameters import FreeParameters, Uniform
+from astropolcal.measurement.parameters import FreeParameters, Uniform, declared_step, step_of
 
 N = 3
 NAMES = ["polarizer.theta", "hwp.w_sio2", *(f"retarder.retardance[{i}]" for i in range(N))]
@@ -76,7 +73,7 @@ def test_a_step_is_a_degree_a_micrometre_or_a_percent():
 
 def test_scale_has_the_step_of_every_element(free):
     expected = [np.deg2rad(1), 1, *[np.deg2rad(1)] * N, *[0.01] * N]
-    np.testing.assert_allclose(physical_scale(free), expected)
+    np.testing.assert_allclose(free.steps, expected)
 
 
 # --- open directions ----------------------------------------------------------------------------
@@ -153,9 +150,7 @@ def test_a_parameter_that_changes_nothing():
 
 def _whitened(free, errors):
     """A problem in which each element has its own error, in steps, for unit noise."""
-    return Whitened(
-        np.diag(1 / np.asarray(errors, dtype=float)) / physical_scale(free), physical_scale(free)
-    )
+    return Whitened(np.diag(1 / np.asarray(errors, dtype=float)) / free.steps, free.steps)
 
 
 def _near(free, errors, level=1.0, sky=None):
@@ -221,7 +216,7 @@ def test_which_of_two_equal_parameters_leads_does_not_hang_on_rounding(free):
         # as large a part of the limit of each, in opposite directions
         vector = _unit(polarizer_theta=-1, hwp_w_sio2=10 + rounding)
         rows = 100 * np.eye(len(NAMES)) - 99.998 * np.outer(vector, vector)
-        scale = physical_scale(free)
+        scale = free.steps
         found = Whitened(rows / scale[:, None], scale)
         (direction,) = near_null_directions(free, found, 1.0, lambda changes: [None] * len(changes))
         assert direction["words"].startswith("polarizer.theta is uncertain by 50 deg")
@@ -250,7 +245,7 @@ def test_several_wavelengths_that_are_uncertain_together(free):
     vector = _unit(retarder_retardance=1)
     rest = np.eye(len(NAMES)) - np.outer(vector, vector)
     rows = 100 * rest + np.outer(vector, vector) / 20
-    found = Whitened(rows / physical_scale(free), physical_scale(free))
+    found = Whitened(rows / free.steps, free.steps)
     (direction,) = near_null_directions(free, found, 1.0, lambda changes: [None] * len(changes))
     # 20 in all, shared by three
     expected = f"{20 / np.sqrt(3):.2g}"
@@ -267,7 +262,7 @@ def test_silent_parameters_are_axes_of_the_null_space(free):
     data = np.random.default_rng(1).normal(size=(free.size, 40))
     data[3] = 0
     data[0] = data[1]
-    scale = physical_scale(free)
+    scale = free.steps
     whitened = Whitened(data / scale[:, None], scale)
     finding, covariance = finding_of(free, whitened), whitened.covariance()
     assert finding.silent == [NAMES[3]]

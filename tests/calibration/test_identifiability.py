@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from astropolcal import optics
 from astropolcal.calibration import calibrate, examine
 from astropolcal.calibration.identifiability.analysis import finding_of as finding_of_problem
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, near_null_directions
 from astropolcal.calibration.identifiability.sky import consequences_along, view_of_measurement
 from astropolcal.measurement import Measurement, Normal
@@ -30,7 +29,7 @@ FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
 
 def analyse(free, jacobian, held=None):
     """What the data alone determine, and the covariance for unit noise."""
-    whitened = Whitened(jacobian, physical_scale(free), None, held)
+    whitened = Whitened(jacobian, free.steps, None, held)
     return finding_of_problem(free, whitened), whitened.covariance()
 
 
@@ -176,7 +175,7 @@ def test_step_along_the_null_directions_leaves_the_data_unchanged(weights, make)
     measurement = Measurement(truth, make.observe(truth, noise=False))
     finding, _ = finding_of(measurement)
     vector = measurement.vector()
-    direction = np.array(weights) @ finding.null_vectors * physical_scale(measurement.free)
+    direction = np.array(weights) @ finding.null_vectors * measurement.free.steps
     step = direction / np.abs(direction).max() * np.deg2rad(0.5)
 
     def change(share):
@@ -195,7 +194,7 @@ def test_null_vectors_are_orthonormal_and_null(make):
     finding, _ = finding_of(measurement)
     null = finding.null_vectors
     np.testing.assert_allclose(null @ null.T, np.eye(2), atol=1e-12)
-    scaled = measurement.jacobian(measurement.vector()) * physical_scale(measurement.free)[:, None]
+    scaled = measurement.jacobian(measurement.vector()) * measurement.free.steps[:, None]
     assert np.abs(null @ scaled).max() < 1e-9 * finding.singular_values[0]
     np.testing.assert_allclose(
         finding.singular_values[91:], 0, atol=1e-9 * finding.singular_values[0]
@@ -212,7 +211,7 @@ def test_covariance_is_the_inverse_normal_matrix(make):
     finding, covariance = analyse(measurement.free, whitened)
     assert finding.identifiable.all()
     # in steps, so that an element has the same weight whatever its unit
-    scale = physical_scale(measurement.free)
+    scale = measurement.free.steps
     covariance, whitened = covariance / np.outer(scale, scale), whitened * scale[:, None]
     np.testing.assert_allclose(covariance @ (whitened @ whitened.T), np.eye(47), atol=1e-7)
 
@@ -252,7 +251,7 @@ def test_scale_is_a_degree_a_micrometre_or_a_percent():
     )
     free = FreeParameters([chain], 1)
     assert free.names == ["plate.theta", "plate.w_sio2", "plate.w_mgf2", "wollaston.efficiency"]
-    np.testing.assert_allclose(physical_scale(free), [np.deg2rad(1.0), 1.0, 1.0, 0.01])
+    np.testing.assert_allclose(free.steps, [np.deg2rad(1.0), 1.0, 1.0, 0.01])
 
 
 def test_words_say_rank_and_directions(make):
@@ -318,7 +317,7 @@ def test_what_is_uncertain_by_many_degrees_is_named(make):
 def test_the_effect_on_sky_is_that_of_one_standard_error(make):
     """Each direction is moved by hand, and the change of the AoLP worked out anew."""
     cal = faint(make, 1e3)
-    live, scale = cal.measurement, physical_scale(cal.measurement.free)
+    live, scale = cal.measurement, cal.measurement.free.steps
     for direction in cal.identifiability.near_null[:2]:
         change = np.zeros(live.free.size)
         for slot in live.free.slots:
@@ -370,7 +369,7 @@ def test_a_bad_condition_is_named_whatever_the_noise():
     chain = angles_chain()
     free = FreeParameters([chain], 1)
     jacobian = np.array([[1.0, 1e-6], [1.0, -1e-6]]) / np.deg2rad(1.0) * 1e9
-    whitened = Whitened(jacobian, physical_scale(free))
+    whitened = Whitened(jacobian, free.steps)
     (found,) = near_null_directions(free, whitened, 1.0, lambda changes: [None] * len(changes))
     assert "(condition 1e+06)" in found["words"]
     assert "sky" not in found
@@ -386,7 +385,7 @@ def test_one_parameter_at_many_wavelengths_is_one_sentence():
     others = np.linalg.svd(np.ones((1, 3)))[2][1:].T
     jacobian = np.hstack([common / 20, others]) / np.deg2rad(1.0)
     (found,) = near_null_directions(
-        free, Whitened(jacobian, physical_scale(free)), 1.0, lambda c: [None] * len(c)
+        free, Whitened(jacobian, free.steps), 1.0, lambda c: [None] * len(c)
     )
     assert found["words"] == (
         "x.retardance is uncertain by 12 to 12 deg at 3 wavelengths together at the noise of this "
@@ -428,5 +427,5 @@ def test_problem_decomposed_once_is_that_of_the_normal_equations(n_data, n_prior
 def test_without_priors_and_bounds_there_is_one_decomposition(make):
     measurement = Measurement(make.chain(), make.observe(make.chain(), seed=1))
     vector = measurement.vector()
-    found = Whitened(measurement.jacobian(vector), physical_scale(measurement.free))
+    found = Whitened(measurement.jacobian(vector), measurement.free.steps)
     assert found.data is found.together is found.errors

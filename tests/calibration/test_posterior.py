@@ -2,6 +2,7 @@
 """Samples of a posterior: autocorrelation, quantiles, covariance, words, files."""
 
 import sys
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -179,7 +180,7 @@ def test_long_chain_of_walkers_that_do_not_agree_has_not_converged():
     # small against the width, so that the autocorrelation time hardly shows it
     chain = apart.chain + 0.04 * np.array([0, 0, 0, 0, 0, 0, 0, 5.0])[:, None]
     found = Posterior(NAMES, UNITS, chain, apart.log_prob, thin=1000)
-    found.autocorrelation_times = np.array([10.0, 10.0])
+    found.convergence = replace(found.convergence, times=np.array([10.0, 10.0]))
     assert found.n_times > 50
     assert not found.converged
     assert "NOT CONVERGED: R-hat of " in found.words()

@@ -26,6 +26,7 @@ from astropolcal.calibration.result.summary import (
 )
 from astropolcal.calibration.result.verdict import parameter_lines
 from astropolcal.calibration.uncertainty.covariance import status_of
+from astropolcal.measurement.parameters import element_names
 
 
 def _entry(value, std=np.nan, unit=None, **flags):
@@ -251,9 +252,20 @@ def test_some_outliers_are_named_and_the_others_counted():
             assert f"- and {more} more pairs" in text, (count, more)
 
 
+def _rows_of(known):
+    """Return the rows of the elements, as `Calibration.parameters` has them."""
+    keys = ("value", "std", "at_bound", "std_inward", "status", "conditional_on", "std_released")
+    return [
+        {"name": label} | {key: np.ravel(entry[key])[i] for key in keys}
+        for name, entry in known.items()
+        for i, label in enumerate(element_names(name, np.size(entry["value"])))
+    ]
+
+
 def test_nothing_tested_nothing_said():
     assert _goodness_lines(_calibration()) == []
-    assert _bound_lines({"a.b": _entry(1.0, 0.1)}) == []
+    known = {"a.b": _entry(1.0, 0.1)}
+    assert _bound_lines(_rows_of(known), known) == []
 
 
 def test_what_is_at_a_bound_and_what_hangs_on_it():
@@ -265,7 +277,7 @@ def test_what_is_at_a_bound_and_what_hangs_on_it():
         "w.eff": _entry([2.0, 1.0, 1.0], 0.01, at_bound=at, std_inward=np.full(3, np.inf)),
         "b.q": _entry([1.0, 1.0, 1.0], 0.01, **hanging),
     }
-    lines = _wrap(_calibration(), _bound_lines(known))
+    lines = _wrap(_calibration(), _bound_lines(_rows_of(known), known))
     assert all(len(line) <= 80 for line in lines)
     assert " ".join(" ".join(lines).split()) == (
         "- a.theta: above 1.50 - w.eff (1200.0 nm): not limited - the "

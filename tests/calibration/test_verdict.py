@@ -252,8 +252,8 @@ def test_a_target_that_is_not_known():
         # what is open is said with its name
         (np.inf, np.inf, {"AoLP": ["a.b"], "DoLP": ["a.b"]}, []),
     ):
-        assert verdicts._too_far([table(s_p, s_chi)], sky) == words
-    assert verdicts._too_far([], {}) == []
+        assert list(verdicts._too_far([table(s_p, s_chi)], sky)) == words
+    assert list(verdicts._too_far([], {})) == []
     assert verdicts._accuracy([], {}) == "On sky      unknown: the frames do not measure Q and U"
     words = verdicts._accuracy([table(0.0001, np.inf), table(0.02, np.inf)], {})
     assert words == "On sky      30, 30 % to <0.001, 0.02 %, AoLP open"

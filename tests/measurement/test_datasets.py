@@ -162,15 +162,13 @@ def test_priors_stand_behind_the_data(with_prior):
     np.testing.assert_allclose(predicted[n:], (0.97 - 0.95) / 0.02)
 
 
-def test_some_of_the_data_with_their_weights(with_prior):
-    keep = np.zeros(with_prior.n_data, dtype=bool)
-    keep[[1, 4]] = True
+def test_weights_of_data_and_priors(with_prior):
     weights = np.arange(with_prior.n_data, dtype=float)
-    index, observed, chosen = with_prior.fit_arguments(weights, 2.0, keep)
+    index, observed, chosen = with_prior.fit_arguments(weights, 2.0)
     n = with_prior.n_data
-    assert index.tolist() == [1, 4, n, n + 1, n + 2]
-    assert observed[:2].tolist() == with_prior.observed[[1, 4]].tolist()
-    assert chosen.tolist() == [1, 4, 2, 2, 2]
+    assert index.tolist() == [*range(n), n, n + 1, n + 2]
+    assert observed[:n].tolist() == with_prior.observed.tolist()
+    assert chosen.tolist() == [*range(n), 2, 2, 2]
 
 
 def test_without_weights_and_priors_there_are_no_weights(chain, observations):

@@ -24,15 +24,15 @@ from astropy.modeling.fitting import TRFLSQFitter
 
 from astropolcal.calibration.fit.strategies import (
     BinProblem,
-    fit_once,
     joint,
     known_noises,
     outside_bounds,
     sequential,
     two_step,
     undecided_signs,
+    until_settled,
 )
-from astropolcal.calibration.identifiability.analysis import complete, physical_scale
+from astropolcal.calibration.identifiability.analysis import complete
 from astropolcal.calibration.identifiability.sky import view_of_measurement
 from astropolcal.calibration.noise.estimates import noise_as_given, rms
 from astropolcal.calibration.noise.scatter import Scatter, model_error
@@ -54,7 +54,7 @@ from astropolcal.calibration.uncertainty.covariance import (
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
+from astropolcal.exceptions import AstropolcalWarning, FitError
 from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
@@ -207,7 +207,12 @@ def calibrate(
     given = weights if strategy == "sequential" else weighting
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
-        outcome, weighting = _robust(measurement, fitter, loss, outcome)
+        # iteratively reweighted least squares, which every fitter can do
+        def again(_=None):
+            return robust_weighting(measurement, loss)
+
+        how = again(), fitter, again, _ROBUST_ROUNDS, "the weights of the robust fit"
+        outcome, weighting = until_settled(measurement, *how)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
@@ -285,7 +290,7 @@ def _check_derivatives(measurement):
     free, vector = measurement.free, measurement.vector()
     for slot in (s for s in free.slots if s.name.partition(".")[0] in foreign):
         step = np.zeros(free.size)
-        step[slot.slice] = _DIFFERENCE * physical_scale(free)[slot.slice]
+        step[slot.slice] = _DIFFERENCE * free.steps[slot.slice]
         change = (measurement.predict(vector + step) - measurement.predict(vector - step)) / 2
         told = step @ measurement.jacobian(vector)
         worst = int(np.argmax(np.abs(change - told)))
@@ -295,20 +300,6 @@ def _check_derivatives(measurement):
                 f"{slot.name}: the derivative that the optic gives is not that of its matrix: "
                 f"data change by up to {change[worst]:.4g} a step, not {told[worst]:.4g}"
             )
-
-
-def _robust(measurement, fitter, loss, outcome):
-    """Fit with the weights of a robust loss until they settle."""
-    before = None
-    for _ in range(_ROBUST_ROUNDS):
-        # iteratively reweighted least squares, which every fitter can do
-        weighting = robust_weighting(measurement, loss)
-        if before is not None and weighting.agrees(before):
-            return outcome, weighting
-        outcome = fit_once(measurement, weighting, fitter)
-        before = weighting
-    message = f"the weights of the robust fit did not settle in {_ROBUST_ROUNDS} fits"
-    return outcome | {"converged": False, "message": message}, weighting
 
 
 # ---- choice of a gauge: one of the solutions that the data cannot tell apart ----
@@ -351,7 +342,7 @@ def settled(problem, origin):
     """
     measurement = problem.measurement
     free, vector = measurement.free, measurement.vector()
-    scale, (low, high) = physical_scale(free), free.bounds()
+    scale, (low, high) = free.steps, free.bounds()
     # the elements whose moves are to be small: those common to all wavelengths
     leaders = [slot.start for slot in free.slots if not slot.per_wavelength]
     leaders = np.array(leaders or range(free.size), dtype=int)
@@ -388,7 +379,7 @@ def open_parameters(free, whitened):
 
 def hold_silent(measurement, origin):
     """Put back to the start what ended elsewhere although it changes no datum."""
-    vector, scale = measurement.vector(), physical_scale(measurement.free)
+    vector, scale = measurement.vector(), measurement.free.steps
     slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
     still = (slopes < _SILENT) & (vector != origin)
     for slot, prior in measurement.free.priors:
@@ -504,10 +495,7 @@ def _lack_of_fit(calibration, whitened):
         # all errors stand on it alone
         noises.insert(0, noise_as_given(measurement, weighting.sigma))
     for noise in noises:
-        try:
-            test = lack_of_fit(measurement, calibration, noise, whitened=whitened)
-        except AstropolcalError:
-            continue  # too few data: nothing to hold against
+        test = lack_of_fit(measurement, calibration, noise, whitened=whitened)
         # unknown where no degree of freedom is left
         ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(

@@ -137,16 +137,26 @@ class Deviation:
         return gram.reshape(m * size, m * size) - taken.T @ taken, target.ravel()
 
 
-@dataclass
-class Try:
-    """A course with its law, its time, and its log evidence with the prior."""
+@dataclass(eq=False)
+class Term:
+    """A course: its law in wavelength, its functions of time, and the size of its prior.
 
-    evidence: float
+    With its log evidence, and the elements (by name) of the optic that it is taken for.
+    """
+
     course: str
-    gap: int | None
     law: np.ndarray
-    waves: np.ndarray
-    size: float
+    times: np.ndarray
+    prior: float = np.inf
+    gap: int | None = None
+    evidence: float = 0.0
+    what: str = ""
+    names: tuple = ()
+
+    @property
+    def size(self):
+        """Number of its coefficients."""
+        return self.law.shape[1] * self.times.shape[1]
 
 
 @dataclass
@@ -184,9 +194,9 @@ def weigh(deviations, waves, chances):
             for size in SIZES:
                 found = np.atleast_1d(log_evidence(*normal, size) + share + prior)
                 for gap, value in enumerate(found):
-                    waves_ = times[:, [gap]] if simple else times
+                    own = times[:, [gap]] if simple else times
                     at = gap if course == "steps" else None
-                    tries.append(Try(float(value), course, at, deviation.law, waves_, size))
+                    tries.append(Term(course, deviation.law, own, size, at, float(value)))
     told = {"constant": np.log(base)} | {
         course: np.logaddexp.reduce([t.evidence for t in tries if t.course == course] or [-np.inf])
         for course in COURSES[1:]

@@ -8,7 +8,7 @@ time; see `astropolcal.calibration.fit.runs`.
 
 from collections import Counter
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,14 +16,13 @@ from astropolcal.calibration.fit.evidence import (
     COURSES,
     EVENT,
     Deviation,
-    Try,
+    Term,
     Weighed,
     chances_of,
     laws_of,
     waves_of,
     weigh,
 )
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
 from astropolcal.exceptions import ParameterError
 from astropolcal.progress import stage
@@ -50,23 +49,6 @@ _PINV = 1e-9
 _MANY = 2000
 
 
-@dataclass(eq=False)
-class Term:
-    """A course of an optic: elements by name, law in wavelength, and time; with a prior or not."""
-
-    what: str
-    course: str
-    names: list
-    law: np.ndarray
-    times: np.ndarray
-    prior: float = np.inf
-    gap: int | None = None
-
-    @property
-    def size(self):
-        return self.law.shape[1] * self.times.shape[1]
-
-
 class Model:
     """The coefficients of all runs, and the rows around them."""
 
@@ -74,7 +56,7 @@ class Model:
         self.work, self.dates, self.terms = work, dates, []
         frees = [shape.free for shape in work.shapes]
         self.names = [free.names for free in frees]
-        self.scales = [physical_scale(free) for free in frees]
+        self.scales = [free.steps for free in frees]
         count = Counter(name for names in self.names for name in names)
         _check_known(own, count, "own")
         self.own = [
@@ -269,10 +251,10 @@ class Model:
             if course in ("walk", "scatter"):
                 found = [self._weighed(names, self._parts()).best([course])]
             elif course == "drift":
-                found = [Try(0.0, course, None, law, waves[course][:, [0]], np.inf)]
+                found = [Term(course, law, waves[course][:, [0]])]
             elif course == "steps":
                 for gap in np.flatnonzero(self.chances == EVENT).tolist():
-                    found.append(Try(0.0, course, gap, law, waves[course][:, [gap]], np.inf))
+                    found.append(Term(course, law, waves[course][:, [gap]], gap=gap))
                 if not found:
                     raise ParameterError(
                         f"vary: {what} has steps, but there is no event between the runs"
@@ -328,8 +310,8 @@ class Model:
 
     def _term(self, what, names, best):
         # a size that is given to what follows no law keeps it from following the noise
-        prior = np.inf if best.course in _SIMPLE else best.size
-        return Term(what, best.course, names, best.law, best.waves, prior, best.gap)
+        prior = np.inf if best.course in _SIMPLE else best.prior
+        return replace(best, what=what, names=names, prior=prior)
 
     def _exchange(self):
         """Put in place of each course the best of its optic beside all others; return the gain.

@@ -31,11 +31,7 @@ from astropolcal.calibration.fit.calibrate import ERRORS, _result
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
-from astropolcal.calibration.identifiability.analysis import physical_scale
-from astropolcal.calibration.identifiability.linearized import (
-    STILL,
-    Whitened,
-)
+from astropolcal.calibration.identifiability.linearized import STILL, Whitened
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance
@@ -249,7 +245,7 @@ class _Run:
         measurement.note_inputs()
         if not measurement.free.size:
             raise FitError("nothing to fit: every parameter is fixed or tied")
-        self.scale = physical_scale(measurement.free)
+        self.scale = measurement.free.steps
         weighting = first_weighting(measurement, None)
         if known is None:
             self._fit(start, weighting, options)
@@ -286,9 +282,8 @@ class _Run:
 
     def around(self, vector):
         """Return the rows of the run around canonical values, in steps of a degree or so."""
-        measurement, n = self.measurement, self.measurement.n_data
-        residual = measurement.observed - measurement.predict(vector)
-        problem = Whitened(measurement.jacobian(vector)[:, :n], self.scale)
+        residual = self.measurement.residuals(vector)
+        problem = Whitened(self.measurement.jacobian(vector), self.scale)
         found = problem.data
         along = problem.rows @ found.half.T
         middle = np.eye(found.rank) * self.level**2

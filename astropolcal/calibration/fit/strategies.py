@@ -20,7 +20,7 @@ import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
-from astropolcal.calibration.identifiability.sky import mean_errors
+from astropolcal.calibration.identifiability.sky import mean_errors, seen_with
 from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
@@ -176,17 +176,16 @@ class BinProblem(Problem):
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""
-        seen, found = set(), []
+        found = {}
         for row, slot in enumerate(self.slots):
             optic, key = slot.name.split(".")
             low, high = slot.canonical_bounds()
             # only a phase that may go round has mirror branches; an
             # orientation is within its bounds
             is_phase = key != "theta" and slot.unit is not None and slot.unit.is_equivalent(u.rad)
-            if is_phase and high - low > np.pi and optic not in seen:
-                seen.add(optic)
-                found.append((row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
-        return found
+            if is_phase and high - low > np.pi:
+                found.setdefault(optic, (row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
+        return list(found.values())
 
     def valleys(self, vector, row, low, high):
         """Return the best values of one slot from a scan over its bounds, (n_valleys, n_bins)."""
@@ -209,8 +208,6 @@ def search_branches(problem, vector, origin=None):
     A bin keeps its own valley unless another is clearly (1 %) better. Scans begin at the
     per-wavelength parameters of ``origin``, by default at ``vector``.
     """
-    if not problem.slots:
-        return vector, np.zeros(problem.n_bins, dtype=bool)
     # in the wrong valley a bin drives its other parameters astray: scan from the origin
     start = vector.copy()
     if origin is not None:
@@ -287,8 +284,7 @@ def undecided_signs(measurement, view):
         beside = _between(measurement.wavelength, vector[places])
         open_ = close & ~(4 * np.abs(vector[places] - beside) < np.abs(trial[places] - beside))
         if view is not None and open_.any():
-            known = {o.name: o for chain in measurement.put_back(trial) for o in leaves(chain)}
-            other = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
+            other = seen_with(view, measurement.put_back(trial))
             chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
             errors = np.maximum(errors, chance * mean_errors(view, other))
     return found, errors
@@ -339,19 +335,30 @@ def run(measurement, weighting, fitter):
         return fit_once(measurement, weighting, fitter), weighting
     if not weighting.is_known:
         weighting = weighting.started(measurement)
-    # noise from the residuals of a fit whose weights come from that noise: a fixed point
-    for _ in range(ROUNDS):
-        outcome = fit_once(measurement, weighting, fitter)
-        before, weighting = weighting, weighting.updated(measurement)
-        if not np.isfinite(weighting.sigma).all():
+
+    def updated(weighting):
+        found = weighting.updated(measurement)
+        if not np.isfinite(found.sigma).all():
             raise FitError(
                 f"{measurement.free.size} free parameters and {measurement.n_data} data leave none "
                 "for the noise, against which priors weigh; fix some, add frames, or take "
                 "weights='errors'"
             )
+        return found
+
+    what = "the noise from the residuals"
+    return until_settled(measurement, weighting, fitter, updated, ROUNDS, what)
+
+
+def until_settled(measurement, weighting, fitter, updated, rounds, what):
+    """Fit in place, with a noise that comes from the fit before, until it stays as it is."""
+    # weights from the residuals of a fit that has these weights: a fixed point
+    for _ in range(rounds):
+        outcome = fit_once(measurement, weighting, fitter)
+        before, weighting = weighting, updated(weighting)
         if weighting.agrees(before):
             return outcome, weighting
-    message = f"the noise from the residuals did not settle in {ROUNDS} fits"
+    message = f"{what} did not settle in {rounds} fits"
     return outcome | {"converged": False, "message": message}, weighting
 
 

@@ -31,13 +31,13 @@ from astropolcal.calibration.identifiability.linearized import (
     led,
     near_null_directions,
     open_directions,
-    step_of,
 )
 from astropolcal.calibration.identifiability.sky import (
     LEFT_OUT,
     consequences_along,
     consequences_of,
     matters,
+    seen_with,
     sky_words,
     view_of_measurement,
 )
@@ -179,7 +179,7 @@ def examine(measurement, weights=None):
     """
     vector, free = measurement.vector(), measurement.free
     data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
-    whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector, for_errors=True))
+    whitened = Whitened(data, free.steps, free.prior_jacobian(vector, for_errors=True))
     level = np.nan if weights is None else 1.0
     name = measurement.datasets[0].observations.instrument
     view = view_of_measurement(measurement, vector, name)
@@ -196,7 +196,7 @@ def complete(measurement, whitened, level, view):
     finding = finding_of(free, whitened)
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
     # one degree, micrometre or percent of the leading parameter
-    canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
+    canonical = np.array(scaled).reshape(-1, free.size) * free.steps
     for direction, sky in zip(finding.directions, consequences_along(view, canonical), strict=True):
         if sky is not None:
             direction["sky"] = sky
@@ -226,12 +226,6 @@ def complete(measurement, whitened, level, view):
     finding.branches = mirror_branches(measurement, vector, view)
     finding.mirrors = [branch["words"] for branch in finding.branches]
     return finding
-
-
-def physical_scale(free):
-    """Return one degree, micrometre or percent of each free parameter, in canonical units."""
-    kinds = [step_of(slot.unit)[0] for slot in free.slots]
-    return np.repeat(kinds, [slot.size for slot in free.slots])
 
 
 # ---- what stars leave open of the telescope's mirrors, and what would determine it ----
@@ -309,12 +303,10 @@ _POOR = 10.0
 
 def harmonic_conditions(angles):
     """Return the condition number of each set of harmonics for plate angles in radian."""
-    found = {}
+    found, angles = {}, np.asarray(angles, float)
     for harmonics, _ in SETS:
         # the frames' brightness or polarization as a Fourier series of the plate angle
-        waves = [
-            wave(k * np.asarray(angles, float)) for k in harmonics for wave in (np.cos, np.sin)
-        ]
+        waves = [wave(k * angles) for k in harmonics for wave in (np.cos, np.sin)]
         # harmonic 0 has no sine
         columns = np.column_stack(waves[:1] + waves[2:])
         singular = np.linalg.svd(columns, compute_uv=False)
@@ -397,10 +389,7 @@ def mirror_branches(measurement, vector, view):
         if inside and change < _SAME and not np.allclose(other, vector):
             sky = None
             if view is not None:
-                # the chain from the sky, with those optics that are in the other solution
-                known = {o.name: o for chain in measurement.put_back(other) for o in leaves(chain)}
-                chain = join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
-                sky = consequences_of(view, chain)
+                sky = consequences_of(view, seen_with(view, measurement.put_back(other)))
             branches.append({"words": words, "sky": sky})
     if not any(_SAME_DATA in branch["words"] for branch in branches):
         branches += _other_instrument(measurement, vector, view)

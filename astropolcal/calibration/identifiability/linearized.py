@@ -4,12 +4,11 @@
 from collections import defaultdict
 from functools import cached_property
 
-import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.sky import sky_words
 from astropolcal.files import plain
-from astropolcal.units import canonical_factor
+from astropolcal.measurement.parameters import step_of
 
 __all__ = []
 
@@ -209,24 +208,6 @@ def ranked(values, equal=None):
     return order[np.lexsort((order, np.cumsum(smaller)))]
 
 
-def step_of(unit):
-    """Return the step of a parameter in canonical units, its size and its unit in words."""
-    if unit is None:
-        return 0.01, 0.01, ""
-    if u.Unit(unit).is_equivalent(u.rad):
-        # canonical is radian: one degree is the step that a user has a feeling for
-        return np.deg2rad(1.0), 1.0, " deg"
-    if not u.Unit(unit).is_equivalent(u.um):
-        # a coefficient of a law, such as one in deg / day
-        return canonical_factor(unit), 1.0, f" {unit}"
-    return 1.0, 1.0, " um"
-
-
-def declared_step(unit):
-    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
-    return step_of(unit)[0] / canonical_factor(unit)
-
-
 # ---- open directions ----------------------------------------------------------------------
 
 
@@ -265,9 +246,7 @@ def led(free, null):
 
     Those common to all wavelengths come first.
     """
-    if not len(null):
-        return
-    several = np.repeat([s.per_wavelength for s in free.slots], [s.size for s in free.slots])
+    several = free.spread([slot.per_wavelength for slot in free.slots])
     order, n_single = np.argsort(several, kind="stable"), int(np.sum(~several))
     columns, leads = null.copy(), []
     while len(leads) < len(null):
@@ -333,10 +312,8 @@ def near_null_directions(free, whitened, level, sky_of):
     # each row is a principal direction, as long as its standard error at the noise of the fit
     singular, errors = found.singular[: found.rank], whitened.factor() * level
     condition = found.singular[:1] / singular
-    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
-    times_large = np.abs(errors) / np.repeat(
-        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
-    )
+    kinds = (step_of(slot.unit)[1:] for slot in free.slots)
+    times_large = np.abs(errors) / free.spread([LARGE[unit] / size for size, unit in kinds])
     bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
     leads = np.array([ranked(row)[0] for row in times_large], dtype=int)
     # the sign of a singular vector is arbitrary: the worst parameter goes up

@@ -12,6 +12,7 @@ matters the more the fainter the polarization is.
 """
 
 import warnings
+from contextlib import suppress
 from functools import cached_property
 
 import astropy.units as u
@@ -20,7 +21,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.calibration.system import Rows, free_of, from_first_stage, inverse_rows
 from astropolcal.chain import join, leaves, stages, standing
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES, LinearPolarizer
@@ -119,16 +120,14 @@ def view_of_calibration(calibration):
 def _view(chains, free, lam, metas, name, settings):
     instrument = known_instrument(name)
     date = max((str(meta["date"]) for meta in metas if meta.get("date")), default=None)
-    try:
-        with warnings.catch_warnings():
+    for known in ((instrument, lam * u.um, date), ()):
+        with suppress(AstropolcalError), warnings.catch_warnings():
             # the published telescope of a coating that nobody states is named as such
             warnings.simplefilter("ignore", AstropolcalWarning)
-            chain, telescope = chain_from_sky(chains, instrument, lam * u.um, date)
-    except AstropolcalError:
-        try:
-            chain, telescope = chain_from_sky(chains)
-        except ChainError:
-            return None
+            chain, telescope = chain_from_sky(chains, *known)
+            break
+    else:
+        return None
     wanted, site = stages(chain), None
     if "hwp" not in wanted or any("=" in stage for stage in wanted):
         placed = sequence_of(wanted, settings)
@@ -149,11 +148,10 @@ def sequence_of(wanted, settings):
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
-    if not own or not {*own} <= {*settings}:
+    known = [settings.get(stage) for stage in own]
+    if not own or None in known or len({*map(len, known)}) > 1:
         return None
-    if len({len(settings[stage]) for stage in own}) > 1:
-        return None
-    frames = np.unique(np.transpose([settings[stage] for stage in own]), axis=0)
+    frames = np.unique(np.transpose(known), axis=0)
     frames = _spread_out(frames, _LONGEST)
     count = _MOST if set(_POINTINGS) & set(wanted) else 1
     placed = dict(zip(own, np.tile(frames, (count, 1)).T, strict=True))
@@ -273,6 +271,12 @@ def consequences_of(view, chain):
     """Return the consequences of taking another chain for the true one, however far it is."""
     change = view.against(chain)
     return _consequences(change[np.isfinite(change).all(axis=(-2, -1))], _whole)
+
+
+def seen_with(view, chains):
+    """Return the chain of a view, with the optics of other chains where they have them."""
+    known = {leaf.name: leaf for chain in chains for leaf in leaves(chain)}
+    return join(known.get(leaf.name, leaf) for leaf in leaves(view.chain))
 
 
 def mean_errors(view, chain):

@@ -78,6 +78,15 @@ class NoiseEstimate:
     sigma_of_data: np.ndarray
     independent: object = 1.0
 
+    def of_data(self, measurement):
+        """Return the noise of every datum; refuse an estimate from another measurement."""
+        if self.sigma_of_data.shape != (measurement.n_data,):
+            raise FitError(
+                f"the noise is that of {self.sigma_of_data.size} data, the measurement has "
+                f"{measurement.n_data}; estimate it from this measurement"
+            )
+        return self.sigma_of_data
+
 
 def data_by_wavelength(measurement):
     """Return number of the dataset, wavelength, and indices of unmasked data of each cell.
@@ -96,6 +105,12 @@ def data_by_wavelength(measurement):
 def rms(values):
     """Return the root mean square, NaN of nothing."""
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+def mean_of_known(values):
+    """Return means of what is known along the last axis, NaN of nothing."""
+    with np.errstate(invalid="ignore"):
+        return np.nansum(values, axis=-1) / np.isfinite(values).sum(axis=-1)
 
 
 def _of_data(measurement, sigma, dof, method, words, independent=1.0):
@@ -187,10 +202,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
         gain, read_noise = _number("gain", gain, False), _number("read_noise", read_noise, True)
         parts = []
         for part in measurement.datasets:
-            obs = part.observations
-            fluxes = [
-                np.moveaxis(f.T[:, part.frames], 2, 0) for f in (obs.flux_right, obs.flux_left)
-            ]
+            beams = part.observations.flux_right, part.observations.flux_left
+            fluxes = [np.moveaxis(flux.T[:, part.frames], 2, 0) for flux in beams]
             # Poisson: var(F) = F / gain, plus the read noise in the same units
             variances = [flux / gain + (read_noise / gain) ** 2 for flux in fluxes]
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -282,19 +295,15 @@ def _replicate_scatter(part, residuals, tolerance):
     """Return deviations from the mean of the same settings, and freedom at each wavelength."""
     dense, present = np.zeros(part.valid.shape), part.valid.T.astype(float)
     dense[part.valid] = residuals
-    setting = _same_settings(part, tolerance)
+    columns = [_states(part.observations)[part.frames[:, 0]]]
+    columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
+    # a number for the settings of every group of frames
+    setting = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
     member = (setting[:, None] == np.arange(setting.max() + 1)).astype(float)
     count = member.T @ present
     mean = member.T @ dense.T / np.maximum(count, 1)
     off = present * (dense.T - member @ mean)
     return off, (present.sum(axis=0) - (count > 0).sum(axis=0)).astype(int)
-
-
-def _same_settings(part, tolerance):
-    """Return a number for the settings of every group of frames of a dataset."""
-    columns = [_states(part.observations)[part.frames[:, 0]]]
-    columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
-    return np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
 def _states(observations):

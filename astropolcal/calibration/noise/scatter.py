@@ -167,14 +167,10 @@ class _Part:
         present = self.dense(np.ones((len(self.pair), 1)))[..., 0]
         alone, diagonal = present.T @ present, np.sum(self.patterns**2, axis=1)
         mixed = present.T @ (diagonal[:, None] * present)
-        # the square of the correlation of the pairs at a setting
-        setting = [self.patterns[:, i::2] for i in (0, 1)] if self.patterns.shape[1] else []
-        both = np.zeros_like(alone)
-        for i, first in enumerate(setting):
-            for second in setting[i:]:
-                crossed = (first * second).T @ present
-                both += (1 if second is first else 2) * crossed.T @ crossed
-        parts = list(self.components())
+        # the square of the correlation of the pairs at a setting: q with q, u with u, and q with u
+        q, u = self.patterns[:, 0::2], self.patterns[:, 1::2]
+        crossed = np.hstack([q * q, u * u, np.sqrt(2) * q * u]).T @ present
+        both, parts = crossed.T @ crossed, list(self.components())
         pairs = {(True, True): both, (False, False): alone}
         return np.array(
             [[np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts]
@@ -362,9 +358,8 @@ def model_error(measurement, scatter, signs):
             settings.append(scatter.parts[i].patterns.shape[1] // 2)
     found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
     for key, rows in squares.items():
-        known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
-        count = known.sum(axis=0)
-        total = np.where(known, rows if rows else 0.0, 0.0).sum(axis=0)
+        rows = np.reshape(rows, (-1, measurement.wavelength.size))
+        count, total = np.isfinite(rows).sum(axis=0), np.nansum(rows, axis=0)
         found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
         if not count.any():
             found["missing"].append(key)

@@ -15,7 +15,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, triangle
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
@@ -188,8 +187,6 @@ class Weighting:
 
     def started(self, measurement):
         """Return one level for all data, from the residuals before the first fit."""
-        if not self.from_residuals:
-            return self
         freedom = max(measurement.n_data - measurement.free.size, 1)
         level = np.sqrt(np.sum(measurement.residuals() ** 2) / freedom) or 1.0
         return Weighting(self.choice, np.full(measurement.n_data, level))
@@ -244,7 +241,7 @@ class Problem:
         vector, free = self.solution if vector is None else vector, self.measurement.free
         data = self.measurement.jacobian(vector) * self.weights
         priors = free.prior_jacobian(vector, for_errors=True) * self.noise
-        return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
+        return Whitened(data, free.steps, priors, free.at_bounds(vector))
 
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
         """Return the vector, chi-square, and what scipy says of the fit.
@@ -313,13 +310,8 @@ def first_weighting(measurement, weights):
     if isinstance(weights, Weighting):
         return weights
     if isinstance(weights, NoiseEstimate):
-        sigma = weights.sigma_of_data
-        if sigma.shape != (measurement.n_data,):
-            raise FitError(
-                f"the noise is that of {sigma.size} data, the measurement has "
-                f"{measurement.n_data}; estimate it from this measurement"
-            )
-        return _known(GIVEN, sigma, f"noise from {weights.method}: ", "have none")
+        sigma, before = weights.of_data(measurement), f"noise from {weights.method}: "
+        return _known(GIVEN, sigma, before, "have none")
     if weights is not None and not isinstance(weights, str):
         sigma = given_noise(measurement, weights)
         if np.median(sigma) > _LARGEST:

@@ -4,7 +4,4 @@
 from astropolcal.calibration.posterior.sampler import LogPosterior
 from astropolcal.calibration.posterior.samples import Posterior
 
-__all__ = [
-    "LogPosterior",
-    "Posterior",
-]
+__all__ = ["LogPosterior", "Posterior"]

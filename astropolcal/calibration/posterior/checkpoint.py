@@ -1,9 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Checkpoints of a sampler: one HDF5 file that a kill at any moment leaves usable.
 
-HDF5 makes the file, with room for all steps, and never touches it again: where a write of its own
-fails it takes the process with it. The block before its structures, which it leaves to the user,
-says where the steps are and (JSON) of which run, so that no structure is read that may be damaged.
+HDF5 lays the file out in memory, with room for all steps, and never touches it again: where a write
+of its own fails it takes the process with it. The block before its structures, which it leaves to
+the user, says where the steps are and (JSON) of which run, so that no structure is read that may be
+damaged.
 All steps have the same size, with their number, the state of the random numbers and a CRC; a run
 writes them in place. What counts is the beginning of the file up to the first step that is not
 whole; the rest is computed again, with the same random numbers. The CRC goes on from that of the
@@ -11,7 +12,6 @@ step before: what an earlier run has left after a step that was computed again m
 other places of the walkers, where another machine rounds otherwise or no seed was given.
 """
 
-import errno
 import io
 import json
 import os
@@ -124,30 +124,21 @@ class Chain:
         h5py = need("h5py", "a checkpoint")
         arrays = {key: np.asarray(array).tolist() for key, array in arrays.items()}
         stated = {"description": description, "arrays": arrays, "room": len(self._steps)}
-        stated, block = json.dumps(stated).encode(), _LEAST_BLOCK
-        while block < len(stated) + 100:
-            block *= 2
-        with atomic_path(path, error=FitError) as temporary, _Disk(temporary, "w+b") as stream:
-            with h5py.File(stream, "w", libver="earliest", userblock_size=block) as file:
-                plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-                # its place is taken at once, without writing zeros
-                plan.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-                plan.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-                kind = h5py.h5t.py_create(self._steps.dtype)
-                space = h5py.h5s.create_simple(self._steps.shape)
-                self._start = h5py.h5d.create(file.id, b"steps", kind, space, plan).get_offset()
-            if stream.error is not None:
-                raise stream.error
-            size = stream.seek(0, os.SEEK_END)
-            # of both: the place is what the CRC of the text begins with
-            numbers = f"{self._start} {len(stated)} {zlib.crc32(stated, self._start)}\n"
-            for place, content in (
-                (0, _FORMAT + numbers.encode() + stated + b"\n"),
-                (self._start, self._steps[: self.count].view(np.uint8)),
-            ):
-                stream.seek(place)
-                write_bytes(stream.fileno(), content)
-            _take_room(stream, size)
+        stated = json.dumps(stated).encode()
+        # a power of two, with room for the first lines beside the text
+        block = max(_LEAST_BLOCK, 1 << (len(stated) + 99).bit_length())
+        image = io.BytesIO()
+        with h5py.File(image, "w", libver="earliest", userblock_size=block) as file:
+            self._start = file.create_dataset("steps", data=self._steps).id.get_offset()
+        # of both: the place is what the CRC of the text begins with
+        numbers = f"{self._start} {len(stated)} {zlib.crc32(stated, self._start)}\n"
+        image.seek(0)
+        image.write(_FORMAT + numbers.encode() + stated + b"\n")
+        with (
+            atomic_path(path, error=FitError) as temporary,
+            open(temporary, "wb", buffering=0) as stream,
+        ):
+            write_bytes(stream.fileno(), image.getbuffer())
 
     def append(self, coords, log_prob, random_state, accepted):
         """Keep a step; bring the file up to date when it is time."""
@@ -176,37 +167,6 @@ class Chain:
                 f"{self.saved} steps are safe, the run goes on from there"
             ) from error
         self.saved = self.count
-
-
-class _Disk(io.FileIO):
-    """A file that keeps the error of a write that failed from whoever writes it."""
-
-    error = None
-
-    def write(self, content):
-        try:
-            write_bytes(self.fileno(), content)
-        except OSError as error:
-            self.error = error
-        return len(content)
-
-    def truncate(self, size=None):
-        try:
-            return super().truncate(size)
-        except OSError as error:
-            self.error = error
-            return size
-
-
-def _take_room(stream, size):
-    """Let the system set aside the blocks that are not written yet, where it can."""
-    if not hasattr(os, "posix_fallocate"):
-        return
-    try:
-        os.posix_fallocate(stream.fileno(), 0, size)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import warnings
 
 import numpy as np
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.weighting import (
     GIVEN,
     Problem,
@@ -156,15 +155,14 @@ class LogPosterior:
 
     def physical_scale(self):
         """Return a degree, a micrometre or a percent of what varies, canonical."""
-        return physical_scale(self.measurement.free)[self.sampled]
+        return self.measurement.free.steps[self.sampled]
 
 
 def _elements(free, parameters):
     """Return the elements of the flat vector that the names stand for, in their order."""
     if not free.size:
         raise ParameterError("nothing to sample: every parameter is fixed or tied")
-    if parameters is None:
-        return np.arange(free.size)
+    parameters = free.names if parameters is None else parameters
     parameters = [parameters] if isinstance(parameters, str) else list(parameters)
     by_name = {name: [i] for i, name in enumerate(free.names)}
     by_name |= {slot.name: list(range(slot.start, slot.start + slot.size)) for slot in free.slots}

@@ -113,13 +113,12 @@ class Convergence:
             raise ParameterError(f"convergence: one value per parameter is allowed, not {shapes}")
 
     @classmethod
-    def of(cls, chain, *, thin=1, burn_in=0, times=None):
+    def of(cls, chain, *, thin=1, burn_in=0):
         """Work it out from a chain (n_steps, n_walkers, n_parameters), thinned by ``thin``.
 
-        ``burn_in`` counts steps of the chain, ``times`` those of the sampler.
+        ``burn_in`` counts steps of the chain.
         """
         used = np.asarray(chain, dtype=float)[burn_in:]
-        times = autocorrelation_times(used) * thin if times is None else times
         flat = used.reshape(-1, used.shape[2])
         lower, median, upper = np.quantile(flat, _QUANTILES, axis=0)
         try:
@@ -141,7 +140,7 @@ class Convergence:
             n_steps=len(chain) * thin,
             burn_in=burn_in * thin,
             n_draws=len(flat),
-            times=times,
+            times=autocorrelation_times(used) * thin,
             median=median,
             lower=lower,
             upper=upper,
@@ -352,21 +351,17 @@ class Posterior:
         before = self._convergence.burn_in if self.is_thinned else 0
         return before + self.thin * np.arange(1, len(self.chain) + 1)
 
-    @cached_property
+    @property
     def autocorrelation_times(self):
         """Integrated autocorrelation time of each parameter, in steps of the sampler."""
-        if self.is_thinned:
-            return self._convergence.times
-        return autocorrelation_times(self.chain[self.burn_in :]) * self.thin
+        return self.convergence.times
 
     @cached_property
     def convergence(self):
         """What the whole run says of itself and of each parameter, a ``Convergence``."""
         if self.is_thinned:
             return self._convergence
-        return Convergence.of(
-            self.chain, thin=self.thin, burn_in=self.burn_in, times=self.autocorrelation_times
-        )
+        return Convergence.of(self.chain, thin=self.thin, burn_in=self.burn_in)
 
     @property
     def n_steps(self):
@@ -404,7 +399,7 @@ class Posterior:
             Length, autocorrelation, agreement of the walkers, acceptance; what
             to do if it has not converged; whether the samples are too narrow.
         """
-        found, times = self.convergence, self.autocorrelation_times
+        found, times = self.convergence, self.convergence.times
         what = "1 parameter" if times.size == 1 else f"{times.size} parameters"
         lines = [f"{self.n_steps} steps of {self.chain.shape[1]} walkers in {what}."]
         if np.isfinite(times).all():

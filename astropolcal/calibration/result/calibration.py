@@ -23,15 +23,11 @@ from astropolcal.calibration.uncertainty.covariance import status_of
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     held_out_residuals,
+    measurement_with,
 )
-from astropolcal.chain import leaves
-from astropolcal.exceptions import (
-    AstropolcalError,
-    CalibrationFileError,
-    ObservationError,
-)
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.measurement.parameters import ties_among
+from astropolcal.measurement.parameters import element_names
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import dates_of
 from astropolcal.units import iso_date
@@ -40,14 +36,7 @@ from astropolcal.words import html
 __all__ = ["Calibration", "with_validity"]
 
 # what is known of each element of a parameter, and what is said of those without an error
-_OF_ELEMENTS = (
-    "std",
-    "identifiable",
-    "at_bound",
-    "std_inward",
-    "conditional_on",
-    "std_released",
-)
+_OF_ELEMENTS = ("std", "identifiable", "at_bound", "std_inward", "conditional_on", "std_released")
 _UNKNOWN = (np.nan, False, False, np.nan, "", np.nan)
 
 
@@ -265,14 +254,8 @@ class Calibration:
         >>> bool(abs(cal.measurement_of(new).residuals()).max() < 0.01)
         True
         """
-        return Measurement(
-            self.chains[dataset],
-            observations,
-            observable=self.settings["observable"],
-            positions=None if positions is None else [positions],
-            ties=ties_among(self.ties, parameter_table([self.chains[dataset]])),
-            wavelength=self.wavelength,
-        )
+        chain = self.chains[dataset]
+        return measurement_with(self, chain, observations, positions, self.wavelength)
 
     def cross_validate(self, groups=None):
         """
@@ -325,23 +308,17 @@ class Calibration:
             ``conditional_on``, the names of what is at it, and ``std_released``, the error without
             it. Arrays for parameters given per wavelength.
         """
-        result, known = {}, self._known()
-        for chain in self.chains:
-            for leaf in leaves(chain):
-                for key in leaf.param_names:
-                    name = f"{leaf.name}.{key}"
-                    # chains share optics by name, and the values of the fit
-                    if name not in result:
-                        result[name] = self._describe(name, getattr(leaf, key), known)
-        return result
+        known = self._known()
+        # chains share optics by name, and the values of the fit
+        table = parameter_table(self.chains).items()
+        return {name: self._describe(name, first, known) for name, (first, *_) in table}
 
     def _describe(self, name, parameter, known):
-        shape, size = np.shape(parameter.value), np.size(parameter.value)
         # the covariance has rows of free parameters only
-        free = not parameter.fixed and name not in self.ties
-        elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
-        rows = [known.get(element, _UNKNOWN) if free else _UNKNOWN for element in elements]
-        columns = (np.array(column).reshape(shape) for column in zip(*rows, strict=True))
+        known = {} if parameter.fixed or name in self.ties else known
+        elements = element_names(name, np.size(parameter.value))
+        columns = zip(*(known.get(element, _UNKNOWN) for element in elements), strict=True)
+        columns = (np.reshape(column, np.shape(parameter.value)) for column in columns)
         entry = {
             "value": np.array(parameter.value),
             "unit": parameter.unit,
@@ -378,8 +355,7 @@ class Calibration:
         for name, known in self.parameter_values().items():
             if known["fixed"] or known["tied"]:
                 continue
-            size, unit = np.size(known["value"]), str(known["unit"] or "")
-            labels = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+            labels, unit = element_names(name, np.size(known["value"])), str(known["unit"] or "")
             flat = (np.ravel(known[key]) for key in keys)
             rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
         types = (str, float, float, bool, bool, float, str, float, str, str)

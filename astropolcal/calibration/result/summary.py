@@ -82,7 +82,7 @@ def summary(calibration, targets=TARGETS, full=False):
         _titled("Goodness of fit", _goodness_lines(calibration)),
         [str(calibration.identifiability)],
         [f"Gauge: {gauge}"] if gauge else [],
-        _titled("At a bound", _bound_lines(known)),
+        _titled("At a bound", _bound_lines(calibration.parameters, known)),
         _titled("Posterior", posterior),
     ]
     before, after = ([_wrap(calibration, part) for part in parts] for parts in (before, after))
@@ -171,13 +171,12 @@ def _evidence(calibration, names):
 def _accuracy_lines(record, reasons):
     table = record.accuracy
     masked = f", {counted(record.n_masked, 'cell')} masked" if record.n_masked else ""
-    why = "; ".join(f"{reason}: {count}" for reason, count in reasons.items())
     size = f"{counted(record.n_frames, 'frame')} x {counted(len(table), 'wavelength')}"
-    counts = f"  ({size}{masked}"
+    counts = [f"{size}{masked}", *(f"{reason}: {count}" for reason, count in reasons.items())]
     return [
         f"Accuracy on {record.name}, in percent of polarization",
         *_rows({name: _percent(table, name) for name in _ACCURACIES}),
-        f"{counts}; {why})" if why else f"{counts})",
+        f"  ({'; '.join(counts)})",
     ]
 
 
@@ -318,21 +317,17 @@ def _goodness_lines(calibration):
     return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
 
 
-def _bound_lines(known):
+def _bound_lines(table, known):
     """Name what is at a bound, how far it may go inward, and whose errors depend on that."""
     lines, hanging = [], {}
-    for name, entry in known.items():
-        flat = {
-            key: np.ravel(entry[key])
-            for key in ("at_bound", "value", "std_inward", "status", "conditional_on")
-        }
-        for i in np.flatnonzero(flat["at_bound"]):
-            end = inward_words(entry, flat["value"][i], flat["std_inward"][i])
-            place = f"{name}[{i}]" if entry["value"].ndim else name
-            lines.append(f"  - {place}{end and ': '}{end}")
-        for i in np.flatnonzero(flat["status"] == "conditional"):
-            times = (np.ravel(entry["std_released"]) / np.ravel(entry["std"]))[i]
-            hanging.setdefault((str(flat["conditional_on"][i]), name), []).append(times)
+    for row in table:
+        name = row["name"].partition("[")[0]
+        if row["at_bound"]:
+            end = inward_words(known[name], row["value"], row["std_inward"])
+            lines.append(f"  - {row['name']}{end and ': '}{end}")
+        if row["status"] == "conditional":
+            times = row["std_released"] / row["std"]
+            hanging.setdefault((row["conditional_on"], name), []).append(times)
     for (by, name), times in hanging.items():
         several = f" at {len(times)} wavelengths" if len(times) > 1 else ""
         low, high = min(times), max(times)

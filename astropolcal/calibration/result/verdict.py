@@ -294,21 +294,15 @@ def _open_words(sky):
 
 def _too_far(tables, sky):
     """Say what of a bright target is known too badly to be called known."""
-    if not tables:
-        return []
-    (table,) = tables
-    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
-    told = []
-    for key, what, unit, most in (
-        ("s_p", "DoLP", "%", dolp),
-        ("s_chi", "AoLP", "deg", _ABSURD_ANGLE.value),
-    ):
-        value = _median(table[key].value)
-        # what is open has been said, with its name
-        if value > most and what not in sky:
-            known = f"known to {value:.2g} {unit} only" if np.isfinite(value) else "open"
-            told.append(f"the {what} of {dolp:g} % on sky is {known}")
-    return told
+    for table in tables:
+        dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+        limits = (("s_p", "DoLP", "%", dolp), ("s_chi", "AoLP", "deg", _ABSURD_ANGLE.value))
+        for key, what, unit, most in limits:
+            value = _median(table[key].value)
+            # what is open has been said, with its name
+            if value > most and what not in sky:
+                known = f"known to {value:.2g} {unit} only" if np.isfinite(value) else "open"
+                yield f"the {what} of {dolp:g} % on sky is {known}"
 
 
 def _median(values):

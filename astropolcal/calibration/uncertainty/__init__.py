@@ -10,11 +10,7 @@ from astropolcal.calibration.uncertainty.derived import (
     derived_retardance,
     derived_sky,
 )
-from astropolcal.calibration.uncertainty.refits import (
-    Resampled,
-    robust_covariance,
-    standard_errors,
-)
+from astropolcal.calibration.uncertainty.refits import Resampled, robust_covariance, standard_errors
 
 __all__ = [
     "Covariance",

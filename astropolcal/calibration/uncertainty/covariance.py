@@ -16,16 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.calibration.identifiability.linearized import (
-    LARGE,
-    RANK,
-    STILL,
-    declared_step,
-    step_of,
-)
+from astropolcal.calibration.identifiability.linearized import LARGE, RANK, STILL
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, problem_of
 from astropolcal.exceptions import ParameterError
+from astropolcal.measurement.parameters import declared_step, step_of
 
 __all__ = ["Covariance"]
 

@@ -457,9 +457,7 @@ def _by_name(calibration, value, slopes, axis):
 def _grid(calibration, wavelength):
     """Return the wavelengths of a matrix; those of the calibration if parameters are on them."""
     grid = calibration.wavelength
-    if wavelength is None:
-        return grid
-    lam = wavelengths_of(wavelength)
+    lam = grid if wavelength is None else wavelengths_of(wavelength)
     several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
     if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=SAME_WAVELENGTH)):
         raise ParameterError(
@@ -595,10 +593,9 @@ def derived_sky(calibration, q, u, positions, *, wavelength=None, chain=None, da
             "such as 0 and 22.5 deg"
         )
     slopes = {}
-    for name in numerator:
-        if name:
-            change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
-            slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
+    for name in filter(None, numerator):
+        change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
+        slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
     return _by_name(calibration, value, slopes, -2)
 

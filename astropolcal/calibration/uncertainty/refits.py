@@ -23,12 +23,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
-from astropolcal.calibration.identifiability.linearized import (
-    STILL,
-    Whitened,
-    declared_step,
-)
+from astropolcal.calibration.identifiability.linearized import STILL, Whitened
 from astropolcal.calibration.noise.scatter import labels_of
 from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty.covariance import (
@@ -39,6 +34,7 @@ from astropolcal.calibration.uncertainty.covariance import (
     widening,
 )
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.measurement.parameters import declared_step
 from astropolcal.progress import counting, in_one_thread, shown
 from astropolcal.units import check_seed, to_unit
 from astropolcal.words import check_choice, did_you_mean
@@ -663,7 +659,7 @@ def _per_wavelength(calibration):
         rows = measurement.bins == i
         if own.size and rows.sum() > own.size:
             # no number for what the data leave open
-            found = Whitened(jacobian[own][:, rows], physical_scale(free)[own]).covariance()
+            found = Whitened(jacobian[own][:, rows], free.steps[own]).covariance()
             # the common parameters count as known, so that only a wavelength's own take freedom
             variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
             stds[own] = np.sqrt(variance * np.diag(found))

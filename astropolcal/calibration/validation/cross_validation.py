@@ -16,7 +16,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
 from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
@@ -105,21 +104,21 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     if not np.isfinite(problem.noise):
         # as many data as parameters tell no noise, against which a prior could weigh
         problem.noise = 0.0
-    linear = _Linear(problem) if len(members) > _MANY else None
+    without = _without(problem) if len(members) > _MANY else None
     for out in steps(members, "groups left out"):
-        if linear is not None:
-            predicted, blind = linear.without(out)
+        if without is not None:
+            predicted, blind = without(out)
         else:
             _, blind = _undetermined(problem, out)
         if groups is not None and blind.any():
-            share = np.abs(_undetermined(problem, out)[0] / physical_scale(measurement.free))
+            share = np.abs(_undetermined(problem, out)[0] / measurement.free.steps)
             slots = measurement.free.slots
             moved = [s.name for s in slots if share[:, s.slice].max() > _WORTH_A_WORD]
             raise FitError(
                 f"cross-validation: without group {labels[out[0]]} ({out.size} data) the others do "
                 f"not determine {listed(moved, most=_MOST_NAMES)}; group by something else"
             )
-        if linear is None:
+        if without is None:
             counts = np.ones(measurement.n_data)
             counts[out] = 0.0
             fitted, _, _ = problem.fit(problem.solution, counts)
@@ -129,23 +128,20 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     return held_out
 
 
-class _Linear:
-    """What a fit without each of many groups predicts, by one step of linear algebra.
+def _without(problem):
+    """Return what says what a fit without a group predicts, by one step of linear algebra.
 
     The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
     for a linear model, and a small group moves no parameter far.
     """
+    weights, root = problem.weights, problem.around().slopes
+    weighted = problem.measurement.residuals(problem.solution) * weights
 
-    def __init__(self, problem):
-        whitened, self._weights = problem.around(), problem.weights
-        self._root = whitened.along(whitened.rows)
-        self._residuals = problem.measurement.residuals(problem.solution) * self._weights
-
-    def without(self, out):
+    def predicted(out):
         """Return the residuals of a group, and which of them the others do not determine."""
         # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
         # eigenvalues are those of R^T R, (rank, rank)
-        own, residuals = self._root[out], self._residuals[out]
+        own, residuals = root[out], weighted[out]
         values, axes = np.linalg.eigh(own.T @ own)
         seen = own @ axes
         # along these the others determine nothing
@@ -154,7 +150,9 @@ class _Linear:
         gain = np.where(alone, 0.0, 1 / np.where(alone, 1.0, 1 - values))
         # (1 - R R^T)^-1 = 1 + R (1 - R^T R)^-1 R^T
         change = seen @ (gain * (seen.T @ residuals))
-        return (residuals + change) / self._weights[out], blind
+        return (residuals + change) / weights[out], blind
+
+    return predicted
 
 
 def _checked(measurement, groups):
@@ -174,7 +172,7 @@ def _checked(measurement, groups):
 
 def _undetermined(problem, out):
     """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
-    measurement, scale = problem.measurement, physical_scale(problem.measurement.free)
+    measurement, scale = problem.measurement, problem.measurement.free.steps
     jacobian = measurement.jacobian(problem.solution)
     kept = np.delete(problem.jacobian(problem.solution), out, axis=0)
     null = Whitened(kept.T, scale).data.null * scale
@@ -292,16 +290,12 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     True
     """
     noise = noise_from_errors(measurement) if noise is None else noise
-    if noise.sigma_of_data.shape != (measurement.n_data,):
-        raise FitError(
-            f"the noise is that of {noise.sigma_of_data.size} data, the measurement has "
-            f"{measurement.n_data}; estimate it from this measurement"
-        )
+    sigma = noise.of_data(measurement)
     if hasattr(vector, "measurement"):
         fitted = vector.measurement is measurement
         vector, weights = None, weighting_of(vector).weight if fitted else None
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    hat = _Hat.of(measurement, vector, noise.sigma_of_data, weights, whitened) if fitted else None
+    hat = _Hat.of(measurement, vector, sigma, weights, whitened) if fitted else None
     table, whole = _test_by_wavelength(measurement, vector, noise, hat)
     priors = _test_of_priors(measurement, vector, hat)
     chi2, expected, p_value = _together(table, whole, noise, priors)
@@ -497,16 +491,13 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     # open directions of the calibration, as far as the standard's chain follows them
     free, moved = free_of(calibration), np.zeros((1, measurement.n_data))
     null = np.reshape(calibration.identifiability.null_vectors, (-1, free.size))
-    null, jacobian = null * physical_scale(free), measurement.jacobian(measurement.vector())
+    null, jacobian = null * free.steps, measurement.jacobian(measurement.vector())
     for slot in measurement.free.slots:
         own, factor, _ = free.lookup(slot.name)
         columns = own.start + (np.sort(rows) if own.per_wavelength else np.zeros(1, dtype=int))
         moved = moved + factor * null[:, columns] @ jacobian[slot.slice]
-    table.meta |= {
-        "name": observations.name,
-        "source": observations.source,
-        "content_hash": observations.content_hash,
-        "n_frames": int(observations.n_frames),
+    keys = ("name", "source", "content_hash", "n_frames")
+    table.meta |= {key: getattr(observations, key) for key in keys} | {
         "open_percent": float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0)),
         "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
@@ -517,12 +508,18 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 def predicted_measurement(calibration, chain, observations, positions=None, sources=False):
     """Return the measurement of a standard with the values of a calibration."""
     predicted = _predicted_chain(calibration, chain, observations, sources)
+    return measurement_with(calibration, predicted, observations, positions)
+
+
+def measurement_with(calibration, chain, observations, positions=None, wavelength=None):
+    """Return the measurement of new observations as a calibration observes, of a chain as it is."""
     return Measurement(
-        predicted,
+        chain,
         observations,
         observable=calibration.settings["observable"],
         positions=None if positions is None else [positions],
-        ties=ties_among(calibration.ties, parameter_table([predicted])),
+        ties=ties_among(calibration.ties, parameter_table([chain])),
+        wavelength=wavelength,
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
+from astropolcal.calibration.noise.estimates import mean_of_known
 from astropolcal.calibration.validation.cross_validation import (
     add_percent,
     keep,
@@ -114,9 +115,10 @@ def star_stokes(calibration, chain, observations, positions=None):
 
 def _table(wavelength, found):
     count = np.isfinite(found[0]).sum(axis=1)
-    mean = _mean(found)
+    mean = mean_of_known(found)
     # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
-    error = np.sqrt(_mean((found - mean[..., None]) ** 2) / np.where(count > 1, count - 1, np.nan))
+    square = mean_of_known((found - mean[..., None]) ** 2)
+    error = np.sqrt(square / np.where(count > 1, count - 1, np.nan))
     table = QTable({"wavelength": wavelength})
     add_percent(table, q=mean[0], u=mean[1], q_err=error[0], u_err=error[1])
     # rms of both components: the degree has the error of one of them
@@ -132,12 +134,6 @@ def _table(wavelength, found):
     table["n_cycles"] = count
     add_percent(table, q_cycles=found[0], u_cycles=found[1])
     return table
-
-
-def _mean(values):
-    """Return means of what is known along the last axis, NaN of nothing."""
-    with np.errstate(invalid="ignore"):
-        return np.nansum(values, axis=-1) / np.isfinite(values).sum(axis=-1)
 
 
 def star_accuracy(table, q=0.0, u_=0.0):
@@ -184,8 +180,8 @@ def star_accuracy(table, q=0.0, u_=0.0):
     result = QTable({"wavelength": table["wavelength"]})
     add_percent(result, dolp_error=np.hypot(*mean) - length)
     result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
-    s_q, s_u = np.sqrt(_mean(off**2))
-    add_percent(result, s_dolp=np.sqrt(_mean(squares)), s_q=s_q, s_u=s_u)
+    s_q, s_u = np.sqrt(mean_of_known(off**2))
+    add_percent(result, s_dolp=np.sqrt(mean_of_known(squares)), s_q=s_q, s_u=s_u)
     return result
 
 

@@ -13,11 +13,12 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
-from astropolcal.calibration.noise.estimates import rms
+from astropolcal.calibration.noise.estimates import mean_of_known, rms
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
+    add_percent,
     held_out_residuals,
     refuse_fitted,
 )
@@ -34,43 +35,35 @@ __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_a
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 
 
-class SkyErrors:
-    """Covariance of the nine changes of I, Q and U that a calibration's errors make on sky."""
+def _errors_on_sky(calibration, view, targets, ignore):
+    """Yield the rms over the settings of the errors of q, u, degree and angle, as fractions.
 
-    def __init__(self, calibration, view, ignore=False):
-        self._good, self._ignore = view.good, ignore
-        axes = full_covariance(calibration)._axes()
-        # the nine in one axis
-        along = axes.along(view.changes.reshape(*view.good.shape, 9, -1))
-        self._known, self._open, self._blind = map(_products, along)
-        self._partial = axes.partial
-        extra = model_error(calibration.fit, view.lam)
-        extra = np.moveaxis(extra.reshape(len(extra), len(view.lam), 9), 0, -1)
-        self._covariance = _products(along[0] * axes.sigmas) + _products(extra)[:, None]
-
-    def of_target(self, dolp, double):
-        """Return the rms over the settings of the errors of q, u, degree and angle, as fractions.
-
-        Shape (4, n_wavelengths, n_angles) for double angles in radian; infinite where an open
-        direction acts.
-        """
+    Shape (4, n_wavelengths, n_angles) for each of ``targets``, degrees with double angles in
+    radian; infinite where an open direction acts.
+    """
+    axes = full_covariance(calibration)._axes()
+    # the nine changes of I, Q and U in one axis
+    along = axes.along(view.changes.reshape(*view.good.shape, 9, -1))
+    extra = model_error(calibration.fit, view.lam)
+    extra = np.moveaxis(extra.reshape(len(extra), len(view.lam), 9), 0, -1)
+    covariance = _products(along[0] * axes.sigmas) + _products(extra)[:, None]
+    matrices, count = (covariance, *map(_products, along)), view.good.sum(axis=1)[:, None]
+    for dolp, double in targets:
         weights = _weights(dolp, double).reshape(-1, 9)
         variance, known, is_open, blind = (
-            np.sum((matrix @ weights.T) * weights.T, axis=-2)
-            for matrix in (self._covariance, self._known, self._open, self._blind)
+            np.sum((matrix @ weights.T) * weights.T, axis=-2) for matrix in matrices
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
         limit = STILL**2 * (known + is_open + blind)
         lost = blind > limit
-        if not self._partial:
+        if not axes.partial:
             lost &= known <= limit
-        if not self._ignore:
+        if not ignore:
             variance[lost | (is_open > limit)] = np.inf
-        variance[~self._good] = np.nan
+        variance[~view.good] = np.nan
         with np.errstate(invalid="ignore", divide="ignore"):
-            count = self._good.sum(axis=1)[:, None]
             rms = np.sqrt(np.nansum(variance, axis=1) / np.where(count, count, np.nan))
-        return np.moveaxis(rms.reshape(len(rms), len(KEYS), -1), 0, 1)
+        yield np.moveaxis(rms.reshape(len(rms), len(KEYS), -1), 0, 1)
 
 
 def _products(rows):
@@ -171,15 +164,16 @@ def _accuracies(calibration, targets, view, ignore=False):
     wanted = [_target(*target) for target in targets]
     if view is None:
         return []
-    errors, tables, count = SkyErrors(calibration, view, ignore), [], view.good.shape[1]
+    tables, count = [], view.good.shape[1]
     words = (
         f"from the covariance of the fit {_of_model(calibration)}; {view.telescope}; "
         + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
         + (f", rms over {count} settings" if count > 1 else "")
     )
     words += "; as if the undetermined parameters were known" if ignore else ""
-    for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
-        found = np.max(errors.of_target(p, double), axis=-1)
+    errors = _errors_on_sky(calibration, view, wanted, ignore)
+    for (dolp, aolp), (p, _), error in zip(targets, wanted, errors, strict=True):
+        found = np.max(error, axis=-1)
         if p == 0:
             # no angle at all
             found[-1] = np.inf
@@ -457,11 +451,9 @@ def _tables_of_kinds(calibration, column):
         rows = np.full((len(several), grid.size), np.nan)
         for row, (own, square) in zip(rows, several, strict=True):
             row[np.abs(own[:, None] - grid).argmin(axis=1)] = square
-        known = np.isfinite(rows)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
         if kind is not None and several:
-            tables[kind] = QTable({"wavelength": grid, column: np.sqrt(mean) * u.percent})
+            mean = np.sqrt(mean_of_known(rows.T)) * u.percent
+            tables[kind] = QTable({"wavelength": grid, column: mean})
     return tables
 
 
@@ -535,14 +527,10 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         for part in measurement.datasets:
             refuse_fitted(calibration, part.observations)
         name = ", ".join(part.observations.name for part in measurement.datasets)
-        wavelength = result["wavelength"]
-        residuals = measurement.residuals()
-        own = measurement.wavelength[measurement.bins]
-        found = [
-            residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
-            for value in wavelength.to_value(u.um)
-        ]
-        result["s_standard"] = 100 * np.array([rms(r) for r in found]) * u.percent
+        residuals, own = measurement.residuals(), measurement.wavelength[measurement.bins]
+        grid = result["wavelength"].to_value(u.um)
+        near = (np.abs(own - lam) <= SAME_WAVELENGTH * lam for lam in grid)
+        add_percent(result, s_standard=[rms(residuals[one]) for one in near])
     chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
     result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
     return result
