@@ -171,7 +171,6 @@ def work(arguments):
         detectors=detectors,
         unit=detectors[0][0].unit,
         # date and mode were checked when the calibration was chosen
-        date=None,
         mode=calibration.validity.mode,
     )
     options = {name: getattr(arguments, name) for name in _PASSED_ON}
