@@ -75,14 +75,23 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
     size = 1.2 + 2.1 * len(columns)
     # corner sets margins of its own, which a layout engine would undo
     with canvas(figure, size, size, layout=None) as figure:
-        look = {"color": BLUE, "quantiles": (0.16, 0.5, 0.84), "hist_kwargs": {"linewidth": 1.5}}
-        look |= {"labelpad": 0.06, "label_kwargs": {"fontsize": 9.5}, "max_n_ticks": 4}
-        look |= {"fill_contours": True, "plot_datapoints": False}
-        # the content of 1, 2 and 3 sigma ellipses in two dimensions: 1 - exp(-s^2 / 2)
-        look["levels"] = 1 - np.exp([-0.5, -2.0, -4.5])
-        # enough samples in each to draw contours
-        look["bins"] = int(np.clip(np.sqrt(len(samples)) / 3, 12, 50))
-        corner.corner(samples - shifts, fig=figure, labels=labels, **look)
+        corner.corner(
+            samples - shifts,
+            fig=figure,
+            labels=labels,
+            label_kwargs={"fontsize": 9.5},
+            labelpad=0.06,
+            quantiles=(0.16, 0.5, 0.84),
+            # the content of 1, 2 and 3 sigma ellipses in two dimensions: 1 - exp(-s^2 / 2)
+            levels=1 - np.exp([-0.5, -2.0, -4.5]),
+            fill_contours=True,
+            plot_datapoints=False,
+            # enough samples in each to draw contours
+            bins=int(np.clip(np.sqrt(len(samples)) / 3, 12, 50)),
+            color=BLUE,
+            max_n_ticks=4,
+            hist_kwargs={"linewidth": 1.5},
+        )
         marks = None if marks is None else marks - shifts
         _finish_corner(figure, posterior, columns, samples - shifts, marks)
     return figure

@@ -67,8 +67,11 @@ class Index:
             words = "another run works on this archive" if "locked" in str(problem) else problem
             raise AstropolcalError(f"{path}: {words}") from None
         except sqlite3.DatabaseError as problem:
-            message = f"{path}: not a readable index ({problem}); it is made again"
-            warnings.warn(message, AstropolcalWarning, stacklevel=2)
+            warnings.warn(
+                f"{path}: not a readable index ({problem}); it is made again",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
             self._base.close()
             self.path.unlink()
             self._connect()
@@ -323,8 +326,11 @@ class Manifest:
             raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
         # the last one may have been cut off
         if n_bad > (not line.endswith("\n")):
-            words = f"{n_bad} of its lines cannot be read; their sequences are done again"
-            warnings.warn(f"{self.path}: {words}", AstropolcalWarning, stacklevel=3)
+            warnings.warn(
+                f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
 
     def add(self, entry):
         """Write down what became of a sequence."""

@@ -149,8 +149,12 @@ class DetectorModel:
         """Return the way in which the detector is read out, and the background (W, 1, 1)."""
         gain = how.gain if self.gain is None else self.gain
         noise = how.read_noise if self.read_noise is None else self.read_noise
-        own = {"gain": number("gain", gain, above=0.0), "read_noise": number("read_noise", noise)}
-        how = replace(how, **own, saturation=how.saturation if self.saturate else np.inf)
+        how = replace(
+            how,
+            gain=number("gain", gain, above=0.0),
+            read_noise=number("read_noise", noise),
+            saturation=how.saturation if self.saturate else np.inf,
+        )
         return how, per_wavelength("background", self.background, n_wavelengths)[:, None, None]
 
     def _pixels(self, rng, shape):
@@ -331,10 +335,12 @@ def simulate_cubes(
             header = layout.to_header(header_of(frames[i], layout) | more)
             write_cube(*names[i], cube, weight, header, layout)
     if fullest[0] > 1 and not detector.saturate:
-        words = f"{fullest[1]:.3g} adu, above the saturation of {fullest[2]:g} adu"
-        advice = "lower the flux (--flux), or cut pixels off there (--saturate)"
-        message = f"the brightest pixel has {words}: {advice}"
-        warnings.warn(message, AstropolcalWarning, stacklevel=2)
+        warnings.warn(
+            f"the brightest pixel has {fullest[1]:.3g} adu, above the saturation of "
+            f"{fullest[2]:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
     return [cube for cube, _ in names]
 
 

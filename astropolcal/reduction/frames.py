@@ -488,8 +488,11 @@ def _check_one_target(files, frames):
             objects.setdefault(re.sub(r"[^\w+-]|_", "", name).casefold(), (name, file))
     if len(objects) > 1:
         (one, first), (other, second) = list(objects.values())[:2]
-        message = f"{first} is of object {one!r}, {second} of {other!r}: corrected as one"
-        warnings.warn(message, AstropolcalWarning, stacklevel=4)
+        warnings.warn(
+            f"{first} is of object {one!r}, {second} of {other!r}: corrected as one",
+            AstropolcalWarning,
+            stacklevel=4,
+        )
 
 
 def _survey(files, layout, raw, find):

@@ -112,9 +112,14 @@ class Detector:
 
     def in_units_of(self, other):
         """Return the same detector where its electrons count as another one's do."""
-        factor, gain = self.units_of(other), other.gain * self.exposures / other.exposures
-        noise, full = self.read_noise * factor, self.saturation * factor
-        return replace(self, unit=other.unit, gain=gain, read_noise=noise, saturation=full)
+        factor = self.units_of(other)
+        return replace(
+            self,
+            unit=other.unit,
+            gain=other.gain * self.exposures / other.exposures,
+            read_noise=self.read_noise * factor,
+            saturation=self.saturation * factor,
+        )
 
 
 def pixel_unit(unit):

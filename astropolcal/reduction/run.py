@@ -175,9 +175,12 @@ def reduce_cubes(files, instrument, **options):
     reduction = reduce_run(files, instrument, **options)
     for words, told in (("left out", reduction.problems), ("doubtful", reduction.doubts)):
         for path, why in list(told.items())[:1]:
-            first = f"the first is {path}: {'; '.join(why)}"
-            message = f"{counted(len(told), 'file')} {words} (reduce_run lists all); {first}"
-            warnings.warn(message, AstropolcalWarning, stacklevel=2)
+            warnings.warn(
+                f"{counted(len(told), 'file')} {words} (reduce_run lists all); the first is "
+                f"{path}: {'; '.join(why)}",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
     return reduction.observations
 
 
@@ -290,13 +293,18 @@ def reduce_run(
     masters = Masters(*(None if path is None else str(path) for path in (dark, flat)))
     # a dark that does not fit is no fault of the frames
     masters.check(layout)
-    raw = None if raw is None else raw_frames(raw, layout)
-    kept = {"options": options, "masters": None if masters == Masters() else masters}
-    task = {"layout": layout, "source": photometry, "raw": raw} | kept
+    task = {
+        "layout": layout,
+        "masters": None if masters == Masters() else masters,
+        "source": photometry,
+        "raw": None if raw is None else raw_frames(raw, layout),
+        "options": options,
+    }
     frames = _measure_all(cubes, task, workers, cluster, resume, progress)
     if photometry == "star":
         # here and not in the processes that measure: one table of the Earth's rotation for all
         check_stars(frames, layout)
+    kept = {"options": options, "masters": task["masters"]}
     reduction = Reduction(instrument, photometry, problems=lost, **kept)
     frames = _usable(frames, reduction, layout, hwp_sequence, keep_repeats)
     if not frames:

@@ -73,13 +73,17 @@ def run(arguments):
     if action == "score":
         result = score_cases(*folders)
     else:
-        setup = Setup(
-            instrument=arguments.instrument,
-            n_wavelengths=arguments.wavelengths,
-            n_derotator=arguments.derotator_angles,
-        )
-        options = {"n": arguments.count, "seed": arguments.seed, "snr": arguments.snr}
-        options |= {"kinds": arguments.kinds or tuple(KINDS), "setup": setup}
+        options = {
+            "n": arguments.count,
+            "seed": arguments.seed,
+            "snr": arguments.snr,
+            "kinds": arguments.kinds or tuple(KINDS),
+            "setup": Setup(
+                instrument=arguments.instrument,
+                n_wavelengths=arguments.wavelengths,
+                n_derotator=arguments.derotator_angles,
+            ),
+        }
         # processes are started once for all challenges
         with _workers(arguments.workers) as client:
             if action == "make":

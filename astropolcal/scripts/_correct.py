@@ -171,13 +171,20 @@ def work(arguments):
         detectors=detectors,
         unit=detectors[0][0].unit,
         # date and mode were checked when the calibration was chosen
+        date=None,
         mode=calibration.validity.mode,
     )
-    options = {name: getattr(arguments, name) for name in _PASSED_ON}
-    options["brightness"] = "measured" if arguments.brightness == "measured" else "given"
-    options["weights"] = "variance" if arguments.weights == "variance" else None
-    options |= {"any_date": True, "n_samples": arguments.samples, "provenance": provenance}
-    result = correct(calibration, frames, chain=chain, **options)
+    result = correct(
+        calibration,
+        frames,
+        chain=chain,
+        brightness="measured" if arguments.brightness == "measured" else "given",
+        weights="variance" if arguments.weights == "variance" else None,
+        any_date=True,
+        n_samples=arguments.samples,
+        provenance=provenance,
+        **{name: getattr(arguments, name) for name in _PASSED_ON},
+    )
     # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
     if arguments.subtract_star is not None:
