@@ -141,23 +141,6 @@ def layout_of(header):
     return replace(LAYOUT, keywords=keywords, shape=shape, **places)
 
 
-def mode_header(wavelength):
-    """Return the keywords of the mode that has slices of these wavelengths."""
-    known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
-    known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
-    known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
-    wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
-    for header, names in known:
-        own = _wavelengths(names).value
-        if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
-            return header
-    raise InstrumentError(
-        f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; allowed "
-        f"are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or without the "
-        "first"
-    )
-
-
 def _wavelengths(names):
     return u.Quantity([filter_wavelength("vampires", name) for name in names])
 
@@ -357,7 +340,19 @@ class VAMPIRES(SubaruPolarimeter):
 
     def mode_header(self, wavelength):
         """Return mode and filter in the headers of cubes of these wavelengths."""
-        return mode_header(wavelength)
+        known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
+        known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
+        known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
+        wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
+        for header, names in known:
+            own = _wavelengths(names).value
+            if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
+                return header
+        raise InstrumentError(
+            f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; "
+            f"allowed are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or "
+            "without the first"
+        )
 
     def optics_of(self, header):
         """Return whether the liquid crystal was in the beam, where the header tells."""
