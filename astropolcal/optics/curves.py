@@ -144,7 +144,7 @@ class Curve(ScalarParameters):
 
     def evaluate(self, x, *parameters):
         """Return the values at ``x``; without units numbers are in the units of the curve."""
-        values = self._values(self._at(x), self._canonical(parameters))
+        values = self._values(self._found_at(x, parameters))
         return values.reshape(np.shape(x)) / canonical_factor(self._unit)
 
     @property
@@ -153,7 +153,7 @@ class Curve(ScalarParameters):
         return None if self.has_tied else self._fit_deriv
 
     def _fit_deriv(self, x, *parameters):
-        slopes = self._slopes(self._at(x), self._canonical(parameters))
+        slopes = self._slopes(self._found_at(x, parameters))
         out, scale = np.zeros((len(parameters), np.size(x))), canonical_factor(self._unit)
         for plan, own in zip(self._plan, slopes, strict=True):
             for (place, factor), slope in zip(plan, own, strict=True):
@@ -161,13 +161,19 @@ class Curve(ScalarParameters):
                     out[place] = slope * (factor / scale)
         return out
 
-    def _canonical(self, parameters):
-        """Return the canonical values of each optic, the same object for the same parameters."""
+    def _found_at(self, x, parameters):
+        """Return what is made of an input and values; a fitter asks twice at the same point."""
+        x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
+        x, memo = x.ravel(), self._memo
+        # as np.array_equal, in a fifth of its time
+        if "x" not in memo or memo["x"].shape != x.shape or not (memo["x"] == x).all():
+            memo.clear()
+            memo |= {"x": np.array(x, dtype=float), "place": self._located(x)}
         # astropy calls with arrays of one, with or without unit, fitters with numbers
         numbers = [getattr(value, "value", value) for value in parameters]
         numbers = [value.item() if hasattr(value, "item") else value for value in numbers]
-        known, values = self._memo.get("values", (None, None))
-        if known != numbers:
+        # arrays are no parameters of the curve, and may be others next time
+        if self._several or memo.get("numbers") != numbers:
             values = [
                 [
                     factor * (getattr(optic, key).value if place is None else numbers[place])
@@ -175,9 +181,8 @@ class Curve(ScalarParameters):
                 ]
                 for optic, plan in zip(self._optics, self._plan, strict=True)
             ]
-            # arrays are no parameters of the curve, and may be others next time
-            self._memo["values"] = (None if self._several else numbers), values
-        return values
+            memo |= {"found": self._found(memo["place"], values), "numbers": numbers}
+        return memo["found"]
 
     def _values_at(self, wavelength, values):
         """Return the values of each optic at the wavelengths, where some have several."""
@@ -189,25 +194,6 @@ class Curve(ScalarParameters):
             theta = optic.canonical_values()[: len(optic.param_names) - len(own)]
             full = optic.values_at(wavelength, [np.asarray(value) for value in (*theta, *own)])
             found.append(full[len(theta) :])
-        return found
-
-    def _once(self, make, place, values):
-        """Return what is made of an input and values; a fitter asks twice at the same point."""
-        there, then, found = self._memo.get(make.__name__, (None, None, None))
-        if there is not place or then is not values:
-            found = make(place, values)
-            self._memo[make.__name__] = place, values, found
-        return found
-
-    def _at(self, x):
-        """Return what depends on the input alone."""
-        x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
-        x = x.ravel()
-        known, found = self._memo.get("inputs", (None, None))
-        # as np.array_equal, in a fifth of its time
-        if known is None or known.shape != x.shape or not (known == x).all():
-            found = self._located(x)
-            self._memo["inputs"] = np.array(x, dtype=float), found
         return found
 
 
@@ -233,11 +219,11 @@ class LawCurve(Curve):
         slopes = [float(key == self._law) for key in optic.own_names]
         return own[optic.own_names.index(self._law)], slopes
 
-    def _values(self, place, values):
-        return self._once(self._found, place, values)[0] + np.zeros(place[0].shape)
+    def _values(self, found):
+        return found[0] + np.zeros(self._memo["x"].shape)
 
-    def _slopes(self, place, values):
-        return [self._once(self._found, place, values)[1]]
+    def _slopes(self, found):
+        return [found[1]]
 
 
 class LightCurve(Curve):
@@ -298,7 +284,7 @@ class LightCurve(Curve):
             for optic, shift in zip(self._optics, shifts, strict=True)
         ]
 
-    def _beams(self, place, values):
+    def _found(self, place, values):
         """Return of each beam what happens at its optics, and the light that leaves them."""
         return [self._beam(arm, place, values) for arm in self._arms]
 
@@ -313,17 +299,16 @@ class LightCurve(Curve):
             light = (matrix @ light[..., None])[..., 0]
         return steps, light
 
-    def _values(self, place, values):
-        found = [self._flux(light) for _, light in self._once(self._beams, place, values)]
+    def _values(self, beams):
+        found = [self._flux(light) for _, light in beams]
         return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
 
     def _flux(self, light):
         """Return what is measured of the light, (k, 1, n), as observables take it."""
-        shape, flux = (self._frames, self._memo["inputs"][0].size), light[..., self._element[0]]
+        shape, flux = (self._frames, self._memo["x"].size), light[..., self._element[0]]
         return (flux if flux.shape == shape else np.broadcast_to(flux, shape))[:, None]
 
-    def _slopes(self, place, values):
-        beams = self._once(self._beams, place, values)
+    def _slopes(self, beams):
         if self._observable is None:
             return self._slopes_of_beam(beams[0][0])
         found = [self._flux(light) for _, light in beams]
