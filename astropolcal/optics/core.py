@@ -409,8 +409,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         ParameterError, WavelengthRangeError
             If a wavelength is needed and missing, or out of a law's range.
         """
-        dispersion, angle, values = self._resolve(wavelength, position)
-        return self._oriented(dispersion, angle, values)
+        return self._oriented(*self._resolve(wavelength, position))
 
     def mueller_derivatives(self, wavelength=None, position=None):
         """
