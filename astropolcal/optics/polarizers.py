@@ -63,7 +63,22 @@ class LinearPolarizer(_LinearOptic):
     _constant = 0.5 * UNITS[:2, :2].sum(axis=(0, 1))
 
 
-class Diattenuator(Optic):
+class _Diattenuating(Optic):
+    """A diattenuator, perhaps with a retardance along the same axes."""
+
+    _components = ("diattenuation",)
+    diattenuation = Parameter(
+        default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
+    )
+
+    def _matrix(self, dispersion, diattenuation, retardance=0.0):
+        return _diattenuator_retarder(diattenuation, retardance)
+
+    def _derivatives(self, dispersion, diattenuation, retardance=0.0):
+        return diattenuator_retarder_slopes(diattenuation, retardance)[: len(self.own_names)]
+
+
+class Diattenuator(_Diattenuating):
     r"""
     Linear diattenuator of unit transmission for unpolarized light.
 
@@ -87,19 +102,8 @@ class Diattenuator(Optic):
     np.float64(0.01)
     """
 
-    _components = ("diattenuation",)
-    diattenuation = Parameter(
-        default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
-    )
 
-    def _matrix(self, dispersion, diattenuation):
-        return _diattenuator_retarder(diattenuation, 0.0)
-
-    def _derivatives(self, dispersion, diattenuation):
-        return diattenuator_retarder_slopes(diattenuation, 0.0)[:1]
-
-
-class DiattenuatorRetarder(Optic):
+class DiattenuatorRetarder(_Diattenuating):
     r"""
     Linear diattenuator and linear retarder with common axes.
 
@@ -128,17 +132,7 @@ class DiattenuatorRetarder(Optic):
     np.float64(0.015)
     """
 
-    _components = ("diattenuation",)
-    diattenuation = Parameter(
-        default=0.0, bounds=(-1, 1), description="relative difference of the two transmissions"
-    )
     retardance = phase("phase between the two axes")
-
-    def _matrix(self, dispersion, diattenuation, retardance):
-        return _diattenuator_retarder(diattenuation, retardance)
-
-    def _derivatives(self, dispersion, diattenuation, retardance):
-        return diattenuator_retarder_slopes(diattenuation, retardance)
 
 
 class VectorDiattenuator(Optic):
