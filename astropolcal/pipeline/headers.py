@@ -143,8 +143,12 @@ class FrameAngles:
         times = [_time(header, layout) for header in headers]
         if all(time is not None for time in times):
             table["time"] = Time(times)
-        #: One row per frame.
-        self.frames = table
+        self._table = table
+
+    @property
+    def frames(self):
+        """One row per frame."""
+        return self._table.copy()
 
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
@@ -190,11 +194,11 @@ class FrameAngles:
         """Return an angle of every frame in radian, a moment, a place, or the number of a state."""
         if column in PLACES:
             return frame_coordinate(self, column)
-        if column not in self.frames.colnames:
+        if column not in self._table.colnames:
             keyword = self._layout.keywords.get(column)
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"
             raise ObservationError(f"position of {column!r}: {lacking} in the header")
-        return numeric_column(self.frames, column, self.name, u.rad)
+        return numeric_column(self._table, column, self.name, u.rad)
 
 
 # ---- which of a calibration's chains the light of a frame went through ----
