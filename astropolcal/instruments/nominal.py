@@ -100,14 +100,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import replace_optic
-from astropolcal.instruments.base import SkyLaw
-from astropolcal.instruments.polarimeter import (
-    Polarimeter,
-    aluminium,
-    diattenuator,
-    turning_retarder,
-    wollaston,
-)
+from astropolcal.instruments.base import Polarimeter, SkyLaw, aluminium
 from astropolcal.instruments.telescope import PARANAL, STARS, misaligned, star_options, star_source
 
 __all__ = []
@@ -383,3 +376,29 @@ class RomanCoronagraph(Polarimeter):
     def particulars(self, observations):
         """Return the names of a star, ``object`` in the meta: of its source, in the catalogue."""
         return star_options(observations)
+
+
+# ---- optics of several -----------------------------------------------------------------------
+
+
+def diattenuator(name, grid, horizontal=0.0, diagonal=0.0):
+    """Return optics that polarize along a direction of their own, free per wavelength."""
+    values = {"horizontal": horizontal, "diagonal": diagonal}
+    values = {key: np.full(grid.size, value) for key, value in values.items()}
+    return optics.VectorDiattenuator(name=name, **values)
+
+
+def turning_retarder(
+    stage, retardance, grid, *, bounds=(150, 180), sign="", about=0.0, most=10, **more
+):
+    """Return a retarder on a stage, free in its angle and, per wavelength, its retardance (deg)."""
+    held = misaligned(about, most) | {"theta": about * u.deg} | more
+    # linear polarization cannot tell 180 + x from 180 - x of a half-wave plate
+    held["bounds"] |= {"retardance": bounds}
+    values = np.full(grid.size, retardance, dtype=float) * u.deg
+    return optics.LinearRetarder(retardance=values, mount=sign + stage, name=stage, **held)
+
+
+def wollaston(grid, **settings):
+    """Return a prism of nominal efficiency, free per wavelength."""
+    return optics.WollastonPrism(efficiency=np.full(grid.size, 0.99), name="wollaston", **settings)

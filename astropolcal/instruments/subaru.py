@@ -37,7 +37,7 @@ The retardance of the derotator in Y starts at its published value at 1.16 um in
 import astropy.units as u
 
 from astropolcal import optics
-from astropolcal.instruments.polarimeter import SubaruPolarimeter
+from astropolcal.instruments.base import SubaruPolarimeter
 from astropolcal.instruments.telescope import telescope
 from astropolcal.instruments.vampires import VAMPIRES, liquid_crystal
 

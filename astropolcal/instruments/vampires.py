@@ -23,6 +23,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
+from astropolcal.instruments.base import SubaruPolarimeter
 from astropolcal.instruments.layout import (
     COMMON,
     EM_EXCESS_NOISE,
@@ -30,7 +31,6 @@ from astropolcal.instruments.layout import (
     ReadOut,
     side_by_side,
 )
-from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 from astropolcal.units import wavelengths_of
