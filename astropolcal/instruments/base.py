@@ -568,10 +568,8 @@ class Instrument(ABC):
         """
         if not is_star(observations.source):
             return {}
-        known = inspect.signature(self.chain).parameters
-        return {
-            key: value for key, value in shared.star_options(observations).items() if key in known
-        }
+        known, told = inspect.signature(self.chain).parameters, shared.star_options(observations)
+        return {key: value for key, value in told.items() if key in known}
 
     def prepare(self, observations):
         """
