@@ -6,7 +6,6 @@ A chain is what astropy's ``|`` makes of optics, written in the order the
 light travels. Nothing here depends on which optics they are.
 """
 
-import math
 import warnings
 from functools import reduce
 from itertools import accumulate
@@ -17,7 +16,6 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ObservationError, ParameterError
-from astropolcal.mueller import act, turned
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
 from astropolcal.optics.positions import FLUXES, PLACES, finite_position
@@ -561,41 +559,10 @@ def system_mueller(chain, wavelength=None, positions=None):
     """
     positions, shape = _check_axes(wavelength, positions)
     warn_beyond(chain, positions)
-    has_grid = np.ndim(wavelength) == 1
-    n_waves = len(wavelength) if has_grid else 1
-    n_frames = math.prod(shape) // n_waves
-    # what comes out of the four unit sources of every frame is the four columns of its matrix
-    light, frame = np.tile(np.eye(4), (n_frames, 1))[None], 0.0
-    for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
-        angle = _waves_first(angle, 0, has_grid)
-        if leaf.rotates_frame:
-            frame = frame - angle
-            continue
-        matrix = _waves_first(leaf._matrix(dispersion, *values), 2, has_grid)
-        light = _turned(light, angle - frame)
-        light = act(matrix[:, 0] if matrix.shape[1] == 1 else _four_each(matrix), light)
-        frame = angle
-    light = _turned(light, -frame).reshape(-1, n_frames, 4, 4)
-    total = np.broadcast_to(light.transpose(1, 0, 3, 2), (n_frames, n_waves, 4, 4))
-    return total.reshape(*shape, 4, 4).copy()
-
-
-def _waves_first(value, own, has_grid):
-    """Bring (n_frames, n_wavelengths), either of which may be missing, to two axes, turned."""
-    value = np.asarray(value)
-    lead, rest = value.shape[: value.ndim - own], value.shape[value.ndim - own :]
-    full = (1,) * (2 - len(lead)) + lead if has_grid else (math.prod(lead), 1)
-    return value.reshape(*full, *rest).swapaxes(0, 1)
-
-
-def _four_each(value):
-    """Give what belongs to a frame to each of its four sources."""
-    return np.repeat(value, 4, axis=1) if value.shape[1] > 1 else value
-
-
-def _turned(light, angle):
-    """Return T(angle) applied to the light of four sources per frame."""
-    return turned(light, _four_each(np.exp(-2j * angle)) if np.any(angle) else None)
+    total = np.eye(4)
+    for leaf, *rest in _oriented_leaves(chain, wavelength, positions):
+        total = leaf._oriented(*rest) @ total
+    return np.broadcast_to(total, (*shape, 4, 4)).copy()
 
 
 def _check_axes(wavelength, positions):
@@ -640,7 +607,8 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
     ):
         if not leaf.name:
             raise ChainError(f"{type(leaf).__name__} needs a name before its parameters have one")
-        slopes = leaf._oriented_derivatives(*rest, leaf._rates_at(wavelength, positions))
+        rates = leaf._rates_at(wavelength, positions)
+        slopes = leaf._oriented_derivatives(matrix, *rest, rates)
         for key, slope in zip(leaf.param_names, slopes, strict=True):
             value = np.broadcast_to(after @ slope @ upstream, (*shape, 4, 4)).copy()
             result[f"{leaf.name}.{key}"] = leaf._per_unit(key, value)

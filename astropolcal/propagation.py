@@ -9,16 +9,18 @@ much as a few evaluations. Everything is on canonical floats.
 
 Light has shape (n_wavelengths, n_columns, 4); a column is a frame, and an axis has length 1 as long
 as nothing has depended on it. Q and U of a column lie side by side, so that they are also the
-complex number Q + iU, which a rotation of the frame by an angle multiplies by exp(-2i angle). Light
-is kept in the frame of the optic that it enters. The matrix of an optic has shape (n_wavelengths,
-4, 4), or (n_wavelengths, n_columns, 4, 4) where it changes from frame to frame.
+complex number Q + iU, which a rotation of the frame by an angle multiplies by exp(-2i angle), its
+phase; None is a phase of 1. Light is kept in the frame of the optic that it enters. The matrix of
+an optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, n_columns, 4, 4) where it changes from
+frame to frame.
 """
+
+import cmath
 
 import numpy as np
 
 from astropolcal.chain import check_inputs, leaves
 from astropolcal.exceptions import ChainError
-from astropolcal.mueller import act, act_back, inverse, phase_of, plane, turned
 from astropolcal.optics import FrameOptic
 
 __all__ = []
@@ -26,17 +28,6 @@ __all__ = []
 
 class _Node:
     """An optic of the chain, with what does not change in a fit."""
-
-    __slots__ = (
-        "dispersion",
-        "follows",
-        "index",
-        "leaf",
-        "per_frame",
-        "phase",
-        "places",
-        "stage_angle",
-    )
 
     def __init__(self, index, leaf, wavelength, positions, follows):
         self.index, self.leaf, self.phase = index, leaf, None
@@ -107,8 +98,6 @@ def _of_beam(leaf, positions):
 
 class _Step:
     """An optic at given values, and the light that entered it in the forward sweep."""
-
-    __slots__ = ("light", "matrix", "node", "phase", "values")
 
     def __init__(self, node, values, phase=None, matrix=None):
         self.node, self.values, self.phase, self.matrix = node, values, phase, matrix
@@ -364,7 +353,9 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
                     slope = (adjoint * changed) @ np.ones(4)
                     _add(result, (step.node.index, parameter), slope)
         behind = pair
-        adjoint = turned(pair[0][0], inverse(step.phase))
+        # the way back
+        phase = None if step.phase is None else step.phase.conjugate()
+        adjoint = turned(pair[0][0], phase)
     return adjoint, behind
 
 
@@ -377,3 +368,56 @@ def _crossed(pairs):
     # a_Q s_U - a_U s_Q, with Q + iU as one number
     products = [(plane(a).conj() * plane(s)).imag for a, s in pairs]
     return sum(products[1:], start=products[0]) if products else np.zeros((1, 1))
+
+
+# ---- Stokes vectors through Mueller matrices ----------------------------------------------------
+
+
+def phase_of(stage, theta):
+    """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
+    if np.ndim(theta):
+        # one value per wavelength goes along the first axis, positions along the second
+        turn = np.exp(-2j * (theta[:, None] if theta.ndim == 1 else theta))
+    elif theta:
+        turn = cmath.exp(-2j * theta)
+    else:
+        return stage
+    return turn if stage is None else stage * turn
+
+
+def turned(light, phase, in_place=False):
+    """Return T(angle) applied to the light, for the phase exp(-2i angle)."""
+    if phase is None:
+        return light
+    rows, columns, _ = light.shape
+    dimensions = np.ndim(phase)
+    if dimensions:
+        # the shape of the product, without asking numpy for it
+        columns = max(columns, phase.shape[-1])
+        rows = max(rows, phase.shape[0]) if dimensions == 2 else rows
+    if not in_place or (rows, columns) != light.shape[:2]:
+        out = np.empty((rows, columns, 4))
+        out[:] = light
+        light = out
+    both = plane(light)
+    np.multiply(both, phase, out=both)
+    return light
+
+
+def plane(light):
+    """Return Q + iU as a view."""
+    return light[..., 1:3].view(complex)[..., 0]
+
+
+def act(matrix, light):
+    """Return matrix times light."""
+    if matrix.ndim == 4:
+        return np.einsum("wcij,wcj->wci", matrix, light)
+    return light @ np.ascontiguousarray(matrix.swapaxes(1, 2))
+
+
+def act_back(matrix, adjoint):
+    """Return the adjoint times matrix."""
+    if matrix.ndim == 4:
+        return np.einsum("wci,wcij->wcj", adjoint, matrix)
+    return adjoint @ matrix

@@ -31,9 +31,9 @@ OPTIC_MODULES = {
         "HarmonicGain HarmonicRetarder HarmonicRotator PolarizedBackground StateAnalyser "
         "StateRetarder StrayLight",
         "perturbations": "MuellerElement Perturbation",
-        "polarizers": "BeamGain Depolarizer Diattenuator "
-        "DiattenuatorRetarder LinearPolarizer VectorDiattenuator WollastonPrism",
-        "retarders": "EllipticalRetarder LinearRetarder Rotator TwoLayerWaveplate",
+        "polarizers": "BeamGain Depolarizer Diattenuator DiattenuatorRetarder EllipticalRetarder "
+        "LinearPolarizer LinearRetarder Rotator TwoLayerWaveplate VectorDiattenuator "
+        "WollastonPrism",
         "sources": "PolarizedSource StarSource",
     }.items()
     for name in names.split()

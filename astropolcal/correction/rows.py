@@ -42,7 +42,7 @@ def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration"
     if not hasattr(calibration, "datasets"):
         return chain_from_sky([calibration])[0]
     inner = inner_optics(calibration, optics_in, beam, label)
-    chain = join([*(telescope_optics(calibration) or ()), *inner])
+    chain = join([*telescope_optics(calibration), *inner])
     instrument = known_instrument(calibration.instrument)
     return chain_from_sky([chain], instrument, calibration.wavelength, date)[0]
 
@@ -125,8 +125,7 @@ def measurement_rows(calibration, positions, wavelength, *, chain=None, interpol
     >>> (rows[0, 0] - rows[1, 0]).round(12).tolist()
     [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
     """
-    model = RowModel(calibration, positions, wavelength, chain=chain, interpolate=interpolate)
-    return model.rows()
+    return RowModel(calibration, positions, wavelength, chain=chain, interpolate=interpolate).rows()
 
 
 def _placed(positions, wanted):

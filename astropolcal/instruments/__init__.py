@@ -14,8 +14,7 @@ from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.instruments.nominal import FORS2, GPI, NIRC2, MagAOX, NaCo, RomanCoronagraph
-from astropolcal.instruments.subaru import IRCS, REACH, FastPDI, HiCIAO
+from astropolcal.instruments.nominal import NOMINAL
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
 
@@ -136,7 +135,5 @@ def get(name):
     )
 
 
-_AT_SUBARU = CHARIS, FastPDI, HiCIAO, IRCS, REACH, VAMPIRES
-_ELSEWHERE = FORS2, GPI, IRDIS, MagAOX, NIRC2, NaCo, RomanCoronagraph
-for _cls in _AT_SUBARU + _ELSEWHERE:
+for _cls in (CHARIS, IRDIS, VAMPIRES, *NOMINAL):
     register(_cls)

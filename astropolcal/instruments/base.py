@@ -6,6 +6,11 @@ With how its stages follow the sky, and the nuisance of a dataset: background in
 unequal gains of the beams and the polarization of a lamp that is called unpolarized are optics
 of one dataset, with its name, and with a prior that keeps them small where the data cannot tell
 them from what the datasets share.
+
+What most instruments share is a chain of source or star, telescope, and what is downstream of them.
+One at a telescope of its own gives `Polarimeter.inner`, the optics from its entrance on; what
+shares Subaru's telescope, half-wave plate and derotator is a `SubaruPolarimeter` and gives its
+`SubaruPolarimeter.camera`.
 """
 
 import inspect
@@ -20,7 +25,8 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
-from astropolcal.instruments.telescope import _normal, as_exact, star_options
+from astropolcal.instruments import telescope as shared
+from astropolcal.instruments.layout import COMMON, FileLayout
 from astropolcal.observations.grid import (
     is_star,
     mask_incomplete_cycles,
@@ -228,7 +234,7 @@ def without_nuisance(chain):
 
 
 def _added(chain, observations, kind, name, size):
-    found, prior, zero = leaves(chain), _normal(0.0, NUISANCES[kind]), np.zeros(size)
+    found, prior, zero = leaves(chain), shared._normal(0.0, NUISANCES[kind]), np.zeros(size)
     split = next(i for i, leaf in enumerate(found) if leaf.splits_light)
     if kind == "lamp":
         source = optics.PolarizedSource(name=name)
@@ -466,7 +472,7 @@ class Instrument(ABC):
         for leaf in (leaf for chain in chains for leaf in leaves(chain)):
             for parameter in (getattr(leaf, key) for key in leaf.param_names):
                 parameter.wavelength = grid if parameter.size == grid.size > 1 else None
-        return add_nuisance(map(as_exact, chains) if exact else chains, datasets, nuisance)
+        return add_nuisance(map(shared.as_exact, chains) if exact else chains, datasets, nuisance)
 
     def telescope_optics(self, behind, **options):
         """
@@ -562,8 +568,8 @@ class Instrument(ABC):
         """
         if not is_star(observations.source):
             return {}
-        known = inspect.signature(self.chain).parameters
-        return {key: value for key, value in star_options(observations).items() if key in known}
+        known, told = inspect.signature(self.chain).parameters, shared.star_options(observations)
+        return {key: value for key, value in told.items() if key in known}
 
     def prepare(self, observations):
         """
@@ -700,3 +706,128 @@ class Instrument(ABC):
 
     def __repr__(self):
         return f"<{type(self).__name__} {self.name!r}>"
+
+
+# ---- what most instruments share -----------------------------------------------------------
+
+
+class Polarimeter(Instrument):
+    """
+    An instrument whose chain is a source, or a star and the telescope, and its own optics.
+
+    Attributes
+    ----------
+    site : tuple of float
+        Longitude and latitude (deg) and height (m) of the telescope; empty without a site.
+    focus : str
+        ``"nasmyth"``, with a tertiary mirror of bare aluminium, or ``"cassegrain"``, where the sky
+        turns upstream of the instrument and nothing else.
+    altitude : str
+        The stage of the altitude at a Nasmyth focus, with its sign.
+    transforms : dict
+        Of the keywords, see `~astropolcal.instruments.FileLayout`.
+    times : dict
+        Keywords of the time of a frame, where they are not the usual ones.
+    """
+
+    sources = ("polarized", *shared.STARS)
+    sky_options = ("wavelength",)
+    site, focus, altitude = (), "nasmyth", "-altitude"
+    transforms, times = {}, {}
+    #: The plate stays where it is put, and turns with the instrument.
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
+
+    def chain(self, source=None, optics_in=(), *, wavelength=None, star="star", target=None):
+        """
+        Return the chain of a source upstream of the instrument or of a star, to be calibrated.
+
+        As `Instrument.chain`. The first of ``sources`` is the default; ``"polarized"`` is a
+        polarizer upstream of the instrument, ``"unpolarized"`` a lamp without one, all others are
+        stars.
+        """
+        source = self.sources[0] if source is None else source
+        self.check_choices(source, optics_in)
+        grid = self.grid(wavelength)
+        light = self.light(source, grid, star, target)
+        return join([*light, *self.inner(source, optics_in, grid)])
+
+    def light(self, source, grid, star, target):
+        """Return the polarizer, or a star and the telescope."""
+        if source == "polarized":
+            return [optics.LinearPolarizer(name="polarizer")]
+        light = shared.star_source(source, grid, star, target)
+        return [light, *self.telescope_optics(wavelength=grid)]
+
+    @abstractmethod
+    def inner(self, source, optics_in, grid):
+        """Return the optics from the entrance of the instrument on."""
+
+    def telescope_optics(self, behind=(), *, wavelength=None):
+        """Return the telescope of the focus."""
+        if self.focus == "cassegrain":
+            return [optics.Rotator(mount="parallactic", name="parallactic")]
+        return shared.telescope(aluminium(self.grid(wavelength)), self.altitude)
+
+    @property
+    def headers(self):
+        """Layout that reads the headers of frames."""
+        keywords = {key: word for key, word in COMMON.items() if key != "exposure_time"}
+        return FileLayout(
+            keywords | self.keywords | self.times, (1, 1, 1), transforms=self.transforms
+        )
+
+    @property
+    def location(self):
+        """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
+        return location_of(self.site)
+
+
+class SubaruPolarimeter(Polarimeter):
+    """
+    What stands downstream of Subaru's tertiary mirror, half-wave plate and derotator.
+
+    Sources are those of the calibration unit upstream of the plate, and stars. Free are what is
+    free of CHARIS, from the same starts.
+    """
+
+    sources = (*shared.INTERNAL, *shared.STARS)
+    sky_options = ()
+    site = shared.SITE
+    changes = shared.CHANGES
+    keywords = {
+        "hwp": "RET-ANG1",
+        "hwp_true": "RET-POS1",
+        "derotator": "D_IMRANG",
+        "altitude": "ALTITUDE",
+    }
+    times = {"mjd": "MJD", "time": "UT"}
+    sky_law = SkyLaw()
+
+    def light(self, source, grid, star, target):
+        """Return the internal source, or a star and the telescope."""
+        return shared.entrance(source, grid, star, target, "free")
+
+    def inner(self, source, optics_in, grid):
+        """Return the half-wave plate, the derotator and the camera."""
+        plate = shared.two_layer_plate(**shared.misaligned(0))
+        return [plate, shared.published_derotator(grid), *self.camera(optics_in, grid)]
+
+    def camera(self, optics_in, grid):
+        """Return the optics downstream of the derotator, here a Wollaston prism."""
+        return [optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston")]
+
+    def telescope_optics(self, behind=(), **options):
+        """Return the telescope with the tertiary mirror that is published."""
+        return shared.telescope(shared.published_mirror())
+
+
+def aluminium(grid):
+    """Return a tertiary mirror whose diattenuation, at first that of aluminium, is free."""
+    metal = optics.MetalMirror(material="aluminium")
+    return optics.DiattenuatorRetarder(
+        diattenuation=metal.diattenuation(grid),
+        retardance=metal.retardance(grid),
+        name="m3",
+        fixed={"retardance": True},
+        bounds={"diattenuation": (-0.1, 0.1)},
+    )

@@ -18,8 +18,8 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import telescope as subaru
+from astropolcal.instruments.base import SubaruPolarimeter
 from astropolcal.instruments.layout import COMMON, FileLayout, frame_time
-from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]

@@ -210,34 +210,9 @@ def filters_at(wavelength):
     return index
 
 
-def check_all_filters(found):
-    """Raise if the optics have another number of values than there are filters."""
-    sizes = {getattr(leaf, key).size for leaf in found for key in leaf.param_names}
-    if max(sizes) != len(FILTERS):
-        raise ChainError(
-            f"irdis: the chain has {max(sizes)} values per parameter, and it is not known for "
-            f"which of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
-        )
-
-
 def coating_on(date):
-    """Return "before" or "after", the coating on a date."""
+    """Return which coating the telescope's mirrors had on a date, "before" or "after"."""
     return "before" if iso_date(date, error=InstrumentError)[:10] < RECOATING else "after"
-
-
-def stated_coating(observations):
-    """Return the coating that the meta of a table tell."""
-    stated = observations.meta.get("coating")
-    if stated is not None:
-        check_choice(f"{observations.name}: coating", stated, COATINGS, InstrumentError)
-        return stated
-    date = stated_date(observations.meta, observations.name, InstrumentError)
-    if date is None:
-        raise InstrumentError(
-            f"{observations.name}: neither date nor coating in the table's meta; were the "
-            f"telescope's mirrors those 'before' or 'after' {RECOATING}?"
-        )
-    return coating_on(date)
 
 
 def coating_of(coating, date):
@@ -375,21 +350,6 @@ LAYOUT = IrdisLayout(
     centred=True,
     **side_by_side(1024, 1024, _LIT),
 )
-
-
-def layout_of(header, layout, sky_law):
-    """Return how files with such a header look; without ``NAXIS1`` they are of full frames."""
-    columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
-    if columns % 2 or min(rows, columns // 2) < 16:
-        raise InstrumentError(
-            f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, of "
-            "16 x 16 pixels and more each"
-        )
-    places = side_by_side(rows, columns // 2, _LIT) | {"tracking": sky_law.plate_law("field")}
-    if str(header.get(_ROTATION, "")).strip() == "PUPIL":
-        # the offset of the plate to the pupil is not known: it is not checked
-        places |= {"tracking": sky_law.plate_law("pupil"), "tracking_tolerance": 90.0}
-    return replace(layout, shape=(1, rows, columns), sky_law=sky_law, **places)
 
 
 class IRDIS(Instrument):
@@ -541,27 +501,50 @@ class IRDIS(Instrument):
         >>> [optic.name for optic in irdis.on_sky(irdis.published(), date="2016-05-01")][:4]
         ['parallactic', 'ut', 'altitude', 'm4']
         """
-        if wavelength is None:
-            check_all_filters(behind)
+        sizes = {getattr(leaf, key).size for leaf in behind for key in leaf.param_names}
+        if wavelength is None and max(sizes) != len(FILTERS):
+            raise ChainError(
+                f"irdis: the chain has {max(sizes)} values per parameter, and it is not known for "
+                f"which of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
+            )
         return telescope(filters_at(self.grid(wavelength)), coating_of(coating, date))
 
     def particulars(self, observations):
         """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
             return {}
-        return {"coating": stated_coating(observations)} | super().particulars(observations)
+        stated, name = observations.meta.get("coating"), observations.name
+        if stated is not None:
+            check_choice(f"{name}: coating", stated, COATINGS, InstrumentError)
+        else:
+            date = stated_date(observations.meta, name, InstrumentError)
+            if date is None:
+                raise InstrumentError(
+                    f"{name}: neither date nor coating in the table's meta; were the "
+                    f"telescope's mirrors those 'before' or 'after' {RECOATING}?"
+                )
+            stated = coating_on(date)
+        return {"coating": stated} | super().particulars(observations)
 
-    @staticmethod
-    def coating_on(date):
-        """Return which coating the telescope's mirrors had on a date, "before" or "after"."""
-        return coating_on(date)
+    coating_on = staticmethod(coating_on)
 
     def configured(self, header):
         """Return the instrument with the filter and the shape of a file."""
         # a new one: the registry hands out instances that others may hold
-        one = type(self)()
+        one, law = type(self)(), self.sky_law
         one.wavelength = np.atleast_1d(_BANDS[_filter(_Header(0, header))])
-        one.files = layout_of(header, self.files, self.sky_law)
+        # without NAXIS1 they are of full frames
+        columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
+        if columns % 2 or min(rows, columns // 2) < 16:
+            raise InstrumentError(
+                f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, "
+                "of 16 x 16 pixels and more each"
+            )
+        places = side_by_side(rows, columns // 2, _LIT) | {"tracking": law.plate_law("field")}
+        if str(header.get(_ROTATION, "")).strip() == "PUPIL":
+            # the offset of the plate to the pupil is not known: it is not checked
+            places |= {"tracking": law.plate_law("pupil"), "tracking_tolerance": 90.0}
+        one.files = replace(self.files, shape=(1, rows, columns), sky_law=law, **places)
         return one
 
     def mode_header(self, wavelength):

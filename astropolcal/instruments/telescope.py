@@ -302,21 +302,16 @@ def two_layer_plate(**settings):
     )
 
 
-def polarizer():
-    """Return the polarizer of the calibration unit, which passes -Q."""
-    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **misaligned(90))
-
-
-def fold_mirror(size):
-    """Return the mirror that polarizes the lamp where the polarizer is out."""
-    return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))
-
-
 def entrance(source, grid, star, target, m3, mirror=tertiary_mirror):
     """Return what stands before the half-wave plate: source, and for a star the telescope."""
     if source in STARS:
         return [star_source(source, grid, star, target), *telescope(mirror(m3, grid))]
-    return [polarizer() if source == "polarized" else fold_mirror(grid.size)]
+    if source == "polarized":
+        name = "calibration_polarizer"
+        # it passes -Q
+        return [optics.LinearPolarizer(theta=90 * u.deg, name=name, **misaligned(90))]
+    # what polarizes the lamp where the polarizer is out
+    return [mounted(optics.Diattenuator(diattenuation=np.zeros(grid.size), name="fold_mirror"))]
 
 
 #: Bins of equal resolving power, as the cubes of CHARIS have them.

@@ -23,6 +23,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import telescope as subaru
+from astropolcal.instruments.base import SubaruPolarimeter
 from astropolcal.instruments.layout import (
     COMMON,
     EM_EXCESS_NOISE,
@@ -30,7 +31,6 @@ from astropolcal.instruments.layout import (
     ReadOut,
     side_by_side,
 )
-from astropolcal.instruments.polarimeter import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 from astropolcal.units import wavelengths_of
@@ -139,23 +139,6 @@ def layout_of(header):
     # raw frames of a filter: a cube of exposures in one state
     places = side_by_side(side, side, _LIT) | {"stacked": not multiband}
     return replace(LAYOUT, keywords=keywords, shape=shape, **places)
-
-
-def mode_header(wavelength):
-    """Return the keywords of the mode that has slices of these wavelengths."""
-    known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
-    known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
-    known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
-    wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
-    for header, names in known:
-        own = _wavelengths(names).value
-        if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
-            return header
-    raise InstrumentError(
-        f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; allowed "
-        f"are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or without the "
-        "first"
-    )
 
 
 def _wavelengths(names):
@@ -357,7 +340,19 @@ class VAMPIRES(SubaruPolarimeter):
 
     def mode_header(self, wavelength):
         """Return mode and filter in the headers of cubes of these wavelengths."""
-        return mode_header(wavelength)
+        known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
+        known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
+        known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
+        wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
+        for header, names in known:
+            own = _wavelengths(names).value
+            if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
+                return header
+        raise InstrumentError(
+            f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; "
+            f"allowed are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or "
+            "without the first"
+        )
 
     def optics_of(self, header):
         """Return whether the liquid crystal was in the beam, where the header tells."""

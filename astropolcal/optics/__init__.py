@@ -7,78 +7,17 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.core import Optic
-from astropolcal.optics.mirrors import KMirror, MetalMirror, ParityFlip, PowerLawMirror
-from astropolcal.optics.modulated import (
-    DriftRetarder,
-    DriftRotator,
-    FerroelectricLiquidCrystal,
-    FluxGain,
-    FrameOptic,
-    HarmonicGain,
-    HarmonicRetarder,
-    HarmonicRotator,
-    PolarizedBackground,
-    StateAnalyser,
-    StateRetarder,
-    StrayLight,
-)
-from astropolcal.optics.perturbations import MuellerElement, Perturbation
-from astropolcal.optics.polarizers import (
-    BeamGain,
-    Depolarizer,
-    Diattenuator,
-    DiattenuatorRetarder,
-    LinearPolarizer,
-    VectorDiattenuator,
-    WollastonPrism,
-)
+from astropolcal.optics import core, mirrors, modulated, perturbations, polarizers, sources
+from astropolcal.optics.core import *
+from astropolcal.optics.mirrors import *
+from astropolcal.optics.modulated import *
+from astropolcal.optics.perturbations import *
+from astropolcal.optics.polarizers import *
 from astropolcal.optics.positions import COORDINATES
-from astropolcal.optics.retarders import (
-    EllipticalRetarder,
-    LinearRetarder,
-    Rotator,
-    TwoLayerWaveplate,
-)
-from astropolcal.optics.sources import Light, PolarizedSource, StarSource
+from astropolcal.optics.sources import *
 
-__all__ = [
-    "COORDINATES",
-    "OPTICS",
-    "BeamGain",
-    "Depolarizer",
-    "Diattenuator",
-    "DiattenuatorRetarder",
-    "DriftRetarder",
-    "DriftRotator",
-    "EllipticalRetarder",
-    "FerroelectricLiquidCrystal",
-    "FluxGain",
-    "FrameOptic",
-    "HarmonicGain",
-    "HarmonicRetarder",
-    "HarmonicRotator",
-    "KMirror",
-    "Light",
-    "LinearPolarizer",
-    "LinearRetarder",
-    "MetalMirror",
-    "MuellerElement",
-    "Optic",
-    "ParityFlip",
-    "Perturbation",
-    "PolarizedBackground",
-    "PolarizedSource",
-    "PowerLawMirror",
-    "Rotator",
-    "StarSource",
-    "StateAnalyser",
-    "StateRetarder",
-    "StrayLight",
-    "TwoLayerWaveplate",
-    "VectorDiattenuator",
-    "WollastonPrism",
-]
+_PARTS = (core, mirrors, modulated, perturbations, polarizers, sources)
+__all__ = ["COORDINATES", "OPTICS", *sorted(name for part in _PARTS for name in part.__all__)]
 
 #: Every optic by class name: all classes above but the two bases, and light, which meets no other.
 OPTICS = {

@@ -409,8 +409,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         ParameterError, WavelengthRangeError
             If a wavelength is needed and missing, or out of a law's range.
         """
-        dispersion, angle, values = self._resolve(wavelength, position)
-        return self._oriented(dispersion, angle, values)
+        return self._oriented(*self._resolve(wavelength, position))
 
     def mueller_derivatives(self, wavelength=None, position=None):
         """
@@ -433,7 +432,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """
         found = self._resolve(wavelength, position)
         rates = self._rates_at(wavelength, self._places_at(position))
-        derivatives = self._oriented_derivatives(*found, rates)
+        derivatives = self._oriented_derivatives(self._oriented(*found), *found, rates)
         return {
             key: self._per_unit(key, value)
             for key, value in zip(self.param_names, derivatives, strict=True)
@@ -544,10 +543,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         matrix = self._matrix(dispersion, *values)
         return _rotation_matrix(angle) if self.rotates_frame else _rotate(matrix, angle)
 
-    def _oriented_derivatives(self, dispersion, angle, values, rates=()):
-        """Return the derivative to theta, then to each other parameter and coefficient."""
+    def _oriented_derivatives(self, matrix, dispersion, angle, values, rates=()):
+        """Return those of `_oriented` to theta, then to each other parameter and coefficient."""
         # a rotator of the frame is T(theta) alone, with no T(-theta) behind it
-        matrix = self._oriented(dispersion, angle, values)
         found = [turn(matrix) if self.rotates_frame else rotation_generator(matrix)]
         found += [_rotate(slope, angle) for slope in self._derivatives(dispersion, *values)]
         return found + [found[i] * np.asarray(rate)[..., None, None] for i, rate in rates]

@@ -10,7 +10,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.mueller import inverse, plane, turned
 from astropolcal.optics._modelling import ScalarParameters
 from astropolcal.optics.positions import COORDINATES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
@@ -145,7 +144,7 @@ class Curve(ScalarParameters):
 
     def evaluate(self, x, *parameters):
         """Return the values at ``x``; without units numbers are in the units of the curve."""
-        values = self._values(self._at(x), self._canonical(parameters))
+        values = self._values(self._found_at(x, parameters))
         return values.reshape(np.shape(x)) / canonical_factor(self._unit)
 
     @property
@@ -154,7 +153,7 @@ class Curve(ScalarParameters):
         return None if self.has_tied else self._fit_deriv
 
     def _fit_deriv(self, x, *parameters):
-        slopes = self._slopes(self._at(x), self._canonical(parameters))
+        slopes = self._slopes(self._found_at(x, parameters))
         out, scale = np.zeros((len(parameters), np.size(x))), canonical_factor(self._unit)
         for plan, own in zip(self._plan, slopes, strict=True):
             for (place, factor), slope in zip(plan, own, strict=True):
@@ -162,13 +161,19 @@ class Curve(ScalarParameters):
                     out[place] = slope * (factor / scale)
         return out
 
-    def _canonical(self, parameters):
-        """Return the canonical values of each optic, the same object for the same parameters."""
+    def _found_at(self, x, parameters):
+        """Return what is made of an input and values; a fitter asks twice at the same point."""
+        x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
+        x, memo = x.ravel(), self._memo
+        # as np.array_equal, in a fifth of its time
+        if "x" not in memo or memo["x"].shape != x.shape or not (memo["x"] == x).all():
+            memo.clear()
+            memo |= {"x": np.array(x, dtype=float), "place": self._located(x)}
         # astropy calls with arrays of one, with or without unit, fitters with numbers
         numbers = [getattr(value, "value", value) for value in parameters]
         numbers = [value.item() if hasattr(value, "item") else value for value in numbers]
-        known, values = self._memo.get("values", (None, None))
-        if known != numbers:
+        # arrays are no parameters of the curve, and may be others next time
+        if self._several or memo.get("numbers") != numbers:
             values = [
                 [
                     factor * (getattr(optic, key).value if place is None else numbers[place])
@@ -176,9 +181,8 @@ class Curve(ScalarParameters):
                 ]
                 for optic, plan in zip(self._optics, self._plan, strict=True)
             ]
-            # arrays are no parameters of the curve, and may be others next time
-            self._memo["values"] = (None if self._several else numbers), values
-        return values
+            memo |= {"found": self._found(memo["place"], values), "numbers": numbers}
+        return memo["found"]
 
     def _values_at(self, wavelength, values):
         """Return the values of each optic at the wavelengths, where some have several."""
@@ -190,25 +194,6 @@ class Curve(ScalarParameters):
             theta = optic.canonical_values()[: len(optic.param_names) - len(own)]
             full = optic.values_at(wavelength, [np.asarray(value) for value in (*theta, *own)])
             found.append(full[len(theta) :])
-        return found
-
-    def _once(self, make, place, values):
-        """Return what is made of an input and values; a fitter asks twice at the same point."""
-        there, then, found = self._memo.get(make.__name__, (None, None, None))
-        if there is not place or then is not values:
-            found = make(place, values)
-            self._memo[make.__name__] = place, values, found
-        return found
-
-    def _at(self, x):
-        """Return what depends on the input alone."""
-        x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
-        x = x.ravel()
-        known, found = self._memo.get("inputs", (None, None))
-        # as np.array_equal, in a fifth of its time
-        if known is None or known.shape != x.shape or not (known == x).all():
-            found = self._located(x)
-            self._memo["inputs"] = np.array(x, dtype=float), found
         return found
 
 
@@ -234,11 +219,11 @@ class LawCurve(Curve):
         slopes = [float(key == self._law) for key in optic.own_names]
         return own[optic.own_names.index(self._law)], slopes
 
-    def _values(self, place, values):
-        return self._once(self._found, place, values)[0] + np.zeros(place[0].shape)
+    def _values(self, found):
+        return found[0] + np.zeros(self._memo["x"].shape)
 
-    def _slopes(self, place, values):
-        return [self._once(self._found, place, values)[1]]
+    def _slopes(self, found):
+        return [found[1]]
 
 
 class LightCurve(Curve):
@@ -299,43 +284,31 @@ class LightCurve(Curve):
             for optic, shift in zip(self._optics, shifts, strict=True)
         ]
 
-    def _beams(self, place, values):
+    def _found(self, place, values):
         """Return of each beam what happens at its optics, and the light that leaves them."""
         return [self._beam(arm, place, values) for arm in self._arms]
 
     def _beam(self, arm, place, values):
         wavelength, places = place
-        light = np.zeros((1, 1, 4))
-        light[..., self._element[1]] = 1.0
-        steps = []
+        steps, light = [], np.eye(4)[self._element[1]]
         values = self._values_at(wavelength, values)
         for optic, (dispersion, shift), (theta, *own) in zip(arm, places, values, strict=True):
-            dispersion, angle = optic._moved(dispersion, theta, shift)
-            # an angle against a stage is an array, whatever its values
-            phase = np.exp(-2j * angle) if np.size(angle) > 1 or angle else None
-            back = inverse(phase)
-            entered = turned(light, phase)
-            if optic.rotates_frame:
-                light, matrix = entered, None
-            else:
-                matrix = optic._matrix(dispersion, *own)
-                left = _act(matrix, entered)
-                light = turned(left, back)
-                entered = entered, left
-            steps.append((optic, (phase, back), matrix, entered, dispersion, own))
+            known = *optic._moved(dispersion, theta, shift), own
+            matrix = optic._oriented(*known)
+            steps.append((optic, known, matrix, light))
+            light = (matrix @ light[..., None])[..., 0]
         return steps, light
 
-    def _values(self, place, values):
-        found = [self._flux(light) for _, light in self._once(self._beams, place, values)]
+    def _values(self, beams):
+        found = [self._flux(light) for _, light in beams]
         return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
 
     def _flux(self, light):
         """Return what is measured of the light, (k, 1, n), as observables take it."""
-        shape, flux = (self._frames, self._memo["inputs"][0].size), light[..., self._element[0]]
+        shape, flux = (self._frames, self._memo["x"].size), light[..., self._element[0]]
         return (flux if flux.shape == shape else np.broadcast_to(flux, shape))[:, None]
 
-    def _slopes(self, place, values):
-        beams = self._once(self._beams, place, values)
+    def _slopes(self, beams):
         if self._observable is None:
             return self._slopes_of_beam(beams[0][0])
         found = [self._flux(light) for _, light in beams]
@@ -351,35 +324,9 @@ class LightCurve(Curve):
 
     def _slopes_of_beam(self, steps):
         """Return the derivatives of the flux of a beam, (k, n)."""
-        row = np.zeros((1, 1, 4))
-        row[..., self._element[0]] = 1.0
-        found = []
-        for optic, (phase, back), matrix, entered, dispersion, own in reversed(steps):
-            if optic.rotates_frame:
-                slopes = [_turning(row, entered)]
-                row = turned(row, back)
-            else:
-                entered, left = entered
-                row = turned(row, phase)
-                inward = _act(np.swapaxes(matrix, -2, -1), row)
-                slopes = [
-                    # T(-theta) M T(theta) by theta, and M by the other parameters
-                    _turning(inward, entered) - _turning(row, left),
-                    *(
-                        np.einsum("...i,...i", row, _act(slope, entered))
-                        for slope in optic._derivatives(dispersion, *own)
-                    ),
-                ]
-                row = turned(inward, back) if len(found) + 1 < len(steps) else None
-            found.append(slopes)
+        row, found = np.eye(4)[[self._element[0]]], []
+        for optic, known, matrix, light in reversed(steps):
+            slopes = optic._oriented_derivatives(matrix, *known)
+            found.append([(row @ slope @ light[..., None])[..., 0, 0] for slope in slopes])
+            row = row @ matrix
         return found[::-1]
-
-
-def _act(matrix, light):
-    # np.dot takes a quarter of the time of a product of three dimensions
-    return np.dot(light, matrix.T) if matrix.ndim == 2 else (matrix @ light[..., None])[..., 0]
-
-
-def _turning(row, light):
-    """Return row times the derivative of T(theta) to theta, at theta = 0, times light."""
-    return 2 * (plane(row).conjugate() * plane(light)).imag

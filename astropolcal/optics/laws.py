@@ -97,8 +97,7 @@ class Law:
             value = lam if name == "wavelength" else places[name]
             shifted = value - self.since if name == "time" else value
             # angles of stages are radian, all else is a number in its unit already
-            angle = name not in COORDINATES and name != "wavelength"
-            found.append(np.rad2deg(shifted) if angle else shifted)
+            found.append(np.rad2deg(shifted) if input_unit(name) is u.deg else shifted)
         return found
 
     def _evaluated(self, inputs, numbers):
@@ -143,9 +142,8 @@ def shown(name, value):
     """Return an input of a law as text with its unit."""
     if name == "time":
         return iso_date(f"{value:.5f}")
-    unit = PLACES.get(name)
-    if name not in COORDINATES:
-        value, unit = np.rad2deg(value), u.deg
+    unit = input_unit(name)
+    value = np.rad2deg(value) if unit is u.deg else value
     return f"{value:.4g} {unit or ''}".strip()
 
 

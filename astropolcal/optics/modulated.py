@@ -32,8 +32,7 @@ from astropolcal.mueller import (
 )
 from astropolcal.optics._modelling import Setting, phase
 from astropolcal.optics.core import Optic
-from astropolcal.optics.polarizers import BEAMS, _BeamOptic
-from astropolcal.optics.retarders import EllipticalRetarder
+from astropolcal.optics.polarizers import BEAMS, EllipticalRetarder, _BeamOptic
 from astropolcal.units import positive_number
 
 __all__ = [

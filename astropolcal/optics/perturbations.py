@@ -9,7 +9,6 @@ change with the wavelength, a function f of the frame, and one of the generators
 """
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 from astropy.modeling import Parameter
@@ -46,7 +45,6 @@ GENERATORS = {
 }
 
 
-@dataclass(frozen=True)
 class Dependence:
     """
     How a perturbation depends on the frame, by a text.
@@ -59,30 +57,21 @@ class Dependence:
     dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset only.
     """
 
-    text: str
-
-    def __post_init__(self):
-        if not isinstance(self.text, str) or not _FORMS.fullmatch(self.text):
+    def __init__(self, text):
+        if not isinstance(text, str) or not _FORMS.fullmatch(text):
             raise ParameterError(
-                f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
+                f"dependence = {text!r}; allowed are constant, time, time2, step:FRAME, "
                 "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
                 "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME after it"
             )
-
-    @property
-    def parts(self):
-        """The words of the text between its colons, without a dataset after it."""
-        return split_run(self.text)[0].split(":")
-
-    @property
-    def run(self):
-        """Name of the one dataset in which it is, None where it is in all."""
-        return split_run(self.text)[1]
-
-    @property
-    def kind(self):
-        """The first word of the text."""
-        return self.parts[0]
+        self.text = text
+        #: Name of the one dataset in which it is, None where it is in all.
+        self.run = split_run(text)[1]
+        #: The words of the text between its colons, without a dataset after it; the first one.
+        self.parts = split_run(text)[0].split(":")
+        self.kind = self.parts[0]
+        #: Number of functions of the frame: two for a harmonic, else one.
+        self.count = 2 if self.kind == "harmonic" else 1
 
     @property
     def driver(self):
@@ -94,11 +83,6 @@ class Dependence:
         if self.kind in ("direction", "move"):
             return f"{self.parts[1]}_{self.kind}"
         return "frame" if self.kind in ("step", "frame") else "sequence"
-
-    @property
-    def count(self):
-        """Number of functions of the frame: two for a harmonic, else one."""
-        return 2 if self.kind == "harmonic" else 1
 
     def waves(self, position):
         """Return the functions at positions of the driver (canonical), shape (count, ...)."""

@@ -240,7 +240,7 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
 
 
 def telescope_optics(calibration):
-    """Return the optics of a calibrated telescope, from the sky on; None if there are none."""
+    """Return the optics of a calibrated telescope, from the sky on; empty if there are none."""
     for chain in calibration.chains:
         outer, _ = split_chain(chain)
         # upstream of the turning of the sky stands the star itself, which is no telescope
@@ -248,7 +248,7 @@ def telescope_optics(calibration):
         start = next(turns, None)
         if start is not None:
             return outer[start:]
-    return None
+    return []
 
 
 def told_beam(headers, instrument, labels=None):

@@ -15,8 +15,8 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
 from astropolcal.pipeline.headers import date_of, days_of
+from astropolcal.pipeline.history import courses
 from astropolcal.pipeline.library import Library
-from astropolcal.pipeline.timeline import courses
 from astropolcal.words import counted, listed
 
 __all__ = ["health"]

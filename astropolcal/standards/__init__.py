@@ -9,22 +9,9 @@ polarization of a star is known. `SerkowskiLaw` is the wavelength dependence of 
 polarization as an astropy model.
 """
 
-from astropolcal.standards.law import SerkowskiLaw, whittet_width
-from astropolcal.standards.priors import StandardStar, catalogue, get, names
-from astropolcal.standards.visibility import (
-    observability,
-    search,
-    telescope_information,
-)
+from astropolcal.standards import law, priors, visibility
+from astropolcal.standards.law import *
+from astropolcal.standards.priors import *
+from astropolcal.standards.visibility import *
 
-__all__ = [
-    "SerkowskiLaw",
-    "StandardStar",
-    "catalogue",
-    "get",
-    "names",
-    "observability",
-    "search",
-    "telescope_information",
-    "whittet_width",
-]
+__all__ = sorted([*law.__all__, *priors.__all__, *visibility.__all__])

@@ -13,7 +13,7 @@ from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.telescope import fold_mirror, misaligned, polarizer
+from astropolcal.instruments.telescope import entrance, misaligned
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 GRID = [0.6, 0.7, 0.8] * u.um
@@ -312,11 +312,13 @@ def test_optics_behind_the_plate_are_those_of_the_lamp():
 def test_calibration_unit_of_subaru():
     assert misaligned(90)["bounds"]["theta"] == (85, 95)
     assert misaligned(0, most=20) == {"fixed": {"theta": False}, "bounds": {"theta": (-20, 20)}}
+    (polarizer,) = entrance("polarized", GRID, "star", None, "free")
     # light of minus Q, half of it
-    np.testing.assert_allclose(polarizer().mueller() @ [1, 0, 0, 0], [0.5, -0.5, 0, 0], atol=1e-15)
-    assert not polarizer().theta.fixed
-    assert fold_mirror(4).diattenuation.shape == (4,)
-    np.testing.assert_array_equal(fold_mirror(2).mueller(GRID[:2]), [np.eye(4)] * 2)
+    np.testing.assert_allclose(polarizer.mueller() @ [1, 0, 0, 0], [0.5, -0.5, 0, 0], atol=1e-15)
+    assert not polarizer.theta.fixed
+    (mirror,) = entrance("unpolarized", GRID[:2], "star", None, "free")
+    assert mirror.diattenuation.shape == (2,)
+    np.testing.assert_array_equal(mirror.mueller(GRID[:2]), [np.eye(4)] * 2)
 
 
 def test_both_polarimeters_of_subaru_have_one_unit_and_one_site():
