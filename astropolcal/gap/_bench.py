@@ -11,11 +11,11 @@ what a detector does; nothing of its fits, noise, derivatives and evidence.
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
+from itertools import product
 
 import astropy.units as u
 import numpy as np
 from numpy.polynomial.legendre import legval, legvander
-from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from astropolcal import instruments
@@ -195,16 +195,15 @@ class Bench:
             yield pair[0].name, found[0][1], both.reshape(2, *missing, *both.shape[1:])
 
     def path(self, dataset, positions=None, values=None, kicks=(), optics=None, skip=None):
-        """Return the fluxes (2, F, W) of a dataset; kicks are (place, action, exponent)."""
+        """Return the fluxes (2, F, W) of a dataset; kicks are places with a Mueller matrix each."""
         n_frames, n_waves = self.clean[dataset].n_frames, len(self.micron)
         light = np.broadcast_to([1.0, 0, 0, 0], (2, n_frames, n_waves, 4))[..., None]
         for name, angle, matrices in self._matrices(dataset, positions, values, optics):
             light = light if name == skip else matrices @ light
-            for place, action, exponent in kicks:
+            for place, kick in kicks:
                 if name == self.anchor(dataset, place):
                     turn = angle if place.startswith("in:") else 0.0
-                    kick = expm(exponent[..., None, None] * rotate(ACTIONS[action], turn * u.rad))
-                    light = kick @ light
+                    light = rotate(kick, turn * u.rad) @ light
         return light[..., 0, 0]
 
     def anchor(self, dataset, place):
@@ -378,49 +377,26 @@ class Bench:
         flux = [self.path(d, values=values) for d in n_sets]
         names = dict.fromkeys([*self.dependences, *([own] if own else [])])
         waves = {name: [self.waves(d, name) for d in n_sets] for name in names}
-        sweeps = [list(self._matrices(d, values=values)) for d in n_sets]
-        for place in self.places:
-            ends = [self._ends(d, sweeps[d], place) for d in n_sets]
-            for kind, action in ACTIONS.items():
-                slopes = [
-                    np.einsum("bfwi,...fwij,fwj->bfw", row, rotate(action, turn * u.rad), light)
-                    for row, light, turn in ends
-                ]
-                for name, wave in waves.items():
-                    yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave, law)
-        gain = [f * np.array([1, -1])[:, None, None] for f in flux]
-        for name, wave in waves.items():
-            yield f"detector/gain/{name}", self._columns(flux, gain, wave, law)
+        for place, (kind, action) in product(self.places, ACTIONS.items()):
+            # to first order what is added to the light goes on as all light does
+            slopes = [self.path(d, values=values, kicks=[(place, action)]) for d in n_sets]
+            for name, wave in waves.items():
+                yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave, law)
         still = waves["constant"]
-        for kind, name in DETECTOR.items():
+        for kind in ("gain", *DETECTOR):
             slopes = [self.glow(d, kind, flux[d]) for d in n_sets]
-            beams = np.ones((1, 2)) if kind == "background" else np.eye(2)
-            columns = [
-                self._columns(flux, [s * on[:, None, None] for s in slopes], still, law)
-                for on in beams
-            ]
-            yield f"detector/{kind}/{name}", np.concatenate(columns)
-
-    def _ends(self, dataset, sweep, place):
-        """Return the analyser rows and the light of a place, and the turn of its frame."""
-        names = [name for name, _, _ in sweep]
-        cut = names.index(self.anchor(dataset, place)) + 1
-        light = np.array([1.0, 0, 0, 0])[:, None]
-        for _, _, matrices in sweep[:cut]:
-            light = matrices[0] @ light
-        row = np.array([[1.0, 0, 0, 0]])
-        for _, _, matrices in sweep[cut:][::-1]:
-            row = row @ matrices
-        shape = (self.clean[dataset].n_frames, len(self.micron), 4)
-        turn = np.asarray(sweep[cut - 1][1] if place.startswith("in:") else 0.0)
-        turn = turn.reshape((1,) * (2 - turn.ndim) + turn.shape)
-        row = np.broadcast_to(row[..., 0, :], (2, *shape))
-        return row, np.broadcast_to(light[..., 0], shape), turn
+            beams = np.ones((1, 2)) if kind in ("gain", "background") else np.eye(2)
+            own = [[s * on[:, None, None] for s in slopes] for on in beams]
+            for name, wave in waves.items() if kind == "gain" else [(DETECTOR[kind], still)]:
+                columns = [self._columns(flux, one, wave, law) for one in own]
+                yield f"detector/{kind}/{name}", np.concatenate(columns)
 
     def glow(self, dataset, kind, flux):
         """Return what is added to the fluxes (2, F, W) for a coefficient of one."""
         bright = self.bright[dataset]
         usual = np.median(bright)
+        if kind == "gain":
+            return flux * np.array([1, -1])[:, None, None]
         if kind == "nonlinearity":
             return flux**2 * bright / usual
         if kind == "persistence":

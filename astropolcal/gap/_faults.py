@@ -2,6 +2,7 @@
 """The faults of a challenge: of any optic, of the detector, of single frames, and stranger ones."""
 
 import numpy as np
+from scipy.linalg import expm
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap._bench import ACTIONS, DETECTOR
@@ -39,6 +40,8 @@ class Fault:
     def __init__(self, bench, told):
         self.bench, self.told = bench, dict(told)
         self.amplitude, self.largest, self.snr = 1e-3, _LARGEST, 0.0
+        # the stage whose angle is wrong
+        self._turned = None
         getattr(self, f"_draw_{self.told['type']}")(bench.rng)
 
     def _choose(self, key, among):
@@ -97,23 +100,26 @@ class Fault:
 
     def _draw_frame(self, rng):
         sets, what = self.bench.clean, self._choose("what", _FRAME_FAULTS)
-        name = self._choose("dataset", [clean.name for clean in sets])
-        self.place = [clean.name for clean in sets].index(name)
+        names = [clean.name for clean in sets]
+        self.place = names.index(self._choose("dataset", names))
         n = sets[self.place].n_frames
         frame = self._choose("frame", range(n))
         self.told["with"] = None
         if what == "exchanged":
             # with one that was taken soon after or before
             self.told["with"] = (frame + int(rng.integers(1, 6))) % n
-        self.largest, self.sign = _LARGEST_SHARE, rng.choice((-1, 1))
+        self._turned = what.split()[0] if "angle" in what else None
+        self.largest, self._shapes = _LARGEST_SHARE, [np.zeros(clean.n_frames) for clean in sets]
+        self._shapes[self.place][frame] = rng.choice((-1, 1))
 
     def _draw_mechanism(self, rng):
         what = self._choose("what", _MECHANISMS)
         self.largest = _LARGEST_SHARE
         self.stage = str(rng.choice(("hwp", "derotator")))
+        angles = [clean.position(self.stage)[:, None] for clean in self.bench.clean]
         if what in _MOVED:
-            self.told["stage"] = self.stage
-            self._angles = [self._wandering(clean, rng) for clean in self.bench.clean]
+            self.told["stage"] = self._turned = self.stage
+            self._shapes = [self._wandering(clean, rng) for clean in self.bench.clean]
         elif what == "ghost":
             self.told["optic"] = self.stage
         elif what == "course":
@@ -124,19 +130,14 @@ class Fault:
         elif what in ("stray light", "crosstalk"):
             # of a reflection that turns with a stage
             self.told["stage"], phase = self.stage, rng.uniform(0, 2 * np.pi)
-            turn, law = rng.choice((1, 2)), self._smooth(rng)
-            angles = [clean.position(self.stage) for clean in self.bench.clean]
-            self._shapes = [
-                (1 + np.cos(turn * angle[:, None] + phase)) * (1 + 0.3 * law) / 2
-                for angle in angles
-            ]
+            turn, law = rng.choice((1, 2)), 1 + 0.3 * self._smooth(rng)
+            self._shapes = [(1 + np.cos(turn * angle + phase)) * law / 2 for angle in angles]
         elif what == "fringes":
             self.told["place"] = str(rng.choice(self.bench.places[2:]))
             self.told["kind"] = str(rng.choice(("retardance_h", "diattenuation_h")))
             phase = 2 * np.pi * rng.uniform(2, 5) * np.linspace(0, 1, len(self.bench.micron))
             turn = rng.choice((1, 2, 4))
-            angles = [clean.position(self.stage) for clean in self.bench.clean]
-            self._shapes = [np.cos(phase + turn * angle[:, None]) for angle in angles]
+            self._shapes = [np.cos(phase + turn * angle) for angle in angles]
 
     def _smooth(self, rng):
         """Return a random law in wavelength; its largest value is one."""
@@ -179,8 +180,7 @@ class Fault:
             raise GapError(f"effect = {name!r} has no place on the bench")
         effect = fitting[rng.integers(len(fitting))]
         self.told["effect"] = effect.name
-        middle = [np.median(o.flux_right + o.flux_left) / 2 for o in bench.clean]
-        context = Context(bench.micron, float(np.median(middle)))
+        context = Context.of(bench.micron, bench.clean)
         self._edit = lambda chains: effect.edit([chain.copy() for chain in chains], context)
         edit = self._edit(bench.chains)
         free = FreeParameters(edit.chains, len(bench.micron), edit.ties)
@@ -197,23 +197,20 @@ class Fault:
 
     # ---- what it does ---------------------------------------------------------------------------
 
+    def _size(self, dataset):
+        return self.amplitude * self._shapes[dataset]
+
     def kicks(self, dataset):
-        """Return place, kind and exponents (F, W) of small Mueller matrices."""
+        """Return places, and a small Mueller matrix for each frame and wavelength there."""
         told = self.told
         if told["type"] == "cell" or told.get("what") in ("fringes", "course"):
-            return [(told["place"], told["kind"], self.amplitude * self._shapes[dataset])]
+            exponent = self._size(dataset)[..., None, None]
+            return [(told["place"], expm(exponent * ACTIONS[told["kind"]]))]
         return []
 
     def moves(self, dataset):
         """Return errors of the angles of stages, radian."""
-        told = self.told
-        if told.get("what") in _MOVED:
-            return {told["stage"]: self.amplitude * self._angles[dataset]}
-        if told["type"] != "frame" or dataset != self.place or "angle" not in told["what"]:
-            return {}
-        error = np.zeros(self.bench.clean[dataset].n_frames)
-        error[told["frame"]] = self.sign * self.amplitude
-        return {told["what"].split()[0]: error}
+        return {self._turned: self._size(dataset)} if self._turned else {}
 
     def edited(self, chains):
         """Return chains with an effect of the library in them, the same without one."""
@@ -230,30 +227,25 @@ class Fault:
 
     def detected(self, dataset, flux):
         """Return the fluxes (2, F, W) as the detector gives them."""
-        told, bench = self.told, self.bench
+        told, bench, what = self.told, self.bench, self.told.get("what")
         if told["type"] == "detector":
-            size = self.amplitude * self._shapes[dataset]
-            if told["kind"] == "gain":
-                return flux * np.stack([1 + size, 1 - size])
             beams = {"right": (1, 0), "left": (0, 1)}.get(told.get("beam"), (1, 1))
-            added = size * bench.glow(dataset, told["kind"], flux)
+            added = self._size(dataset) * bench.glow(dataset, told["kind"], flux)
             return flux + np.array(beams)[:, None, None] * added
-        if told.get("what") == "ghost":
+        if what == "ghost":
             return flux + self.amplitude * bench.path(dataset, skip=told["optic"])
-        if told.get("what") in ("stray light", "crosstalk"):
+        if what in ("stray light", "crosstalk"):
             # light of nowhere in one beam, or of each beam in the other
-            stray = told["what"] == "stray light"
+            stray = what == "stray light"
             other = np.array([np.median(flux), 0])[:, None, None] if stray else flux[::-1]
-            return flux + self.amplitude * self._shapes[dataset] * other
-        if told["type"] != "frame" or dataset != self.place or "angle" in told["what"]:
-            return flux
-        flux, i, j = flux.copy(), told["frame"], told["with"]
-        if told["what"] == "one beam":
-            flux[0, i] *= 1 + self.sign * self.amplitude
-            return flux
-        seen = flux * bench.bright[dataset]
-        seen[:, [i, j]] = seen[:, [j, i]]
-        return seen / bench.bright[dataset]
+            return flux + self._size(dataset) * other
+        if what == "one beam":
+            return flux * np.stack([1 + self._size(dataset), np.ones(flux.shape[1])])[..., None]
+        if what == "exchanged" and dataset == self.place:
+            seen, pair = flux * bench.bright[dataset], [told["frame"], told["with"]]
+            seen[:, pair] = seen[:, pair[::-1]]
+            return seen / bench.bright[dataset]
+        return flux
 
 
 def _law(parameter, n, rng):

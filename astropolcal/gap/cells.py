@@ -200,8 +200,7 @@ class Place:
 
     def insert(self, chain, optic):
         """Return the chain with an optic at the place, which has to have its frame."""
-        where = {"before": self.before} if self.after is None else {"after": self.after}
-        return insert_optic(chain, optic, **where)
+        return insert_optic(chain, optic, after=self.after, before=self.before)
 
 
 _KEEPS = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)

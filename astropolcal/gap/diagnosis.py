@@ -341,7 +341,7 @@ def _with_noise_of(base, selection):
     problem = GapProblem(base.chains, base.observations)
     problem.settle_noise(base.fit.coefficients)
     fresh = Model(problem, base.fit, base.added)
-    recipes = [(group.best.effect, group.best.context) for group in selection.groups]
+    recipes = [group.best.recipe for group in selection.groups]
     beside = fresh.with_effects(recipes, like=selection.model, steps=0)
     beside.problem.settle_noise(beside.fit.coefficients)
     # the noise is that of the channels, which both share
@@ -365,7 +365,7 @@ def _nested(base, smooth, groups, say, cells):
         fold = Model(fold.problem, fold.problem.fit(base.fit.coefficients), base.added)
         # as the whole was chosen: other groups may contradict a cause
         chosen = select(fold, smooth, groups, lambda line: None, cells=cells)
-        recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
+        recipes = [group.best.recipe for group in chosen.groups]
         whole = base.with_effects(recipes, like=chosen.model, steps=0)
         start = chosen.model.start_of(whole.problem)
         found.append(whole.problem.differences(start.coefficients))

@@ -15,6 +15,7 @@ from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, few_frames, search_branches
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
+from astropolcal.calibration.system import at_wavelengths
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
@@ -526,22 +527,13 @@ def thinned(chains, observations, count):
         return list(chains), list(observations)
     keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
     few = [_at(o, grid[keep]) for o in observations]
-    return [join([_picked(leaf, keep, len(grid)) for leaf in leaves(c)]) for c in chains], few
+    return [at_wavelengths(c, np.eye(len(grid))[keep], len(grid)) for c in chains], few
 
 
 def _at(observations, wavelength):
     own = observations.wavelength.to_value(u.um)
     near = np.isclose(own[:, None], wavelength, rtol=1e-4).any(axis=1)
     return observations.select_bins(near)
-
-
-def _picked(leaf, keep, size):
-    values = {}
-    for key in leaf.param_names:
-        parameter = getattr(leaf, key)
-        if parameter.shape == (size,):
-            values[key] = parameter.value[keep] * (parameter.unit or 1)
-    return leaf.with_parameters(**values) if values else leaf.copy()
 
 
 def off_extremum(problem, start, parameters):

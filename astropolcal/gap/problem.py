@@ -45,13 +45,9 @@ _GUESSES, _ROUNDING = 10, 1e-13
 
 def _exact(chain):
     """Return the optics of a chain, copies where a standard star is held as it is known."""
-    found = leaves(chain)
-    if not any(isinstance(leaf, StarSource) for leaf in found):
-        return Train(found)
-    found = [leaf.copy() if isinstance(leaf, StarSource) else leaf for leaf in found]
-    for leaf in found:
-        for key in leaf.param_names if isinstance(leaf, StarSource) else ():
-            parameter = getattr(leaf, key)
+    found = [leaf.copy() if isinstance(leaf, StarSource) else leaf for leaf in leaves(chain)]
+    for star in (leaf for leaf in found if isinstance(leaf, StarSource)):
+        for parameter in (getattr(star, key) for key in star.param_names):
             if parameter.prior is not None:
                 parameter.fixed, parameter.prior = True, None
     return Train(found)
@@ -290,17 +286,14 @@ class GapProblem:
         """Measure noise and lamp from residuals, those of frames ``without``, (F,) each, aside."""
         q = self.start if coefficients is None else coefficients
         without = without or [None] * len(self.datasets)
-        for channel, dataset, residual, out in zip(
-            self.channels, self.datasets, self.differences(q), without, strict=True
-        ):
+        seen = zip(self.channels, self.datasets, self.differences(q), without, strict=True)
+        found = []
+        for channel, dataset, residual, out in seen:
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
             told = noise(channel, residual, angles, dataset.bins, out)
             channel.set_noise(told, residual, saturating)
-        found = [
-            expected_fluxes(channel, dataset.forward(self.vector(q)))
-            for channel, dataset in zip(self.channels, self.datasets, strict=True)
-        ]
+            found.append(expected_fluxes(channel, dataset.forward(self.vector(q))))
         self.fluxes, self.flickering = map(list, zip(*found, strict=True))
 
     # ---- fit -------------------------------------------------------------------------
