@@ -19,8 +19,7 @@ import numpy as np
 from astropolcal import calibrate
 from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.system import inverse_rows
-from astropolcal.gap._bench import Bench, Setup
-from astropolcal.gap._faults import Fault
+from astropolcal.gap._bench import Bench, Fault, Setup
 from astropolcal.mueller import rotate
 
 TABLE = Path(__file__).with_name("unlisted_effects.csv")

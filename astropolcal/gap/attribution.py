@@ -364,11 +364,11 @@ def _named(probes, effects, temper, degree="default", others=()):
 def _columns(model, effects, degree):
     """Return the derivatives to named effects, all at zero in the same chains, by name."""
     known = model.__dict__.setdefault("_named_columns", {})
-    waiting = {e.name: e for e in effects if (e.name, degree) not in known}
-    waiting = [effect for name, effect in waiting.items() if name not in model.added]
+    asked = {e.name: e for e in effects if e.name not in model.added}
+    waiting = [effect for name, effect in asked.items() if (name, degree) not in known]
     context = replace(model.context, degree=degree)
     while waiting:
-        edited, parameters, ties, later = list(model.held_chains), {}, {}, []
+        edited, parameters, ties, laws, later = list(model.held_chains), {}, {}, {}, []
         for effect in waiting:
             # what is absent does nothing to another, but two may free the same parameter, or
             # exchange the same optic
@@ -381,10 +381,9 @@ def _columns(model, effects, degree):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-        laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
-        problem = GapProblem(
-            edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
-        )
+            laws |= edit.laws
+        how = {"ties": ties, "laws": laws, "like": model.problem}
+        problem = GapProblem(edited, model.observations, **how, copy=False)
         jacobian = problem.jacobian(problem.start) if problem.size else None
         for name, own in parameters.items():
             known[name, degree] = _columns_of(problem, jacobian, own)

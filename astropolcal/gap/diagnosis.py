@@ -434,22 +434,13 @@ def _exchanged(nominal, base, improved, exchanged, total):
 
 def _cause(group, improved, explained, before=None, after=None):
     (best, share), *aliases = group.members
-    return Cause(
-        effect=best.effect,
-        cell=best.cell,
-        probability=group.probability,
-        aliases=aliases,
-        share=share,
-        p_value=best.p_value,
-        explained=float(explained),
-        before=before,
-        after=after,
-        physical=best.name not in improved.added
-        or (improved.is_physical(best.name) and improved.keeps_polarization(best.name)),
-        evidence=float(best.evidence),
-        stability=group.stability,
-        by_dataset=group.by_dataset,
-    )
+    told = {key: getattr(best, key) for key in ("effect", "cell", "p_value", "evidence")}
+    told |= {key: getattr(group, key) for key in ("probability", "stability", "by_dataset")}
+    told |= {"aliases": aliases, "share": share, "before": before, "after": after}
+    if best.name in improved.added:
+        possible = improved.is_physical(best.name)
+        told["physical"] = possible and improved.keeps_polarization(best.name)
+    return Cause(**told, explained=float(explained))
 
 
 def _verdict(causes, nominal, left_p, courses):

@@ -221,22 +221,15 @@ class Model:
         return self._linear(names) if names else self.linear
 
     def _linear(self, names):
-        problem, q = self.problem, self.fit.coefficients
-        kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
-        residual = self.residual
-        absent = problem.coefficients(problem._absent())
-        for parameter in (p for name in names for p in self.added[name]):
-            where = problem.slices.get(parameter.name)
-            if where is not None:
-                kept[where] = False
-                residual = residual + jacobian[:, where] @ (q - absent)[where]
+        problem, q, jacobian = self.problem, self.fit.coefficients, self.jacobian
+        out = problem.numbers(p.name for name in names for p in self.added[name])
+        kept = ~np.isin(np.arange(problem.size), out)
+        residual = self.residual + jacobian[:, out] @ (q - problem.absent)[out]
         # what is known beforehand is one more row of data for each of these parameters
         known = np.flatnonzero(kept & (problem.tight > 0))
         table, target = jacobian, residual
         if known.size:
-            rows = np.zeros((known.size, problem.size))
-            rows[np.arange(known.size), known] = problem.tight[known]
-            table = np.concatenate([jacobian, rows])
+            table = np.concatenate([jacobian, np.diag(problem.tight)[known]])
             target = np.concatenate([residual, -(q - problem.centre)[known] * problem.tight[known]])
         tangent = problem.tangent(q, table, kept)
         left = target - tangent @ (tangent.T @ target)
@@ -526,14 +519,10 @@ def thinned(chains, observations, count):
     if count >= len(grid):
         return list(chains), list(observations)
     keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
-    few = [_at(o, grid[keep]) for o in observations]
+    own = [o.wavelength.to_value(u.um)[:, None] for o in observations]
+    near = [np.isclose(one, grid[keep], rtol=1e-4).any(axis=1) for one in own]
+    few = [o.select_bins(bins) for o, bins in zip(observations, near, strict=True)]
     return [at_wavelengths(c, np.eye(len(grid))[keep], len(grid)) for c in chains], few
-
-
-def _at(observations, wavelength):
-    own = observations.wavelength.to_value(u.um)
-    near = np.isclose(own[:, None], wavelength, rtol=1e-4).any(axis=1)
-    return observations.select_bins(near)
 
 
 def off_extremum(problem, start, parameters):

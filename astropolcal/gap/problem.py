@@ -127,7 +127,9 @@ class GapProblem:
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
-        self.centre = np.where(self.tight > 0, self.coefficients(self._absent()), 0.0)
+        #: Coefficients at which every effect is absent, about which the priors are.
+        self.absent = self.coefficients(self._absent())
+        self.centre = np.where(self.tight > 0, self.absent, 0.0)
 
     def _with_flicker(self, i, chain):
         """Return a dataset as its differences see it, None where that is no matter."""
@@ -198,6 +200,12 @@ class GapProblem:
             low[where] = np.maximum(low[where], absent[where] - room)
             high[where] = np.minimum(high[where], absent[where] + room)
         return low, high
+
+    def numbers(self, names):
+        """Return the numbers of the coefficients of parameters, of those that are free."""
+        every = np.arange(self.size)
+        known = [every[self.slices[name]] for name in names if name in self.slices]
+        return np.concatenate([every[:0], *known])
 
     def coefficients(self, vector):
         """Return the coefficients whose laws are nearest to canonical values, see `vector`."""
