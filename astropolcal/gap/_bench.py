@@ -160,19 +160,11 @@ class Bench:
         out = [name for name in instrument.optional_optics if name not in known]
         # so that a table of it needs no more to be read
         meta = {"instrument": instrument.name, **instrument.meta_without(out)}
-        self.clean = [
-            simulate(
-                chain,
-                wavelength,
-                frames,
-                flux=flux,
-                lamp=self._lamp(len(frames)),
-                noise=False,
-                name=source,
-                meta=meta | {"source": source},
-            )
-            for chain, source in zip(self.chains, setup.sources, strict=True)
-        ]
+        self.clean = []
+        for chain, source in zip(self.chains, setup.sources, strict=True):
+            light = {"flux": flux, "lamp": self._lamp(len(frames)), "noise": False}
+            named = {"name": source, "meta": meta | {"source": source}}
+            self.clean.append(simulate(chain, wavelength, frames, **light, **named))
         self.optics = [self.split(chain) for chain in self.chains]
         every = (leaf for chain in self.chains for leaf in leaves(chain))
         self._known = {leaf.name: leaf.canonical_values() for leaf in every}

@@ -339,16 +339,13 @@ def _named(probes, effects, temper, degree="default", others=()):
     """Return the candidates of named effects; ``others`` will be asked for, too."""
     model, found = probes.model, []
     chains = model.trains
-    fitting, others = (
-        [
-            e
-            for e in some
-            if e.name not in probes.own
-            and not e.absorbed_by
-            and (e.name in model.added or e.applies(chains))
-        ]
-        for some in (effects, others)
-    )
+
+    def fits(effect):
+        if effect.name in probes.own or effect.absorbed_by:
+            return False
+        return effect.name in model.added or effect.applies(chains)
+
+    fitting, others = ([*filter(fits, some)] for some in (effects, others))
     law = replace(model.context, degree=degree)
     for effect in fitting:
         spectrum = _bent_name(probes, effect, law) if effect.name not in model.added else None
@@ -413,7 +410,8 @@ def _slopes_of(probes, effect, effects, degree):
 
 def _spectrum_of(probes, slopes):
     """Return what derivatives say of an effect, see `_spectra`, None where it does nothing."""
-    if slopes is None:
+    # a law may have no freedom left
+    if slopes is None or not slopes.size:
         return None
     seen = probes.tangent.T @ slopes
     gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual

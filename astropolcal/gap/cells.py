@@ -410,13 +410,10 @@ class Probes:
         chains, where = [], {}
         for chain in self.model.held_chains:
             for place in places(chain):
-                probe = optics.LinearRetarder(
-                    retardance=0 * u.deg,
-                    theta=place.theta * u.rad,
-                    mount=place.mount,
-                    name=_PROBE + place.name,
-                    fixed={"theta": True, "retardance": True},
-                )
+                frame = {"theta": place.theta * u.rad, "mount": place.mount}
+                held = {"fixed": {"theta": True, "retardance": True}}
+                name = _PROBE + place.name
+                probe = optics.LinearRetarder(retardance=0 * u.deg, name=name, **frame, **held)
                 chain = place.insert(chain, probe)
                 where.setdefault(place.name, None)
             chains.append(chain)

@@ -406,20 +406,15 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
-    return Diagnosis(
-        verdict=_verdict(causes, nominal, improved.p_value, selection.courses),
-        nominal=nominal,
-        improved=improved,
-        causes=causes,
-        scan=selection.scan,
-        held_out=[h for h in selection.history if h is not None],
-        gap_p_value=nominal.p_value,
-        remainder_p_value=improved.p_value,
-        seconds=time.perf_counter() - started,
-        frames=frames,
-        settings={"unlisted": selection.unlisted},
-        courses=selection.courses,
-    )
+    verdict = _verdict(causes, nominal, improved.p_value, selection.courses)
+    models = {"nominal": nominal, "gap_p_value": nominal.p_value}
+    models |= {"improved": improved, "remainder_p_value": improved.p_value}
+    told = [errors for errors in selection.history if errors is not None]
+    found = Diagnosis(verdict, causes=causes, scan=selection.scan, held_out=told, **models)
+    found.frames, found.courses = frames, selection.courses
+    found.settings["unlisted"] = selection.unlisted
+    found.seconds = time.perf_counter() - started
+    return found
 
 
 def _exchanged(nominal, base, improved, exchanged, total):

@@ -110,13 +110,8 @@ class Model:
     def of_dataset(self, i):
         """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
-        noise = SimpleNamespace(
-            fluxes=[mine.fluxes[i]],
-            flickering=[mine.flickering[i]],
-            channels=[mine.channels[i]],
-            waves=None,
-            known=mine.known,
-        )
+        own = {key: [getattr(mine, key)[i]] for key in ("fluxes", "flickering", "channels")}
+        noise = SimpleNamespace(**own, waves=None, known=mine.known)
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
 
@@ -279,11 +274,8 @@ class Model:
                 return False
         # bounds that an effect sets itself may be those of no optic; a perturbation is a change of
         # an optic, and need not be one by itself
-        matrices = [
-            leaf.mueller(self.problem.wavelength * u.um)
-            for leaf in self._carriers(name)
-            if not isinstance(leaf, Perturbation)
-        ]
+        carriers = [leaf for leaf in self._carriers(name) if not isinstance(leaf, Perturbation)]
+        matrices = [leaf.mueller(self.problem.wavelength * u.um) for leaf in carriers]
         return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
     def keeps_polarization(self, name):

@@ -577,14 +577,8 @@ def _hypothetical(base, exposure):
     if exposure.states:
         states = np.tile(exposure.states, exposure.n_angles)
         frames[MODULATOR] = (states == STATES[1]).astype(float)
-    return simulate(
-        join(chain),
-        problem.wavelength * u.um,
-        frames,
-        flux=exposure.lamp * measured / usual,
-        noise=False,
-        name=f"next {base.observations[i].name}",
-    )
+    how = {"flux": exposure.lamp * measured / usual, "name": f"next {base.observations[i].name}"}
+    return simulate(join(chain), problem.wavelength * u.um, frames, noise=False, **how)
 
 
 def _middle(channel, values):

@@ -101,16 +101,10 @@ class GapProblem:
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
         single = all(each.single_beam for each in observations)
-        self.measurement = Measurement(
-            chains,
-            observations,
-            observable="intensity" if single else "normalized_single_difference",
-            ties=ties,
-            copy=copy,
-            positions=[
-                _positions(*each) for each in zip(chains, observations, self.fluxes, strict=True)
-            ],
-        )
+        how = {"observable": "intensity" if single else "normalized_single_difference"}
+        seen = zip(chains, observations, self.fluxes, strict=True)
+        how |= {"ties": ties, "copy": copy, "positions": [_positions(*each) for each in seen]}
+        self.measurement = Measurement(chains, observations, **how)
         self.datasets = self.measurement.datasets
         self._flickering = [self._with_flicker(*each) for each in enumerate(chains)]
         self.free = self.measurement.free
@@ -178,18 +172,15 @@ class GapProblem:
         self._blocks = blocks
         self.low, self.high = np.array(self.low), np.array(self.high)
         self.size = start
-        self._walls = self._as_walls(walls)
-
-    def _as_walls(self, laws):
-        """Return the bounds of the values of laws: rows, and what each is at most."""
+        # the bounds of the values of laws: rows, and what each is at most
         rows, ends = [np.empty((0, self.size))], [np.empty(0)]
-        for where, block, bounds in laws:
+        for where, block, bounds in walls:
             for sign, end in zip((-1, 1), bounds, strict=True):
                 if np.isfinite(end):
                     rows.append(np.zeros((len(block), self.size)))
                     rows[-1][:, where] = sign * block
                     ends.append(np.full(len(block), sign * end))
-        return np.concatenate(rows), np.concatenate(ends)
+        self._walls = np.concatenate(rows), np.concatenate(ends)
 
     def _bounds(self):
         """Return the bounds of the flat vector: those of the chains, or narrower limits."""

@@ -475,14 +475,10 @@ def with_causes(model, **options):
     held = {p.name for parameters in model.added.values() for p in parameters}
     ties = model.problem.ties
     held |= {name for name, tie in ties.items() if tie.source in held}
-    return calibrate(
-        model.chains,
-        model.observations,
-        fix=dict.fromkeys(sorted(held)) or None,
-        search=False if held else None,
-        ties={name: tie for name, tie in ties.items() if name not in held},
-        **options,
-    )
+    if held:
+        options |= {"fix": dict.fromkeys(sorted(held)), "search": False}
+    free = {name: tie for name, tie in ties.items() if name not in held}
+    return calibrate(model.chains, model.observations, ties=free, **options)
 
 
 def _median(values):

@@ -207,14 +207,10 @@ class BandAverage(Effect):
         """Return the chain with a depolarizer along the axis of the retarder."""
         retarder = self.retarder(roles)
         slopes, axis = retardance_slopes(retarder), _steep_axis(retarder)
+        theta = retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad
+        how = {"theta": theta, "mount": retarder.mount, "name": label}
         keep = np.ones(len(slopes))
-        optic = optics.Depolarizer(
-            retained_u=keep,
-            retained_v=keep,
-            theta=retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad,
-            mount=retarder.mount,
-            name=label,
-        )
+        optic = optics.Depolarizer(retained_u=keep, retained_v=keep, **how)
         # along the axis nothing is lost
         optic.retained_q.fixed, optic.theta.bounds = True, (None, None)
         tie = {f"{label}.retained_v": Tie(f"{label}.retained_u")}
