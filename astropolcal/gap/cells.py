@@ -12,7 +12,6 @@ kind: light and rows of all places come from one forward and one backward sweep.
 from collections import Counter
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import astropy.units as u
 import numpy as np
@@ -329,15 +328,6 @@ class Probes:
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
         self.lamp_by_frame = [_frames_first(c.nuisance, c.shape[1:]) for c, _ in parts]
-
-    @cached_property
-    def cells(self):
-        """All cells, in the order of places, kinds and dependences."""
-        return [
-            Cell(place, kind, dependence)
-            for place, kind in self.slopes
-            for dependence in self.dependences_of(place, kind)
-        ]
 
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""

@@ -11,6 +11,7 @@ that the true cause is expected to have.
 
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import product
 
 import astropy.units as u
 import numpy as np
@@ -189,16 +190,13 @@ def _run(i, train, observations):
 
 def _turned(run, name):
     """Return the run with each of its stages turned, those of the sky aside."""
-    return [
-        replace(
-            run,
-            positions=run.positions | {stage: angles + by},
-            what=f"the run of {name} with {stage} turned by {by:g} deg",
-        )
-        for stage, angles in run.positions.items()
-        if stage not in (*_SKY, GROUP) and angles.dtype.kind == "f"
-        for by in _TURNED_BY
-    ]
+    own = {s: angles for s, angles in run.positions.items() if s not in (*_SKY, GROUP)}
+    own = {stage: angles for stage, angles in own.items() if angles.dtype.kind == "f"}
+    found = []
+    for stage, by in product(own, _TURNED_BY):
+        what = f"the run of {name} with {stage} turned by {by:g} deg"
+        found.append(replace(run, positions=run.positions | {stage: own[stage] + by}, what=what))
+    return found
 
 
 def _blocks(run):
