@@ -466,7 +466,7 @@ class Bench:
         power, last = 1.0, None
         # amplitudes at which it stands out by less, and by more
         low, high = 0.0, np.inf
-        for _ in range(_TRIES):
+        for left in reversed(range(_TRIES + 1)):
             residual, fit = self.residual([fault])
             fault.snr = float(np.linalg.norm(residual))
             if last is not None and min(fault.snr, last[1]) > 0.1:
@@ -481,12 +481,9 @@ class Bench:
                 wanted = float(np.sqrt(low * high))
             # what is exchanged is there or not, without a size
             done = wanted == fault.amplitude or fault.told.get("what") == "exchanged"
-            if done or abs(fault.snr / snr - 1) < 0.02:
+            if done or not left or abs(fault.snr / snr - 1) < 0.02:
                 return residual, fit
             last, fault.amplitude = (fault.amplitude, fault.snr), wanted
-        residual, fit = self.residual([fault])
-        fault.snr = float(np.linalg.norm(residual))
-        return residual, fit
 
 
 def _channels(flux, bright):
