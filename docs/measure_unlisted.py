@@ -15,13 +15,11 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from scipy.linalg import expm
 
 from astropolcal import calibrate
 from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.system import inverse_rows
-from astropolcal.gap._bench import ACTIONS, Bench, Setup
-from astropolcal.gap._faults import Fault
+from astropolcal.gap._bench import Bench, Fault, Setup
 from astropolcal.mueller import rotate
 
 TABLE = Path(__file__).with_name("unlisted_effects.csv")
@@ -74,12 +72,10 @@ def rows(bench, optics, kicks):
         light = light if light is None else matrices @ light
         if name == lamp:
             light = np.eye(4)
-        for place, action, exponent in kicks if light is not None else ():
+        for place, kick in kicks if light is not None else ():
             if name == bench.anchor(0, place):
                 turn = angle if place.startswith("in:") else 0.0
-                light = (
-                    expm(exponent[..., None, None] * rotate(ACTIONS[action], turn * u.rad)) @ light
-                )
+                light = rotate(kick, turn * u.rad) @ light
     return light[..., 0, :3].swapaxes(1, 2)
 
 

@@ -67,7 +67,7 @@ def test_only_names_of_other_packages_may_be_without_a_link(settings):
         ("ValueError", True),
         ("pathlib.Path", True),
         ("io.BytesIO", True),
-        ("astropolcal.gap._numbers.State", True),
+        ("astropolcal.gap._words.State", True),
         ("astropolcal.calibration.Calibration", False),
         ("numpyx.array", False),
     ]:

@@ -339,41 +339,33 @@ def _named(probes, effects, temper, degree="default", others=()):
     """Return the candidates of named effects; ``others`` will be asked for, too."""
     model, found = probes.model, []
     chains = model.trains
-    fitting, others = (
-        [
-            e
-            for e in some
-            if e.name not in probes.own
-            and not e.absorbed_by
-            and (e.name in model.added or e.applies(chains))
-        ]
-        for some in (effects, others)
-    )
-    context = None if degree == "default" else replace(model.context, degree=degree)
+
+    def fits(effect):
+        if effect.name in probes.own or effect.absorbed_by:
+            return False
+        return effect.name in model.added or effect.applies(chains)
+
+    fitting, others = ([*filter(fits, some)] for some in (effects, others))
     law = replace(model.context, degree=degree)
     for effect in fitting:
-        bent = _bent_name(probes, effect, law, temper) if effect.name not in model.added else []
-        if bent:
-            found += [replace(one, context=context) for one in bent]
-            continue
-        slopes, size = _slopes_of(probes, effect, [*fitting, *others], degree)
-        if size is None or not size.size:
-            continue
-        found += [
-            replace(one, context=context)
-            for one in _of_columns(probes, effect, slopes * size, temper)
-        ]
+        spectrum = _bent_name(probes, effect, law) if effect.name not in model.added else None
+        if spectrum is None:
+            slopes = _slopes_of(probes, effect, [*fitting, *others], degree)
+            spectrum = _spectrum_of(probes, slopes)
+        if spectrum is not None:
+            context = None if degree == "default" else law
+            found.append(_with_name(effect, model, *spectrum, temper, context))
     return found
 
 
 def _columns(model, effects, degree):
-    """Return derivatives and usual sizes of named effects, all at zero in the same chains."""
+    """Return the derivatives to named effects, all at zero in the same chains, by name."""
     known = model.__dict__.setdefault("_named_columns", {})
-    waiting = {e.name: e for e in effects if (e.name, degree) not in known}
-    waiting = [effect for name, effect in waiting.items() if name not in model.added]
+    asked = {e.name: e for e in effects if e.name not in model.added}
+    waiting = [effect for name, effect in asked.items() if (name, degree) not in known]
     context = replace(model.context, degree=degree)
     while waiting:
-        edited, parameters, ties, later = list(model.held_chains), {}, {}, []
+        edited, parameters, ties, laws, later = list(model.held_chains), {}, {}, {}, []
         for effect in waiting:
             # what is absent does nothing to another, but two may free the same parameter, or
             # exchange the same optic
@@ -386,10 +378,9 @@ def _columns(model, effects, degree):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-        laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
-        problem = GapProblem(
-            edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
-        )
+            laws |= edit.laws
+        how = {"ties": ties, "laws": laws, "like": model.problem}
+        problem = GapProblem(edited, model.observations, **how, copy=False)
         jacobian = problem.jacobian(problem.start) if problem.size else None
         for name, own in parameters.items():
             known[name, degree] = _columns_of(problem, jacobian, own)
@@ -399,74 +390,67 @@ def _columns(model, effects, degree):
 
 def _named_in(probes, effect, i, temper, context):
     """Return the candidate of a named effect in one dataset only, in a list."""
-    degree = "default" if context is None else context.degree
-    slopes, size = _slopes_of(probes, effect, [effect], degree)
-    if size is None or not size.size:
+    slopes = _slopes_of(probes, effect, [effect], "default" if context is None else context.degree)
+    if slopes is None:
         return []
     rows = probes.problem.segments[i]
     alone = np.zeros_like(slopes)
     alone[rows] = slopes[rows]
-    return _of_columns(probes, effect, alone * size, temper)
+    spectrum = _spectrum_of(probes, alone)
+    return [] if spectrum is None else [_with_name(effect, probes.model, *spectrum, temper)]
 
 
 def _slopes_of(probes, effect, effects, degree):
-    """Return the derivatives to the parameters of an effect, and their usual sizes."""
+    """Return the derivatives to the parameters of an effect, None where it has none."""
     model = probes.model
     if effect.name in model.added:
         return _columns_of(model.problem, model.jacobian, model.added[effect.name])
-    return _columns(model, effects, degree).get(effect.name, (None, None))
+    return _columns(model, effects, degree).get(effect.name)
 
 
-def _of_columns(probes, effect, scaled, temper):
-    """Return the candidate of an effect with these derivatives, of unit size, in a list."""
-    seen = probes.tangent.T @ scaled
-    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+def _spectrum_of(probes, slopes):
+    """Return what derivatives say of an effect, see `_spectra`, None where it does nothing."""
+    # a law may have no freedom left
+    if slopes is None or not slopes.size:
+        return None
+    seen = probes.tangent.T @ slopes
+    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
     values, share = (part[0] for part in _spectra(gram[None], target[None]))
-    return [_with_name(effect, probes.model, values, share, temper)] if _rank(values, 1.0) else []
+    return (values, share) if _rank(values, 1.0) else None
 
 
 def _columns_of(problem, jacobian, parameters):
-    """Return the derivatives to parameters, and their usual sizes."""
+    """Return the derivatives to parameters, each for its usual size, None where none is free."""
     parts = [(problem.slices[p.name], p) for p in parameters if p.name in problem.slices]
     if jacobian is None or not parts:
-        return None, np.empty(0)
-    rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
-    size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
-    return jacobian[:, rows], size
+        return None
+    return np.concatenate([jacobian[:, rows] * p.canonical_scale for rows, p in parts], axis=1)
 
 
-def _bent_name(probes, effect, context, temper):
-    """Return the candidate of an effect whose derivative vanishes, in a list."""
+def _bent_name(probes, effect, context):
+    """Return what second derivatives say of an effect whose first one vanishes, else None."""
     model = probes.model
     cell = effect.cell(model.trains) if probes.bends else None
     if cell is None or cell.dependence != "constant" or (cell.place, cell.kind) not in probes.bends:
-        return []
+        return None
     added = effect.edit(model.held_chains, context).parameters
     # what is freed, instead of inserted, is no perturbation behind the optic
     if len(added) != 1 or not added[0].name.startswith(effect.label):
-        return []
+        return None
     law = added[0].basis
     law = np.eye(len(probes.problem.wavelength)) if law is None else law
     bent = _bent(probes, cell.place, cell.kind, law)
     if bent is None:
-        return []
-    scale = added[0].canonical_scale
+        return None
     (values,), (share,) = _spectra(*(part[None] for part in bent))
-    values = values * scale**2
-    return [_with_name(effect, model, values, share, temper)] if _rank(values, 1.0) else []
+    values = values * added[0].canonical_scale ** 2
+    return (values, share) if _rank(values, 1.0) else None
 
 
-def _with_name(effect, model, values, share, temper):
-    cells = effect.cells(model.trains)
-    one = Candidate(
-        effect,
-        cells[0] if cells else None,
-        float(share.sum()),
-        int(_rank(values, 1.0)),
-        0.0,
-        float(np.log(NAMED)),
-        (values, share, 1.0),
-    )
+def _with_name(effect, model, values, share, temper, context=None):
+    prior, spectrum, statistic = float(np.log(NAMED)), (values, share, 1.0), float(share.sum())
+    cell, rank = effect.cell(model.trains), int(_rank(values, 1.0))
+    one = Candidate(effect, cell, statistic, rank, 0.0, prior, spectrum, context=context)
     return one.tempered(temper)
 
 

@@ -12,7 +12,6 @@ kind: light and rows of all places come from one forward and one backward sweep.
 from collections import Counter
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import astropy.units as u
 import numpy as np
@@ -216,8 +215,7 @@ class Place:
 
     def insert(self, chain, optic):
         """Return the chain with an optic at the place, which has to have its frame."""
-        where = {"before": self.before} if self.after is None else {"after": self.after}
-        return insert_optic(chain, optic, **where)
+        return insert_optic(chain, optic, after=self.after, before=self.before)
 
 
 _KEEPS = (optics.ParityFlip, optics.Rotator, optics.FrameOptic)
@@ -347,15 +345,6 @@ class Probes:
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
         self.lamp_by_frame = [_frames_first(c.nuisance, c.shape[1:]) for c, _ in parts]
 
-    @cached_property
-    def cells(self):
-        """All cells, in the order of places, kinds and dependences."""
-        return [
-            Cell(place, kind, dependence)
-            for place, kind in self.slopes
-            for dependence in self.dependences_of(place, kind)
-        ]
-
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
         if kind in DETECTED:
@@ -427,13 +416,10 @@ class Probes:
         chains, where = [], {}
         for chain in self.model.held_chains:
             for place in places(chain):
-                probe = optics.LinearRetarder(
-                    retardance=0 * u.deg,
-                    theta=place.theta * u.rad,
-                    mount=place.mount,
-                    name=_PROBE + place.name,
-                    fixed={"theta": True, "retardance": True},
-                )
+                frame = {"theta": place.theta * u.rad, "mount": place.mount}
+                held = {"fixed": {"theta": True, "retardance": True}}
+                name = _PROBE + place.name
+                probe = optics.LinearRetarder(retardance=0 * u.deg, name=name, **frame, **held)
                 chain = place.insert(chain, probe)
                 where.setdefault(place.name, None)
             chains.append(chain)

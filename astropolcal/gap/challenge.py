@@ -20,8 +20,7 @@ from astropy.table import QTable
 
 from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.files import append_line, atomic_path, understood
-from astropolcal.gap._bench import DETECTOR, Bench, Setup
-from astropolcal.gap._faults import Fault
+from astropolcal.gap._bench import DETECTOR, Bench, Fault, Setup
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.progress import shown, steps

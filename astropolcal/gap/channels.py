@@ -39,12 +39,8 @@ class Channels:
         var_right, var_left, cov = obs.variance_right.T, obs.variance_left.T, obs.covariance.T
         with np.errstate(divide="ignore", invalid="ignore"):
             self.observed = self.predicted(beams)
-            self.variance = np.stack(
-                [
-                    right**2 * var_right + left**2 * var_left + 2 * cov * right * left
-                    for right, left in self.slopes(beams)
-                ]
-            )
+            right, left = np.swapaxes(self.slopes(beams), 0, 1)
+            self.variance = right**2 * var_right + left**2 * var_left + 2 * cov * right * left
         #: Index of the channel that tells the gap, and how many channels have data.
         self.told, self.count = (1, 1) if obs.single_beam else (0, 2)
         self.groups = obs.brightness_groups if obs.single_beam else None

@@ -355,7 +355,7 @@ def _with_noise_of(base, selection):
     problem = GapProblem(base.chains, base.observations)
     problem.settle_noise(base.fit.coefficients)
     fresh = Model(problem, base.fit, base.added)
-    recipes = [(group.best.effect, group.best.context) for group in selection.groups]
+    recipes = [group.best.recipe for group in selection.groups]
     beside = fresh.with_effects(recipes, like=selection.model, steps=0)
     beside.problem.settle_noise(beside.fit.coefficients)
     # the noise is that of the channels, which both share
@@ -379,7 +379,7 @@ def _nested(base, smooth, groups, say, cells):
         fold = Model(fold.problem, fold.problem.fit(base.fit.coefficients), base.added)
         # as the whole was chosen: other groups may contradict a cause
         chosen = select(fold, smooth, groups, lambda line: None, cells=cells)
-        recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
+        recipes = [group.best.recipe for group in chosen.groups]
         whole = base.with_effects(recipes, like=chosen.model, steps=0)
         start = chosen.model.start_of(whole.problem)
         found.append(whole.problem.differences(start.coefficients))
@@ -420,20 +420,15 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
-    return Diagnosis(
-        verdict=_verdict(causes, nominal, improved.p_value, selection.courses),
-        nominal=nominal,
-        improved=improved,
-        causes=causes,
-        scan=selection.scan,
-        held_out=[h for h in selection.history if h is not None],
-        gap_p_value=nominal.p_value,
-        remainder_p_value=improved.p_value,
-        seconds=time.perf_counter() - started,
-        frames=frames,
-        settings={"unlisted": selection.unlisted},
-        courses=selection.courses,
-    )
+    verdict = _verdict(causes, nominal, improved.p_value, selection.courses)
+    models = {"nominal": nominal, "gap_p_value": nominal.p_value}
+    models |= {"improved": improved, "remainder_p_value": improved.p_value}
+    told = [errors for errors in selection.history if errors is not None]
+    found = Diagnosis(verdict, causes=causes, scan=selection.scan, held_out=told, **models)
+    found.frames, found.courses = frames, selection.courses
+    found.settings["unlisted"] = selection.unlisted
+    found.seconds = time.perf_counter() - started
+    return found
 
 
 def _exchanged(nominal, base, improved, exchanged, total):
@@ -448,22 +443,13 @@ def _exchanged(nominal, base, improved, exchanged, total):
 
 def _cause(group, improved, explained, before=None, after=None):
     (best, share), *aliases = group.members
-    return Cause(
-        effect=best.effect,
-        cell=best.cell,
-        probability=group.probability,
-        aliases=aliases,
-        share=share,
-        p_value=best.p_value,
-        explained=float(explained),
-        before=before,
-        after=after,
-        physical=best.name not in improved.added
-        or (improved.is_physical(best.name) and improved.keeps_polarization(best.name)),
-        evidence=float(best.evidence),
-        stability=group.stability,
-        by_dataset=group.by_dataset,
-    )
+    told = {key: getattr(best, key) for key in ("effect", "cell", "p_value", "evidence")}
+    told |= {key: getattr(group, key) for key in ("probability", "stability", "by_dataset")}
+    told |= {"aliases": aliases, "share": share, "before": before, "after": after}
+    if best.name in improved.added:
+        possible = improved.is_physical(best.name)
+        told["physical"] = possible and improved.keeps_polarization(best.name)
+    return Cause(**told, explained=float(explained))
 
 
 def _verdict(causes, nominal, left_p, courses):

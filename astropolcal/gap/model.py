@@ -15,6 +15,7 @@ from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, few_frames, search_branches
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
+from astropolcal.calibration.system import at_wavelengths
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
@@ -109,13 +110,8 @@ class Model:
     def of_dataset(self, i):
         """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
-        noise = SimpleNamespace(
-            fluxes=[mine.fluxes[i]],
-            flickering=[mine.flickering[i]],
-            channels=[mine.channels[i]],
-            waves=None,
-            known=mine.known,
-        )
+        own = {key: [getattr(mine, key)[i]] for key in ("fluxes", "flickering", "channels")}
+        noise = SimpleNamespace(**own, waves=None, known=mine.known)
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
 
@@ -220,22 +216,15 @@ class Model:
         return self._linear(names) if names else self.linear
 
     def _linear(self, names):
-        problem, q = self.problem, self.fit.coefficients
-        kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
-        residual = self.residual
-        absent = problem.coefficients(problem._absent())
-        for parameter in (p for name in names for p in self.added[name]):
-            where = problem.slices.get(parameter.name)
-            if where is not None:
-                kept[where] = False
-                residual = residual + jacobian[:, where] @ (q - absent)[where]
+        problem, q, jacobian = self.problem, self.fit.coefficients, self.jacobian
+        out = problem.numbers(p.name for name in names for p in self.added[name])
+        kept = ~np.isin(np.arange(problem.size), out)
+        residual = self.residual + jacobian[:, out] @ (q - problem.absent)[out]
         # what is known beforehand is one more row of data for each of these parameters
         known = np.flatnonzero(kept & (problem.tight > 0))
         table, target = jacobian, residual
         if known.size:
-            rows = np.zeros((known.size, problem.size))
-            rows[np.arange(known.size), known] = problem.tight[known]
-            table = np.concatenate([jacobian, rows])
+            table = np.concatenate([jacobian, np.diag(problem.tight)[known]])
             target = np.concatenate([residual, -(q - problem.centre)[known] * problem.tight[known]])
         tangent = problem.tangent(q, table, kept)
         left = target - tangent @ (tangent.T @ target)
@@ -285,11 +274,8 @@ class Model:
                 return False
         # bounds that an effect sets itself may be those of no optic; a perturbation is a change of
         # an optic, and need not be one by itself
-        matrices = [
-            leaf.mueller(self.problem.wavelength * u.um)
-            for leaf in self._carriers(name)
-            if not isinstance(leaf, Perturbation)
-        ]
+        carriers = [leaf for leaf in self._carriers(name) if not isinstance(leaf, Perturbation)]
+        matrices = [leaf.mueller(self.problem.wavelength * u.um) for leaf in carriers]
         return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
     def keeps_polarization(self, name):
@@ -525,23 +511,10 @@ def thinned(chains, observations, count):
     if count >= len(grid):
         return list(chains), list(observations)
     keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
-    few = [_at(o, grid[keep]) for o in observations]
-    return [join([_picked(leaf, keep, len(grid)) for leaf in leaves(c)]) for c in chains], few
-
-
-def _at(observations, wavelength):
-    own = observations.wavelength.to_value(u.um)
-    near = np.isclose(own[:, None], wavelength, rtol=1e-4).any(axis=1)
-    return observations.select_bins(near)
-
-
-def _picked(leaf, keep, size):
-    values = {}
-    for key in leaf.param_names:
-        parameter = getattr(leaf, key)
-        if parameter.shape == (size,):
-            values[key] = parameter.value[keep] * (parameter.unit or 1)
-    return leaf.with_parameters(**values) if values else leaf.copy()
+    own = [o.wavelength.to_value(u.um)[:, None] for o in observations]
+    near = [np.isclose(one, grid[keep], rtol=1e-4).any(axis=1) for one in own]
+    few = [o.select_bins(bins) for o, bins in zip(observations, near, strict=True)]
+    return [at_wavelengths(c, np.eye(len(grid))[keep], len(grid)) for c in chains], few
 
 
 def off_extremum(problem, start, parameters):

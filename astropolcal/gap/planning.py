@@ -11,6 +11,7 @@ that the true cause is expected to have.
 
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import product
 
 import astropy.units as u
 import numpy as np
@@ -189,16 +190,13 @@ def _run(i, train, observations):
 
 def _turned(run, name):
     """Return the run with each of its stages turned, those of the sky aside."""
-    return [
-        replace(
-            run,
-            positions=run.positions | {stage: angles + by},
-            what=f"the run of {name} with {stage} turned by {by:g} deg",
-        )
-        for stage, angles in run.positions.items()
-        if stage not in (*_SKY, GROUP) and angles.dtype.kind == "f"
-        for by in _TURNED_BY
-    ]
+    own = {s: angles for s, angles in run.positions.items() if s not in (*_SKY, GROUP)}
+    own = {stage: angles for stage, angles in own.items() if angles.dtype.kind == "f"}
+    found = []
+    for stage, by in product(own, _TURNED_BY):
+        what = f"the run of {name} with {stage} turned by {by:g} deg"
+        found.append(replace(run, positions=run.positions | {stage: own[stage] + by}, what=what))
+    return found
 
 
 def _blocks(run):
@@ -310,21 +308,18 @@ def _telling_apart(forecast, group, foreseen):
     titles = {e.name: e.title + f" ({e.name})" * (e.kind != "cell") for e, _ in recipes}
     hypotheses = forecast.foreseen(names)
     now = float(np.sum(weights**2) / weights.sum())
-    best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
     timed = any(Dependence(effect.dependence).kind in _TIMED for effect, _ in recipes)
-    for exposure, columns in foreseen:
-        if timed and not exposure.what:
-            continue
+    found = []
+    for exposure, columns in (each for each in foreseen if each[0].what or not timed):
         factors, sigmas = odds(hypotheses, columns.T @ columns)
         after = expected(weights, factors)
         clear = np.log10(1 + np.min(sigmas + sigmas.max() * np.eye(len(names))))
         worth = after + _CHANGE * (clear - exposure.effort) - _FRAME * exposure.n_frames
-        if worth > value:
-            best, value = (exposure, after, factors, sigmas), worth
+        found.append((worth, exposure, after, factors, sigmas))
     first = titles[names[0]]
-    if best is not None:
-        exposure, after, factors, sigmas = best
+    if found:
+        _, exposure, after, factors, sigmas = max(found, key=lambda one: one[0])
         other = [j for j in range(1, len(names)) if min(factors[0, j], factors[j, 0]) > _APART]
         if other and after - now > _CLEARLY * (1 - now):
             gain = min(min(sigmas[0, j], sigmas[j, 0]) for j in other)
@@ -418,20 +413,17 @@ class Forecast:
         edited = model.edited(*(wanted[name] for name in wanted if name not in model.added))
         self.model, self.chains, self.problem = model, edited.trains, edited.problem
         problem, q = edited.problem, edited.fit.coefficients
-        every, tight = np.arange(problem.size), problem.tight**2
-        #: Coefficients of each cause that has a place.
-        self.own = {}
+        tight, own = problem.tight**2, {}
         for name, parameters in edited.added.items():
-            rows = [np.empty(0, dtype=int)]
-            for one in (p for p in parameters if p.name in problem.slices):
-                rows.append(every[problem.slices[one.name]])
-                tight[rows[-1]] = 1 / (_WIDE * one.canonical_scale) ** 2
-            if sum(map(len, rows)):
-                self.own[name] = np.concatenate(rows)
+            own[name] = problem.numbers(p.name for p in parameters)
+            for one in parameters:
+                tight[problem.numbers([one.name])] = 1 / (_WIDE * one.canonical_scale) ** 2
+        #: Coefficients of each cause that has a place.
+        self.own = {name: numbers for name, numbers in own.items() if numbers.size}
         slopes, self.residual = problem.jacobian(q), problem.residual(q)
         self.causes = np.zeros(problem.size, dtype=bool)
-        for own in self.own.values():
-            self.causes[own] = True
+        for numbers in self.own.values():
+            self.causes[numbers] = True
         at_bound = (q <= problem.low + _AT_BOUND) | (q >= problem.high - _AT_BOUND)
         #: Coefficients that the data may move.
         self.live = self.causes | ~at_bound
@@ -440,7 +432,7 @@ class Forecast:
         self.slopes = slopes / self.scale
         self.gram = self.slopes.T @ self.slopes + np.diag(tight / self.scale**2 + _HOLD)
         #: By how much each coefficient is off the value at which its cause is absent.
-        self.value = (q - problem.coefficients(problem._absent())) * self.scale
+        self.value = (q - problem.absent) * self.scale
 
     def foreseen(self, names):
         """
@@ -481,10 +473,9 @@ class Forecast:
         _settle_noise(problem.channels[0], self.model.problem.channels[exposure.dataset], exposure)
         slopes = problem.jacobian(problem.start)[problem.segments[0]]
         out = np.zeros((len(slopes), self.problem.size))
-        for name, where in problem.slices.items():
-            # a parameter that the set-up alone has is none of those fitted
-            if name in self.problem.slices:
-                out[:, self.problem.slices[name]] = slopes[:, where]
+        # a parameter that the set-up alone has is none of those fitted
+        shared = [name for name in problem.slices if name in self.problem.slices]
+        out[:, self.problem.numbers(shared)] = slopes[:, problem.numbers(shared)]
         return out / self.scale
 
     def open_directions(self):
@@ -503,9 +494,7 @@ class Forecast:
         change of it shows, and how many directions show at all.
         """
         rows, known, unknown, scale = directions
-        names = self.model.problem.slices
-        every = np.arange(self.problem.size)
-        order = np.concatenate([every[self.problem.slices[n]] for n in names])
+        order = self.problem.numbers(self.model.problem.slices)
         table = np.concatenate([rows, columns[:, order] * self.scale[order] / scale])
         basis = orthonormal(table @ known)
         left = table @ unknown
@@ -586,14 +575,8 @@ def _hypothetical(base, exposure):
     if exposure.states:
         states = np.tile(exposure.states, exposure.n_angles)
         frames[MODULATOR] = (states == STATES[1]).astype(float)
-    return simulate(
-        join(chain),
-        problem.wavelength * u.um,
-        frames,
-        flux=exposure.lamp * measured / usual,
-        noise=False,
-        name=f"next {base.observations[i].name}",
-    )
+    how = {"flux": exposure.lamp * measured / usual, "name": f"next {base.observations[i].name}"}
+    return simulate(join(chain), problem.wavelength * u.um, frames, noise=False, **how)
 
 
 def _middle(channel, values):

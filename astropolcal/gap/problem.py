@@ -45,13 +45,9 @@ _GUESSES, _ROUNDING = 10, 1e-13
 
 def _exact(chain):
     """Return the optics of a chain, copies where a standard star is held as it is known."""
-    found = leaves(chain)
-    if not any(isinstance(leaf, StarSource) for leaf in found):
-        return Train(found)
-    found = [leaf.copy() if isinstance(leaf, StarSource) else leaf for leaf in found]
-    for leaf in found:
-        for key in leaf.param_names if isinstance(leaf, StarSource) else ():
-            parameter = getattr(leaf, key)
+    found = [leaf.copy() if isinstance(leaf, StarSource) else leaf for leaf in leaves(chain)]
+    for star in (leaf for leaf in found if isinstance(leaf, StarSource)):
+        for parameter in (getattr(star, key) for key in star.param_names):
             if parameter.prior is not None:
                 parameter.fixed, parameter.prior = True, None
     return Train(found)
@@ -105,16 +101,10 @@ class GapProblem:
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
         single = all(each.single_beam for each in observations)
-        self.measurement = Measurement(
-            chains,
-            observations,
-            observable="intensity" if single else "normalized_single_difference",
-            ties=ties,
-            copy=copy,
-            positions=[
-                _positions(*each) for each in zip(chains, observations, self.fluxes, strict=True)
-            ],
-        )
+        how = {"observable": "intensity" if single else "normalized_single_difference"}
+        seen = zip(chains, observations, self.fluxes, strict=True)
+        how |= {"ties": ties, "copy": copy, "positions": [_positions(*each) for each in seen]}
+        self.measurement = Measurement(chains, observations, **how)
         self.datasets = self.measurement.datasets
         self._flickering = [self._with_flicker(*each) for each in enumerate(chains)]
         self.free = self.measurement.free
@@ -131,7 +121,9 @@ class GapProblem:
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
-        self.centre = np.where(self.tight > 0, self.coefficients(self._absent()), 0.0)
+        #: Coefficients at which every effect is absent, about which the priors are.
+        self.absent = self.coefficients(self._absent())
+        self.centre = np.where(self.tight > 0, self.absent, 0.0)
 
     def _with_flicker(self, i, chain):
         """Return a dataset as its differences see it, None where that is no matter."""
@@ -180,18 +172,15 @@ class GapProblem:
         self._blocks = blocks
         self.low, self.high = np.array(self.low), np.array(self.high)
         self.size = start
-        self._walls = self._as_walls(walls)
-
-    def _as_walls(self, laws):
-        """Return the bounds of the values of laws: rows, and what each is at most."""
+        # the bounds of the values of laws: rows, and what each is at most
         rows, ends = [np.empty((0, self.size))], [np.empty(0)]
-        for where, block, bounds in laws:
+        for where, block, bounds in walls:
             for sign, end in zip((-1, 1), bounds, strict=True):
                 if np.isfinite(end):
                     rows.append(np.zeros((len(block), self.size)))
                     rows[-1][:, where] = sign * block
                     ends.append(np.full(len(block), sign * end))
-        return np.concatenate(rows), np.concatenate(ends)
+        self._walls = np.concatenate(rows), np.concatenate(ends)
 
     def _bounds(self):
         """Return the bounds of the flat vector: those of the chains, or narrower limits."""
@@ -202,6 +191,12 @@ class GapProblem:
             low[where] = np.maximum(low[where], absent[where] - room)
             high[where] = np.minimum(high[where], absent[where] + room)
         return low, high
+
+    def numbers(self, names):
+        """Return the numbers of the coefficients of parameters, of those that are free."""
+        every = np.arange(self.size)
+        known = [every[self.slices[name]] for name in names if name in self.slices]
+        return np.concatenate([every[:0], *known])
 
     def coefficients(self, vector):
         """Return the coefficients whose laws are nearest to canonical values, see `vector`."""
@@ -290,17 +285,14 @@ class GapProblem:
         """Measure noise and lamp from residuals, those of frames ``without``, (F,) each, aside."""
         q = self.start if coefficients is None else coefficients
         without = without or [None] * len(self.datasets)
-        for channel, dataset, residual, out in zip(
-            self.channels, self.datasets, self.differences(q), without, strict=True
-        ):
+        seen = zip(self.channels, self.datasets, self.differences(q), without, strict=True)
+        found = []
+        for channel, dataset, residual, out in seen:
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
             told = noise(channel, residual, angles, dataset.bins, out)
             channel.set_noise(told, residual, saturating)
-        found = [
-            expected_fluxes(channel, dataset.forward(self.vector(q)))
-            for channel, dataset in zip(self.channels, self.datasets, strict=True)
-        ]
+            found.append(expected_fluxes(channel, dataset.forward(self.vector(q))))
         self.fluxes, self.flickering = map(list, zip(*found, strict=True))
 
     # ---- fit -------------------------------------------------------------------------

@@ -182,7 +182,7 @@ def stability(model, groups, temper):
     effect is asked for where the evidence for its size by Schwarz (1978) is above that for none.
     """
     problem, q = model.problem, model.fit.coefficients
-    absent, jacobian = problem.coefficients(problem._absent()), model.jacobian
+    absent, jacobian = problem.absent, model.jacobian
     found = {name: [] for name in model.added}
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
@@ -197,9 +197,8 @@ def stability(model, groups, temper):
         size = (q - absent) * scale + inverse @ (target + pull)
         n = rows.sum() if inside else len(rows) - rows.sum()
         for name, parameters in model.added.items():
-            own = [problem.slices[p.name] for p in parameters if p.name in problem.slices]
-            if own:
-                own = np.concatenate([np.arange(s.start, s.stop) for s in own])
+            own = problem.numbers(p.name for p in parameters)
+            if own.size:
                 covariance = temper * inverse[np.ix_(own, own)]
                 strength = size[own] @ np.linalg.pinv(covariance, hermitian=True) @ size[own]
                 found[name].append(strength > own.size * np.log(max(n, 2)))

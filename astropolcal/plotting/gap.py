@@ -6,9 +6,9 @@ import textwrap
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._numbers import ANGLES, Fitted
 from astropolcal.gap._words import is_determined, labels, share, shortened
 from astropolcal.gap.cells import places
+from astropolcal.gap.report import ANGLES, Fitted
 from astropolcal.gap.residuals import frame_blocks
 from astropolcal.optics.perturbations import GENERATORS, Dependence
 from astropolcal.plotting import _style as st

@@ -174,7 +174,7 @@ def _write(diagnosis, content, arguments, instrument):
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
     if arguments.save and not content["misread"]:
-        from astropolcal.gap._numbers import with_causes
+        from astropolcal.gap.report import with_causes
 
         calibration = with_causes(diagnosis.improved, instrument=instrument)
         calibration.write(arguments.save, overwrite=True)

@@ -32,7 +32,8 @@ def spread(probes):
     waves = [name for name in probes.waves if name not in steps[1:]]
     pairs = [pair for pair in probes.slopes if pair[1] in GENERATORS]
     cells = [Cell(*pair, waves[i % len(waves)]) for i, pair in enumerate(pairs)]
-    return cells + [cell for cell in probes.cells if cell.kind not in GENERATORS]
+    detected = [key for key in probes.slopes if key[1] not in GENERATORS]
+    return cells + [Cell(*key, text) for key in detected for text in probes.dependences_of(*key)]
 
 
 def differences(model, cell):

@@ -13,8 +13,7 @@ from scipy.linalg import expm
 from astropolcal.chain import system_mueller, with_beam
 from astropolcal.exceptions import GapError
 from astropolcal.gap import challenge
-from astropolcal.gap._bench import ACTIONS, Bench
-from astropolcal.gap._faults import _COURSES, _MECHANISMS, Fault
+from astropolcal.gap._bench import _COURSES, _MECHANISMS, ACTIONS, Bench, Fault
 from astropolcal.gap.challenge import (
     KINDS,
     ChallengeResult,

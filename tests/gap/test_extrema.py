@@ -10,10 +10,10 @@ from gap_data import chain, clean_model, observed
 from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves
 from astropolcal.gap import diagnose
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.report import Fitted
 from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

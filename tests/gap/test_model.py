@@ -10,12 +10,11 @@ import pytest
 
 from astropolcal import instruments
 from astropolcal.gap import diagnose
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.challenge import make_challenge
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import Fit, GapProblem
-from astropolcal.gap.report import to_dict
+from astropolcal.gap.report import Fitted, to_dict
 from astropolcal.simulation import simulate
 
 DIATTENUATOR = "static_diattenuator"

@@ -13,9 +13,9 @@ from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise import estimates
 from astropolcal.exceptions import FitError
 from astropolcal.gap import channels
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.report import Fitted
 from astropolcal.observations import Observations
 
 W, F = 11, 60

@@ -6,10 +6,10 @@ import gap_data as data
 import numpy as np
 import pytest
 
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.channels import Channels, orthonormal
 from astropolcal.gap.effects import get_effect
 from astropolcal.gap.problem import GapProblem, law_basis
+from astropolcal.gap.report import Fitted
 from astropolcal.measurement import Measurement
 
 

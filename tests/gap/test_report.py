@@ -18,13 +18,20 @@ from matplotlib.figure import Figure
 from astropolcal import Observations, calibrate, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import diagnose, get_effect
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
-from astropolcal.gap.report import MAP, _about_frames, causes_table, summary, to_dict, write_html
+from astropolcal.gap.report import (
+    MAP,
+    Fitted,
+    _about_frames,
+    causes_table,
+    summary,
+    to_dict,
+    write_html,
+)
 from astropolcal.simulation import simulate
 
 SIZE = 0.012

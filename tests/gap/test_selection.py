@@ -12,14 +12,13 @@ import pytest
 from astropy.table import Table
 from gap_setups import SETUPS
 
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.attribution import Candidate, Scan
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.challenge import make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS
 from astropolcal.gap.model import nominal_model
-from astropolcal.gap.report import to_dict
+from astropolcal.gap.report import Fitted, to_dict
 from astropolcal.gap.selection import _members, select
 from astropolcal.gap.shrinkage import frame_groups
 

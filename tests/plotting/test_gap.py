@@ -15,11 +15,11 @@ from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, diagnose, get_effect
-from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import Effect, EffectParameter
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.report import Fitted
 from astropolcal.plotting import gap as figures
 from astropolcal.plotting._style import BLACK
 from astropolcal.plotting.gap import (

@@ -145,10 +145,12 @@ class Elliptical(Effect):
     def put(self, chain, roles, context, label):
         """Return the chain with an elliptical derotator; see `Effect.put`."""
         old, is_new, ties = self.where.anchor(roles), False, {}
-        values = dict.fromkeys(self.free, np.zeros(len(context.wavelength)))
-        if isinstance(old, optics.EllipticalRetarder):
-            values = {k: np.broadcast_to(getattr(old, k).value, v.shape) for k, v in values.items()}
-            new = old.with_parameters(**{key: value * u.deg for key, value in values.items()})
+        # a component that the old one lacks is zero in it
+        known = old if isinstance(old, optics.EllipticalRetarder) else optics.EllipticalRetarder()
+        size = len(context.wavelength)
+        values = {k: np.broadcast_to(getattr(known, k).value, size) * u.deg for k in self.free}
+        if known is old:
+            new = old.with_parameters(**values)
         else:
             # what is more than a retarder stays, and the new one turns with it
             is_new = not isinstance(old, optics.LinearRetarder)
@@ -157,7 +159,7 @@ class Elliptical(Effect):
                 horizontal=(0.0 if is_new else old.retardance.value) * u.deg,
                 mount=old.mount,
                 name=label if is_new else old.name,
-                **{key: value * u.deg for key, value in values.items()},
+                **values,
             )
             for key in new.param_names:
                 getattr(new, key).fixed = True
@@ -205,14 +207,10 @@ class BandAverage(Effect):
         """Return the chain with a depolarizer along the axis of the retarder."""
         retarder = self.retarder(roles)
         slopes, axis = retardance_slopes(retarder), _steep_axis(retarder)
+        theta = retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad
+        how = {"theta": theta, "mount": retarder.mount, "name": label}
         keep = np.ones(len(slopes))
-        optic = optics.Depolarizer(
-            retained_u=keep,
-            retained_v=keep,
-            theta=retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad,
-            mount=retarder.mount,
-            name=label,
-        )
+        optic = optics.Depolarizer(retained_u=keep, retained_v=keep, **how)
         # along the axis nothing is lost
         optic.retained_q.fixed, optic.theta.bounds = True, (None, None)
         tie = {f"{label}.retained_v": Tie(f"{label}.retained_u")}

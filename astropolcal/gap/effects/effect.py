@@ -188,12 +188,8 @@ class Context:
     def of(cls, wavelength, observations):
         """Return what the datasets tell, on their common grid of wavelengths."""
         fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
-        return cls(
-            wavelength,
-            float(np.median(fluxes)),
-            tracking=tracking_laws(observations),
-            datasets=tuple(o.name for o in observations),
-        )
+        names, tracking = tuple(o.name for o in observations), tracking_laws(observations)
+        return cls(wavelength, float(np.median(fluxes)), tracking=tracking, datasets=names)
 
     def basis(self, degree):
         """Return the basis of the law of an effect."""
@@ -635,17 +631,11 @@ class Effect:
         text = self._dependence(roles)
         keys = ("amplitude", "quadrature")[: Dependence(text).count]
         zero = 0.0 if self.degree is NUMBER else np.zeros(len(context.wavelength))
-        return [
-            optics.Perturbation(
-                **dict.fromkeys(keys, zero),
-                kind=kind,
-                dependence=text,
-                theta=place.theta * u.rad,
-                name=label if len(self.kinds) == 1 else f"{label}_{kind}",
-                fixed={key: key not in keys for key in optics.Perturbation.param_names},
-            )
-            for kind in self.kinds
-        ]
+        how = dict.fromkeys(keys, zero) | {"dependence": text, "theta": place.theta * u.rad}
+        how["fixed"] = {key: key not in keys for key in optics.Perturbation.param_names}
+        names = [label if len(self.kinds) == 1 else f"{label}_{kind}" for kind in self.kinds]
+        pairs = zip(self.kinds, names, strict=True)
+        return [optics.Perturbation(kind=kind, name=name, **how) for kind, name in pairs]
 
     def __repr__(self):
         return f"<Effect {self.name}: {self.title}>"
@@ -679,28 +669,19 @@ _IN_FRONT = ("background", "crosstalk")
 class CellEffect(Effect):
     """An effect that is one cell: a perturbation of some kind at some place."""
 
+    kind = "cell"
+    shows, reference = "what the cell does to the data", "a perturbation of no name"
+
     def __init__(self, cell, degree=2):
-        place, dependence, settings = cell.place, cell.dependence, {}
+        place, dependence, settings = cell.place, cell.dependence, {"words": cell.place}
         if cell.kind in DETECTOR:
             optic, free, more = DETECTOR[cell.kind]
-            settings = {"inserted": optic, "free": (free,), "scale": cell.scale, "limit": _LIMIT}
+            settings |= {"inserted": optic, "free": (free,), "scale": cell.scale, "limit": _LIMIT}
             settings |= more
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
-        super().__init__(
-            cell.name,
-            cell.title,
-            place,
-            cell.kind,
-            dependence,
-            degree,
-            category="cell",
-            words=cell.place,
-            shows="what the cell does to the data",
-            reference="a perturbation of no name",
-            **settings,
-        )
+        super().__init__(cell.name, cell.title, place, cell.kind, dependence, degree, **settings)
         self._cell = cell
 
     def cells(self, chains):

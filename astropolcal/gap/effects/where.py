@@ -15,7 +15,7 @@ __all__ = []
 #: Roles of which a chain may have several optics.
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
-_NO_STAGES = (None, "parallactic", "altitude")
+_NO_STAGES = (None, "parallactic", "altitude", *COORDINATES)
 _RETARDERS = (
     optics.LinearRetarder,
     optics.EllipticalRetarder,
@@ -191,7 +191,6 @@ class Roles:
     def _turning(self):
         """Return plates and derotators."""
         found = [o for o in self._own if isinstance(o, _RETARDERS) and o.stage not in _NO_STAGES]
-        found = [o for o in found if o.stage not in COORDINATES]
         names = [o.stage for o in found]
         plates = [o for o in found if o.stage == "hwp"]
         if plates:
