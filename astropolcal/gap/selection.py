@@ -479,7 +479,8 @@ def _extensions(task, states, known, most, least):
     for state in states:
         if state.outline not in known:
             known[state.outline] = _scanned(state.model, names, task.cells)
-    fitted = sorted(_fitted(_grown(states, known, most)[:most]), key=preference)
+    instead = partial(_in_place, replace(task, library=names))
+    fitted = sorted(_fitted(_grown(states, known, most)[:most], instead), key=preference)
     return fitted if fitted and fitted[0].evidence >= least else []
 
 
@@ -496,14 +497,14 @@ def _by_left_out_frames(states, least, groups):
     return sorted(enough, key=lambda state: foreseen(state.model, groups).typical_percent)
 
 
-def _fitted(grown):
+def _fitted(grown, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
         share = _HALF if any(other.is_dear for other in found) else _PROMISING
         if promised - state.evidence < share * (most - state.evidence):
             break
-        one = _extended(promised, state, added)
+        one = _extended(promised, state, added, instead)
         if one is not None:
             found.append(one)
             most = max(most, one.evidence)
@@ -536,15 +537,19 @@ def _continuations(found, most):
     return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
 
 
-def _extended(evidence, state, added):
-    """Return a set with more causes, fitted in full, None where one is of impossible size."""
+def _extended(evidence, state, added, instead):
+    """Return a set with more causes, fitted in full, None where that is impossible."""
     model = state.model.with_effects([one.recipe for one in added], **_QUICK)
     chosen = [*state.chosen, *added]
     # what the full fit gains over the linear promise
     gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
     evidence += 0.5 * gained / max(1.0, model.mean_square)
-    possible = all(model.is_physical(one.name) for one in chosen)
-    return _State(model, chosen, evidence) if possible else None
+    impossible = [one for one in chosen if not model.is_physical(one.name)]
+    grown = _State(model, chosen, evidence)
+    if len(impossible) != 1 or impossible[0] in added:
+        return None if impossible else grown
+    # what was possible before is driven to its limit by what is added: another is in its place
+    return instead(impossible[0], grown)
 
 
 def _in_place(task, one, state):
