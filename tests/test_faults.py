@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -28,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import astropolcal
 from astropolcal import Calibration, Observations
+from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, FitError, GapError
 from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
@@ -154,6 +156,18 @@ def test_checkpoint_has_the_room_it_needs_from_the_start(tmp_path):
     Checkpoint()._run(path, 1)
     state = path.stat()
     assert 512 * state.st_blocks >= state.st_size
+
+
+@needs_h5py
+def test_making_a_checkpoint_takes_no_memory_for_its_steps(tmp_path):
+    chain, reader = Chain((2000, 8, 2), 50), Checkpoint()
+    tracemalloc.start()
+    try:
+        with chain.open(tmp_path / "chain.h5", reader.description, reader.arrays, True):
+            peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < chain._steps.nbytes / 4
 
 
 @needs_h5py

@@ -52,7 +52,7 @@ def test_half_square_of_the_residual_is_minus_the_log_density():
 
 def test_log_densities_are_those_of_scipy():
     """For rows of values at once, outside of the support too."""
-    for distribution in [*DISTRIBUTIONS, stats.uniform(0.1, 0.5)]:
+    for distribution in [*DISTRIBUTIONS, stats.uniform(0.1, 0.5), stats.gamma(0.5)]:
         for unit in [None, u.deg]:
             prior = bind_prior(distribution, "x.y", unit, (None, None))
             values = np.linspace(-3, 3, 12).reshape(4, 3)
@@ -60,6 +60,13 @@ def test_log_densities_are_those_of_scipy():
             np.testing.assert_allclose(
                 prior.log_densities(values * prior.factor), expected, atol=1e-9
             )
+
+
+def test_edges_of_a_flat_prior_are_inside():
+    """A fit may stand there; in degrees they are beyond the edge by rounding."""
+    for low in (15, 22, 30):
+        prior = bind_prior(stats.uniform(low, 7), "x.y", u.deg, (None, None))
+        np.testing.assert_allclose(prior.log_densities(prior.support), -np.log(7))
 
 
 def test_bounds_are_told_for_a_whole_vector():

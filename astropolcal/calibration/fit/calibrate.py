@@ -208,11 +208,13 @@ def calibrate(
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
         # iteratively reweighted least squares, which every fitter can do
-        def again(_=None):
+        def updated(_):
             return robust_weighting(measurement, loss)
 
-        how = again(), fitter, again, _ROBUST_ROUNDS, "the weights of the robust fit"
-        outcome, weighting = until_settled(measurement, *how)
+        first, what = updated(weighting), "the weights of the robust fit"
+        outcome, weighting = until_settled(
+            measurement, first, fitter, updated, _ROBUST_ROUNDS, what
+        )
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2

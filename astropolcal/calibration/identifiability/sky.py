@@ -148,8 +148,10 @@ def sequence_of(wanted, settings):
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
-    known = [settings.get(stage) for stage in own]
-    if not own or None in known or len({*map(len, known)}) > 1:
+    if not own or not {*own} <= {*settings}:
+        return None
+    known = [settings[stage] for stage in own]
+    if len({*map(len, known)}) > 1:
         return None
     frames = np.unique(np.transpose(known), axis=0)
     frames = _spread_out(frames, _LONGEST)

@@ -1,7 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Checkpoints of a sampler: one HDF5 file that a kill at any moment leaves usable.
 
-HDF5 lays the file out in memory, with room for all steps, and never touches it again: where a write
+HDF5 lays the file out in memory, without the steps, and never touches it again: where a write
 of its own fails it takes the process with it. The block before its structures, which it leaves to
 the user, says where the steps are and (JSON) of which run, so that no structure is read that may be
 damaged.
@@ -129,7 +129,10 @@ class Chain:
         block = max(_LEAST_BLOCK, 1 << (len(stated) + 99).bit_length())
         image = io.BytesIO()
         with h5py.File(image, "w", libver="earliest", userblock_size=block) as file:
-            self._start = file.create_dataset("steps", data=self._steps).id.get_offset()
+            steps = file.create_dataset("steps", self._steps.shape, self._steps.dtype)
+            # the first one takes the place of all, which would be twice in memory
+            steps[:1] = self._steps[:1]
+            self._start = steps.id.get_offset()
         # of both: the place is what the CRC of the text begins with
         numbers = f"{self._start} {len(stated)} {zlib.crc32(stated, self._start)}\n"
         image.seek(0)
@@ -138,7 +141,8 @@ class Chain:
             atomic_path(path, error=FitError) as temporary,
             open(temporary, "wb", buffering=0) as stream,
         ):
-            write_bytes(stream.fileno(), image.getbuffer())
+            for content in (image.getbuffer()[: self._start], self._steps.view(np.uint8)):
+                write_bytes(stream.fileno(), content)
 
     def append(self, coords, log_prob, random_state, accepted):
         """Keep a step; bring the file up to date when it is time."""

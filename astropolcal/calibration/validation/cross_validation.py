@@ -496,8 +496,11 @@ def standard_accuracy(calibration, chain, observations, positions=None):
         own, factor, _ = free.lookup(slot.name)
         columns = own.start + (np.sort(rows) if own.per_wavelength else np.zeros(1, dtype=int))
         moved = moved + factor * null[:, columns] @ jacobian[slot.slice]
-    keys = ("name", "source", "content_hash", "n_frames")
-    table.meta |= {key: getattr(observations, key) for key in keys} | {
+    table.meta |= {
+        "name": observations.name,
+        "source": observations.source,
+        "content_hash": observations.content_hash,
+        "n_frames": observations.n_frames,
         "open_percent": float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0)),
         "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
