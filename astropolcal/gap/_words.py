@@ -298,19 +298,22 @@ def details(entry, ranks):
 # ---- the summary -------------------------------------------------------------------------------
 
 
-def sentences(content):
-    """Return frames to distrust, what causes the gap, how large it is, and what is left."""
-    faults = _faults(content["frames"])
+def sentences(content, several=False):
+    """
+    Return frames to distrust, what causes the gap, how large it is, and what is left.
+
+    Frames are named with their datasets where there are several.
+    """
+    faults = _faults(content["frames"], several)
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
     rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
     return [words for words in (first, *rest) if words]
 
 
-def _faults(frames):
+def _faults(frames, several):
     """Return what is wrong with each of some frames; of many single data only how many they are."""
     single = [fault for fault in frames if fault["what"] == "one wavelength"]
     single = single if len(single) > _SINGLE else []
-    several = len({fault["dataset"] for fault in frames}) > 1
     told = [
         f"{fault['dataset']}, {words}" if several else words
         for fault in frames

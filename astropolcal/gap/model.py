@@ -437,10 +437,16 @@ def starting_model(calibration, observations, library, say):
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         misfit, found = _misfit(made), []
         # tables are seldom misread: that is asked where signs and reflections leave much
-        for misread in (False, True):
+        misread = [e for e in discrete if isinstance(e, Misread)]
+        for some in ([e for e in discrete if e not in misread], misread):
             if not found or found[0][0] > _SETTLED * misfit:
-                some = [e for e in discrete if isinstance(e, Misread) is misread]
                 found = _tried(chains, observations, some, say, found)
+        settled = found[0][1] if found and found[0][0] <= _SETTLED * misfit else None
+        if len(observations) > 1 and (settled is None or settled in misread):
+            # all but one of the tables may be right
+            some = misread if settled is None else [settled]
+            apart = [e.in_run(o.name) for e in some for o in observations]
+            found = _tried(chains, observations, apart, say, found)
         if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
             read = _read(found[0][1], chains, observations, _context(observations))
@@ -473,7 +479,9 @@ def _read(effect, chains, observations, context):
 
 def _context(observations):
     """Return what a discrete effect may know: how the plates follow the sky."""
-    return Context(common_wavelengths(observations), tracking=tracking_laws(observations))
+    names = tuple(one.name for one in observations)
+    tracking = tracking_laws(observations)
+    return Context(common_wavelengths(observations), tracking=tracking, datasets=names)
 
 
 def _misfit(calibration):

@@ -154,7 +154,7 @@ def _worked_out(diagnosis):
     }
     names = [o.name for o in improved.observations]
     asked = diagnosis.settings.get("changes", False)
-    words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
+    words = [*_words.sentences(content, len(names) > 1), *runs.paragraph(content, names, asked)]
     if misread and causes[0]["probability"] >= 0.5:
         # before all optics, and before what else is not known
         words.insert(0, _words.correct(causes[0]))

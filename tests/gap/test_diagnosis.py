@@ -210,6 +210,20 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
 
 
 @pytest.mark.slow
+def test_of_two_tables_the_one_that_is_misread_is_named():
+    first, second = (data.observed(flux=1e7, seed=seed, name=f"run {seed}") for seed in (1, 2))
+    table = second.to_table()
+    table["hwp"] = np.roll(table["hwp"], second.n_bins)
+    found = diagnose(data.chain(), [first, Observations.from_table(table, name="run 2")], **QUICK)
+    assert found.verdict == "named"
+    assert names(found.causes[0]) == ["hwp_late/dataset:run 2"]
+    assert [(fault.dataset, fault.frame) for fault in found.frames] == [("run 2", 31)]
+    sentences = to_dict(found)["sentences"]
+    assert 'in the table of "run 2" only' in sentences[0]
+    assert "run 2, frame 31: its angle is in no row" in sentences[1]
+
+
+@pytest.mark.slow
 def test_an_angle_in_no_row_does_not_hide_that_a_short_table_is_late():
     right = data.observed(table=half_wave_plate_cycles(derotator=[45, 80] * u.deg))
     table = right.to_table()

@@ -275,10 +275,14 @@ def test_what_is_not_known_of_a_cause_is_left_out():
 
 
 def test_frames_come_first_in_every_verdict():
-    frames = [{"dataset": "lamp", "words": "Frame 29 of lamp has another plate angle (98 %)."}]
+    words = "frame 29: its data are those of another plate angle"
+    frames = [{"dataset": "lamp", "frame": 29, "what": "hwp angle", "words": words}]
     for verdict in ("none", "named", "located", "unexplained"):
         first = _words.sentences(content(verdict=verdict, frames=frames))[0]
-        assert frames[0]["words"] in first
+        assert f"says: {words}" in first
+        # of several tables that of the frame
+        first = _words.sentences(content(verdict=verdict, frames=frames), several=True)[0]
+        assert f"says: lamp, {words}" in first
 
 
 def test_every_verdict_has_its_sentence():

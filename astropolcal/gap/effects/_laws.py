@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Effects that are laws of physics, or exchange optics, and no perturbations at a place."""
 
+import copy
+
 import astropy.units as u
 import numpy as np
 from scipy.linalg import helmert
@@ -434,6 +436,8 @@ class Misread(Alternative):
     """Angles of stages that are not those of the table; asked for where no other alternative is."""
 
     reference = "the writing of tables; no paper is known"
+    #: Name of the only dataset of several whose table is misread, None for all.
+    run = None
 
     def __init__(self, name, title, words, role, shows, stages, what, rate):
         super().__init__(name, title, words, role, shows=shows)
@@ -446,8 +450,25 @@ class Misread(Alternative):
         stages = {leaf.stage for leaf in roles.leaves}
         return super().applies_to(roles) and stages.issuperset(self.stages)
 
+    def in_run(self, name):
+        """Return the same for the table of one of several datasets."""
+        one = copy.copy(self)
+        one.run, one.name = name, f"{self.name}/dataset:{name}"
+        one.title = f'{self.title} of "{name}" only'
+        return one
+
+    def edit(self, chains, context):
+        """Return the changed chains, of one dataset only where it is of one."""
+        edited = super().edit(chains, context).chains
+        if self.run is not None:
+            trios = zip(context.datasets, chains, edited, strict=True)
+            edited = [new if name == self.run else old for name, old, new in trios]
+        return Edit(edited, [])
+
     def edge(self, observations):
         """Return the frames, (F,) of bool, whose angle is in no row of their table."""
+        if self.run not in (None, observations.name):
+            return super().edge(observations)
         first = {"_move": np.min, "_next": np.max}.get(self.what)
         sequence = observations.position("sequence")
         return super().edge(observations) if first is None else sequence == first(sequence)
