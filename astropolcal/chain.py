@@ -16,6 +16,7 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ObservationError, ParameterError
+from astropolcal.mueller import _rotation_matrix
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
 from astropolcal.optics.positions import FLUXES, PLACES, finite_position
@@ -559,10 +560,21 @@ def system_mueller(chain, wavelength=None, positions=None):
     """
     positions, shape = _check_axes(wavelength, positions)
     warn_beyond(chain, positions)
-    total = np.eye(4)
-    for leaf, *rest in _oriented_leaves(chain, wavelength, positions):
-        total = leaf._oriented(*rest) @ total
-    return np.broadcast_to(total, (*shape, 4, 4)).copy()
+    # one turn from optic to optic, where there is one: most of the time goes to products
+    total, frame = np.eye(4), 0.0
+    for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
+        if leaf.rotates_frame:
+            frame = frame - angle
+        else:
+            total = leaf._matrix(dispersion, *values) @ _turned(total, angle - frame)
+            frame = angle
+    total, whole = _turned(total, -frame), (*shape, 4, 4)
+    return total if total.shape == whole else np.broadcast_to(total, whole).copy()
+
+
+def _turned(matrix, angle):
+    """Return T(angle) times the matrix."""
+    return _rotation_matrix(angle) @ matrix if np.any(angle) else matrix
 
 
 def _check_axes(wavelength, positions):

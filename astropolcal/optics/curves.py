@@ -144,7 +144,7 @@ class Curve(ScalarParameters):
 
     def evaluate(self, x, *parameters):
         """Return the values at ``x``; without units numbers are in the units of the curve."""
-        values = self._values(self._found_at(x, parameters))
+        values = self._values(self._found_at(x, parameters), np.size(x))
         return values.reshape(np.shape(x)) / canonical_factor(self._unit)
 
     @property
@@ -153,7 +153,7 @@ class Curve(ScalarParameters):
         return None if self.has_tied else self._fit_deriv
 
     def _fit_deriv(self, x, *parameters):
-        slopes = self._slopes(self._found_at(x, parameters))
+        slopes = self._slopes(self._found_at(x, parameters), np.size(x))
         out, scale = np.zeros((len(parameters), np.size(x))), canonical_factor(self._unit)
         for plan, own in zip(self._plan, slopes, strict=True):
             for (place, factor), slope in zip(plan, own, strict=True):
@@ -164,16 +164,16 @@ class Curve(ScalarParameters):
     def _found_at(self, x, parameters):
         """Return what is made of an input and values; a fitter asks twice at the same point."""
         x = x.to_value(self._input_unit) if isinstance(x, u.Quantity) else np.asarray(x)
-        x, memo = x.ravel(), self._memo
+        x = x.ravel()
+        at, place, known, found = self._memo.get("point", (None, None, None, None))
         # as np.array_equal, in a fifth of its time
-        if "x" not in memo or memo["x"].shape != x.shape or not (memo["x"] == x).all():
-            memo.clear()
-            memo |= {"x": np.array(x, dtype=float), "place": self._located(x)}
+        if at is None or at.shape != x.shape or not (at == x).all():
+            at, place, known = np.array(x, dtype=float), self._located(x), None
         # astropy calls with arrays of one, with or without unit, fitters with numbers
         numbers = [getattr(value, "value", value) for value in parameters]
         numbers = [value.item() if hasattr(value, "item") else value for value in numbers]
         # arrays are no parameters of the curve, and may be others next time
-        if self._several or memo.get("numbers") != numbers:
+        if self._several or known != numbers:
             values = [
                 [
                     factor * (getattr(optic, key).value if place is None else numbers[place])
@@ -181,8 +181,10 @@ class Curve(ScalarParameters):
                 ]
                 for optic, plan in zip(self._optics, self._plan, strict=True)
             ]
-            memo |= {"found": self._found(memo["place"], values), "numbers": numbers}
-        return memo["found"]
+            found = self._found(place, values)
+            # all at once: threads may share a curve
+            self._memo["point"] = at, place, numbers, found
+        return found
 
     def _values_at(self, wavelength, values):
         """Return the values of each optic at the wavelengths, where some have several."""
@@ -219,10 +221,10 @@ class LawCurve(Curve):
         slopes = [float(key == self._law) for key in optic.own_names]
         return own[optic.own_names.index(self._law)], slopes
 
-    def _values(self, found):
-        return found[0] + np.zeros(self._memo["x"].shape)
+    def _values(self, found, size):
+        return found[0] + np.zeros(size)
 
-    def _slopes(self, found):
+    def _slopes(self, found, size):
         return [found[1]]
 
 
@@ -299,19 +301,19 @@ class LightCurve(Curve):
             light = (matrix @ light[..., None])[..., 0]
         return steps, light
 
-    def _values(self, beams):
-        found = [self._flux(light) for _, light in beams]
+    def _values(self, beams, size):
+        found = [self._flux(light, size) for _, light in beams]
         return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
 
-    def _flux(self, light):
+    def _flux(self, light, size):
         """Return what is measured of the light, (k, 1, n), as observables take it."""
-        shape, flux = (self._frames, self._memo["x"].size), light[..., self._element[0]]
+        shape, flux = (self._frames, size), light[..., self._element[0]]
         return (flux if flux.shape == shape else np.broadcast_to(flux, shape))[:, None]
 
-    def _slopes(self, beams):
+    def _slopes(self, beams, size):
         if self._observable is None:
             return self._slopes_of_beam(beams[0][0])
-        found = [self._flux(light) for _, light in beams]
+        found = [self._flux(light, size) for _, light in beams]
         weights = [weight[:, 0] for weight in self._observable.derivative(*found)]
         parts = [self._slopes_of_beam(steps) for steps, _ in beams]
         return [

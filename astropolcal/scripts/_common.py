@@ -386,8 +386,13 @@ def check_suffix(option, path, *suffixes):
 
 def wrapped(line, indent=0):
     """Break a line at 80 columns, the further ones indented; words stay whole."""
-    whole = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.fill(line, WIDTH, subsequent_indent=" " * indent, **whole)
+    return textwrap.fill(
+        line,
+        WIDTH,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def write_json(content, path):

@@ -349,8 +349,11 @@ def _summary(result, star, arguments, n_frames):
         spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
     summary = {
         "output": str(arguments.output),
-        **{key: result.provenance[key] for key in ("calibration", "calibration_hash")},
-        **{key: getattr(result, key) for key in ("mode", "observable", "components")},
+        "calibration": result.provenance["calibration"],
+        "calibration_hash": result.provenance["calibration_hash"],
+        "mode": result.mode,
+        "observable": result.observable,
+        "components": result.components,
         "n_frames": n_frames,
         "north_up": result.north_up,
         "wavelength_nm": result.wavelength.to_value(u.nm),

@@ -131,6 +131,7 @@ def _any_modulation(arguments, instrument, chain, grid, settings):
     found = demodulation(chain, grid, frames, components="IQU")
     with suppress(ParameterError):
         whole = demodulation(chain, grid, frames)
+        # from which efficiency on V is solved for, too
         found = whole if whole.efficiency[:, 3].min() > 0.1 else found
     rows = _rows(arguments.wavelength, grid)
     content = {"instrument": instrument.name, "n_frames": len(frames)}

@@ -199,10 +199,11 @@ def _observations(path):
     paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
     pairs = observations.pairs() if paired else ()
-    told = {key: getattr(observations, key) for key in ("instrument", "source", "n_frames")}
     content = {
         "file": str(path),
-        **told,
+        "instrument": observations.instrument,
+        "source": observations.source,
+        "n_frames": observations.n_frames,
         "n_wavelengths": observations.n_bins,
         "n_masked": int(observations.mask.sum()),
         "n_pairs": len(pairs),
@@ -252,7 +253,9 @@ def _describe_product(path, product):
         "shape": list(product.stokes.shape),
         "unit": product.unit.to_string(),
         "wavelength_nm": wavelength,
-        **{key: getattr(product, key) for key in ("mode", "observable", "north_up")},
+        "mode": product.mode,
+        "observable": product.observable,
+        "north_up": product.north_up,
         # at a wavelength all components must be
         "n_determined": int(np.sum(product.determined.all(axis=-1))),
         "statistical": product.covariance is not None,

@@ -93,17 +93,22 @@ def _check_options(arguments):
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
-    options = {key: getattr(arguments, key) for key in ("parameters", "seed", "checkpoint")}
-    options |= {key: getattr(arguments, option[2:]) for key, option in _OPTIONS.items()}
-    if arguments.burn == "auto":
-        options["burn_in"] = None
     try:
         with warnings.catch_warnings():
             if not common.is_quiet(arguments):
                 # the summary says the same
                 warnings.filterwarnings("ignore", message="the chain (is|has)")
-            # progress as for all commands, and not at all where that is not wanted
-            return sample(calibration, **options, progress=False)
+            return sample(
+                calibration,
+                parameters=arguments.parameters,
+                n_walkers=arguments.walkers,
+                n_steps=arguments.steps,
+                burn_in=None if arguments.burn == "auto" else arguments.burn,
+                seed=arguments.seed,
+                checkpoint=arguments.checkpoint,
+                # as for all commands, and not at all where that is not wanted
+                progress=False,
+            )
     except FitError as error:
         # about the option instead of the argument
         words, option = str(error), _OPTIONS.get(error.argument)

@@ -162,13 +162,20 @@ def _pair(value, form, error=math.nan):
 
 
 def _many(arguments):
-    wanted = {key: getattr(arguments, key) for key in ("kind", "band", "magnitude", "night")}
-    wanted["site"] = None if arguments.site is None else _site(arguments.site)
+    site = None if arguments.site is None else _site(arguments.site)
+    near = {}
     if arguments.near:
         radius = 15.0 if arguments.radius is None else arguments.radius
-        wanted["center"] = common.sky_position(arguments.near, "--near")
-        wanted["radius"] = radius * u.deg
-    found = standards.search(**wanted, min_altitude=arguments.min_altitude * u.deg)
+        near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
+    found = standards.search(
+        **near,
+        kind=arguments.kind,
+        band=arguments.band,
+        magnitude=arguments.magnitude,
+        site=site,
+        night=arguments.night,
+        min_altitude=arguments.min_altitude * u.deg,
+    )
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")

@@ -1,6 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Curves of optics and chains, and fits to them."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -177,3 +180,22 @@ def test_what_there_is_no_curve_of():
     ):
         with pytest.raises(error, match=words):
             make()
+
+
+def test_threads_share_a_curve():
+    curve = instrument()["hwp"].curve("mueller", (1, 2))
+
+    def one(i):
+        x, values = WAVELENGTH.value[: 40 - i % 2], np.array(curve.parameters) + i % 3
+        return curve.evaluate(x, *values), curve.fit_deriv(x, *values)
+
+    expected, interval = [one(i) for i in range(6)], sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            found = list(pool.map(one, range(300)))
+    finally:
+        sys.setswitchinterval(interval)
+    for i, both in enumerate(found):
+        for a, b in zip(both, expected[i % 6], strict=True):
+            np.testing.assert_array_equal(a, b)
