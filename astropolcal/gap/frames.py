@@ -148,7 +148,7 @@ def _single(residual, tangent, weight, least):
     Return by how many standard deviations data are off, (F, W), 0 where it is less than so many.
 
     Each is left out in turn: of a frame, beside a smooth law in wavelength of its own, and of what
-    the nominal model takes up, ``tangent`` (F, W, p). ``weight`` (F, W) whitens.
+    the nominal model absorbs, ``tangent`` (F, W, p). ``weight`` (F, W) whitens.
     """
     found, n = np.zeros(residual.shape), residual.shape[1]
     law = law_basis(np.arange(n), min(_SMOOTH, (n - 1) // 3))
