@@ -173,10 +173,10 @@ def _single(residual, tangent, weight, least):
             return 0.0 * found
         worst = off.argmax(axis=1)[frames]
         found[frames, worst] = off[frames, worst]
-    found = np.where(found > least * spread, found / spread, 0.0)
+    # what is in many frames is there, too, where it is weaker
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
-    return found
+    return np.where(found > least * spread, found / spread, 0.0)
 
 
 def unknown_angles(observations, effect):
