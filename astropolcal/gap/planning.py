@@ -48,7 +48,9 @@ _LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
 # have to bring
 _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
 # dependences that a run shows, and not the frames of any other block
-_TIMED = ("time", "time2", "step", "frame")
+_TIMED = ("time", "time2")
+# what happened at a frame of a run, which need not happen in another
+_EVENTS = ("step", "frame")
 # log Bayes factor at which two causes are told apart
 _APART = np.log(10)
 # entries of a plan
@@ -296,10 +298,15 @@ def _groups(diagnosis):
                 members[one.cell or one.name][2] += share
             elif share > _LEAST_SHARE:
                 members[one.cell or one.name] = [one.name, one.recipe, share]
-        smooth = [m for m in members.values() if m[1][0].kind != "discrete"]
-        if cause.name in diagnosis.improved.added and len(smooth) > 1:
-            found.append([tuple(m) for m in smooth[:_MOST_MEMBERS]])
+        asked = [m for m in members.values() if _can_return(m[1][0])]
+        if cause.name in diagnosis.improved.added and asked[1:] and asked[0][0] == cause.name:
+            found.append([tuple(m) for m in asked[:_MOST_MEMBERS]])
     return found
+
+
+def _can_return(effect):
+    """Return whether other data have an effect, too: no alternative, and nothing that happened."""
+    return effect.kind != "discrete" and Dependence(effect.dependence).kind not in _EVENTS
 
 
 def _telling_apart(forecast, group, foreseen):
