@@ -471,11 +471,14 @@ def _tried(chains, observations, effects, say, known):
     found = list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
-        # where it leaves too few frames it is not asked for
-        with suppress(FitError, ObservationError):
-            found.append((_misfit(nominal_calibration(*_read(effect, *few, context))), effect))
-    misfits = np.array([misfit for misfit, _ in found])
-    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf))]
+        for one in effect.ways():
+            # where it leaves too few frames it is not asked for
+            with suppress(FitError, ObservationError):
+                found.append((_misfit(nominal_calibration(*_read(one, *few, context))), one))
+    misfits, best = np.array([misfit for misfit, _ in found]), {}
+    for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf)):
+        best.setdefault(found[i][1].name, found[i])
+    return list(best.values())
 
 
 def _read(effect, chains, observations, context):

@@ -402,6 +402,8 @@ class Alternative(Effect):
     reference = "McIntosh et al. 2026, Sec. 4; the reflections and signs of a chain"
     #: Function of chain, roles, the optic and the law of its tracking that changes the chain.
     change = None
+    #: The function that changes it the other way, where there are two that have one name.
+    back = None
 
     def __init__(self, name, title, words, role, change=None, shows=None, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role
@@ -410,6 +412,10 @@ class Alternative(Effect):
     def cells(self, chains):
         """Return none: an alternative is not a perturbation."""
         return ()
+
+    def ways(self):
+        """Return the alternative, and that which changes the chain the other way."""
+        return [self] if self.back is None else [self, self.changed(change=self.back)]
 
     def edge(self, observations):
         """Return the frames, (F,) of bool, of which the alternative knows no angle: none."""

@@ -45,7 +45,7 @@ _SAME = 1e-9
 _SETTINGS = (
     *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
     *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
-    "change",
+    *("change", "back"),
 )
 
 
