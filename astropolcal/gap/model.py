@@ -54,6 +54,8 @@ _SETTLED = 0.25
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
 _FEW = 3
+# names of what was found by an earlier diagnosis
+_EARLIER = "gap_earlier_"
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -445,6 +447,7 @@ def starting_model(calibration, observations, library, say):
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    chains = _set_apart(chains)
     # of a calibration too: in other data a wavelength may be in another branch
     made = nominal_calibration(chains, observations)
     if _may_be_wrong(made):
@@ -463,6 +466,18 @@ def starting_model(calibration, observations, library, say):
                 return _with_alternative(*read, made, best, found)
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, []
+
+
+def _set_apart(chains):
+    """Return chains in which what an earlier diagnosis found leaves its names to this one."""
+    found = [[leaf.copy() for leaf in leaves(chain)] for chain in chains]
+    known = [leaf for one in found for leaf in one if (leaf.name or "").startswith("gap_")]
+    first = _EARLIER
+    while any(leaf.name.startswith(first) for leaf in known):
+        first += "earlier_"
+    for leaf in (leaf for leaf in known if not leaf.name.startswith(_EARLIER)):
+        leaf.name = first + leaf.name.removeprefix("gap_")
+    return [join(optics) for optics in found] if known else chains
 
 
 def _tried(chains, observations, effects, say, known):
