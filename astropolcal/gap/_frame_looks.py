@@ -371,11 +371,10 @@ class Frame:
         fall = np.divide(along**2, seen, out=np.zeros(seen.shape), where=seen > _TINY).sum(axis=0)
         best = int(np.argmax(np.where(self.valid, fall, -1.0)))
         cost = width[best] + np.log1p(_ANY**2 * seen[1, best])
-        there = np.arange(len(width))[:, None] == best
+        name, chi2 = "one wavelength", self.as_told().chi2 - float(fall[best])
         # or one beam is off there, which a law that bends enough describes as well
-        each = [self.beam(1.0 * there, side) for side in sides]
-        name, none = "one wavelength", self.as_told().chi2
-        each = [Trial(name, none - float(fall[best]), float(cost)), *each]
+        beams = [self.beam(np.eye(len(width))[:, [best]], side) for side in sides]
+        each = [Trial(name, chi2, float(cost)), *beams]
         return [Trial(name, one.chi2, one.cost + 2 * np.log(n), bin=best) for one in each]
 
     def angle(self, stage):

@@ -20,7 +20,6 @@ from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, Obser
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
-from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
@@ -54,8 +53,6 @@ _SETTLED = 0.25
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
 _FEW = 3
-# names of what was found by an earlier diagnosis
-_EARLIER = "gap_earlier_"
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -285,12 +282,16 @@ class Model:
             beyond = np.maximum(low - vector, vector - high)[where]
             if np.any(beyond > _AT_LIMIT * parameter.canonical_limit):
                 return False
-        # bounds that an effect sets itself may be those of no optic; a perturbation is a change of
-        # an optic, and need not be one by itself
+        # the optics that have its parameters, or some that follow these: bounds that an effect sets
+        # itself may be those of no optic; a perturbation is a change of an optic, and need not be
+        # one by itself
+        own = {parameter.name for parameter in self.added[name]}
+        own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
+        names = {parameter.partition(".")[0] for parameter in own}
         matrices = [
             leaf.mueller(self.problem.wavelength * u.um)
-            for leaf in self._carriers(name)
-            if not isinstance(leaf, Perturbation)
+            for leaf in (leaf for chain in self.trains for leaf in leaves(chain))
+            if leaf.name in names and not isinstance(leaf, Perturbation)
         ]
         return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
@@ -323,13 +324,6 @@ class Model:
                     if np.any(polarized > row[..., 0] * (1 + _MORE_LIGHT)):
                         return False
         return True
-
-    def _carriers(self, name):
-        """Return the optics that have the parameters of an effect, or some that follow these."""
-        own = {parameter.name for parameter in self.added[name]}
-        own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
-        names = {parameter.partition(".")[0] for parameter in own}
-        return [leaf for chain in self.trains for leaf in leaves(chain) if leaf.name in names]
 
     def at_bound(self, name):
         """Return how many values of an effect are at a bound of their optic."""
@@ -451,16 +445,17 @@ def starting_model(calibration, observations, library, say):
     # of a calibration too: in other data a wavelength may be in another branch
     made = nominal_calibration(chains, observations)
     if _may_be_wrong(made):
+        context = Context.of(common_wavelengths(observations), observations)
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         misfit, found = _misfit(made), []
         # tables are seldom misread: that is asked where signs and reflections leave much
         for misread in (False, True):
             if not found or found[0][0] > _SETTLED * misfit:
                 some = [e for e in discrete if isinstance(e, Misread) is misread]
-                found = _tried(chains, observations, some, say, found)
+                found = _tried(chains, observations, some, context, say, found)
         if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
-            read = _read(found[0][1], chains, observations, _context(observations))
+            read = _read(found[0][1], chains, observations, context)
             best = nominal_calibration(*read)
             if _misfit(best) < _FAR_BETTER * misfit:
                 return _with_alternative(*read, made, best, found)
@@ -472,18 +467,14 @@ def _set_apart(chains):
     """Return chains in which what an earlier diagnosis found leaves its names to this one."""
     found = [[leaf.copy() for leaf in leaves(chain)] for chain in chains]
     known = [leaf for one in found for leaf in one if (leaf.name or "").startswith("gap_")]
-    first = _EARLIER
-    while any(leaf.name.startswith(first) for leaf in known):
-        first += "earlier_"
-    for leaf in (leaf for leaf in known if not leaf.name.startswith(_EARLIER)):
-        leaf.name = first + leaf.name.removeprefix("gap_")
+    for leaf in known:
+        leaf.name = f"gap_earlier_{leaf.name.removeprefix('gap_')}"
     return [join(optics) for optics in found] if known else chains
 
 
-def _tried(chains, observations, effects, say, known):
+def _tried(chains, observations, effects, context, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
-    few, context = thinned(chains, observations, _FEW), _context(observations)
-    found = list(known)
+    few, found = thinned(chains, observations, _FEW), list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
         for one in effect.ways():
@@ -501,11 +492,6 @@ def _read(effect, chains, observations, context):
     edges = ((o, effect.edge(o)) for o in observations)
     kept = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     return effect.edit(chains, context).chains, kept
-
-
-def _context(observations):
-    """Return what a discrete effect may know: how the plates follow the sky."""
-    return Context(common_wavelengths(observations), tracking=tracking_laws(observations))
 
 
 def _misfit(calibration):

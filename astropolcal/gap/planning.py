@@ -23,6 +23,7 @@ from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
+from astropolcal.gap.effects._laws import turned_by
 from astropolcal.gap.problem import OPEN, GapProblem
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES
@@ -49,8 +50,6 @@ _LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
 _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
 # dependences that a run shows, and not the frames of any other block
 _TIMED = ("time", "time2")
-# what happened at a frame of a run, which need not happen in another
-_EVENTS = ("step", "frame")
 # log Bayes factor at which two causes are told apart
 _APART = np.log(10)
 # entries of a plan
@@ -208,8 +207,7 @@ def _blocks(run):
     plate = np.unique(np.round(run.positions["hwp"], 2))
     # a plate that follows the sky has been everywhere
     cycle = _CYCLE if len(plate) > len(_TURN) else tuple(map(float, plate[:8]))
-    usual = {name: float(np.median(angles)) for name, angles in run.positions.items()}
-    del usual["hwp"]
+    usual = {name: float(np.median(a)) for name, a in run.positions.items() if name != "hwp"}
     moved = next((name for name in ("altitude", "derotator", *usual) if name in usual), None)
     if moved is None:
         return [replace(run, positions={"hwp": angles}) for angles in (cycle, _TURN)]
@@ -298,15 +296,12 @@ def _groups(diagnosis):
                 members[one.cell or one.name][2] += share
             elif share > _LEAST_SHARE:
                 members[one.cell or one.name] = [one.name, one.recipe, share]
-        asked = [m for m in members.values() if _can_return(m[1][0])]
+        # what happened at a frame of a run need not happen in another
+        asked = [m for m in members.values() if m[1][0].kind != "discrete"]
+        asked = [m for m in asked if Dependence(m[1][0].dependence).driver != "frame"]
         if cause.name in diagnosis.improved.added and asked[1:] and asked[0][0] == cause.name:
             found.append([tuple(m) for m in asked[:_MOST_MEMBERS]])
     return found
-
-
-def _can_return(effect):
-    """Return whether other data have an effect, too: no alternative, and nothing that happened."""
-    return effect.kind != "discrete" and Dependence(effect.dependence).kind not in _EVENTS
 
 
 def _telling_apart(forecast, group, foreseen):
@@ -375,8 +370,7 @@ def _repetitions(diagnosis):
         f"Take the run of {name} {_REPEATS} times: tells structure that no cause explains from "
         f"noise larger than stated, at {_sigmas(gain)} standard deviations"
     )
-    after = float(stats.norm.cdf(gain))
-    found = _line(words, "structure", [], float(gain), 0.5, after)
+    found = _line(words, "structure", [], float(gain), 0.5, float(stats.norm.cdf(gain)))
     return [found] if gain > LEAST_GAIN else []
 
 
@@ -436,9 +430,7 @@ class Forecast:
             if sum(map(len, rows)):
                 self.own[name] = np.concatenate(rows)
         slopes, self.residual = problem.jacobian(q), problem.residual(q)
-        self.causes = np.zeros(problem.size, dtype=bool)
-        for own in self.own.values():
-            self.causes[own] = True
+        self.causes = np.isin(every, [k for own in self.own.values() for k in own])
         at_bound = (q <= problem.low + _AT_BOUND) | (q >= problem.high - _AT_BOUND)
         #: Coefficients that the data may move.
         self.live = self.causes | ~at_bound
@@ -571,9 +563,7 @@ def _set_up(chain, exposure):
     """Return copies of the optics of a chain as the exposure needs them."""
     train = Train(leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
     if exposure.polarizer_turned:
-        theta, angle = Roles(train).polarizer.theta, exposure.polarizer_turned
-        theta.bounds = tuple(None if b is None else b + angle for b in theta.bounds)
-        theta.value = theta.value + angle
+        turned_by(exposure.polarizer_turned)(train, Roles(train).polarizer)
     return train
 
 

@@ -111,7 +111,6 @@ def _brought(cell, run, names, chains):
         if not (optic.name or "").startswith("gap_")
     ]
     others = {o.name for n, c in zip(names, chains, strict=True) if n != run for o in c}
-    own = [name for name in mine if name not in others]
     head, _, optic = cell.place.partition(":")
     if head == "detector":
         end = len(mine)
@@ -120,7 +119,7 @@ def _brought(cell, run, names, chains):
         end = mine.index(optic) + 1 + (head == "after")
     else:
         return []
-    return [name for name in own if mine.index(name) < end]
+    return [name for name in mine[:end] if name not in others]
 
 
 # ---- in words ----------------------------------------------------------------------------------

@@ -275,7 +275,7 @@ def test_what_is_not_known_of_a_cause_is_left_out():
 
 
 def test_frames_come_first_in_every_verdict():
-    frames = [{"dataset": "lamp", "words": "Frame 29 of lamp has another plate angle (98 %)."}]
+    frames = [{"dataset": "lamp", "what": "hwp angle", "words": "Frame 29: another angle (98 %)."}]
     for verdict in ("none", "named", "located", "unexplained"):
         first = _words.sentences(content(verdict=verdict, frames=frames))[0]
         assert frames[0]["words"] in first

@@ -8,6 +8,7 @@ effect would do to the data; fitted, the edited chains are ordinary chains again
 
 import copy
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -207,10 +208,9 @@ def tracking_laws(observations):
     """
     found = []
     for one in observations:
-        try:
+        law = None
+        with suppress(InstrumentError):
             law = one.instrument and instruments.get(one.instrument).plate_law(one)
-        except InstrumentError:
-            law = None
         found.append(law or TRACKING)
     return tuple(found)
 
