@@ -137,8 +137,10 @@ class Look:
     def law(self, i):
         """Return the law of a beam's factor at the wavelengths of a dataset, (W, k)."""
         law = law_basis(self.problem.wavelength[self.problem.datasets[i].bins], BEAM_DEGREE)
-        # of few wavelengths it is any function: its first column is a constant here, too
-        return law if len(law) > BEAM_DEGREE + 1 else np.tril(np.ones(law.shape))
+        # of few wavelengths it is any function: its first column is a constant here, too, and the
+        # others have no mean
+        few = np.sqrt(len(law)) * np.linalg.qr(np.tril(np.ones(law.shape)))[0]
+        return law if len(law) > BEAM_DEGREE + 1 else few
 
     @cached_property
     def _parts(self):
@@ -348,16 +350,15 @@ class Frame:
     def trials(self):
         """Return all trials that need no other frame."""
         stages = [self.angle(stage) for stage in angle_stages(self.look.chains[self.i])]
-        degrees = range(self.look.law(self.i).shape[1])
-        sides = (1,) if self.single else _BEAMS
-        beams = [self.beam(degree, side) for degree in degrees for side in sides]
+        law, sides = self.look.law(self.i), (1,) if self.single else _BEAMS
+        beams = [self.beam(law[:, : n + 1], side) for n in range(law.shape[1]) for side in sides]
         # every wavelength of the frame is off by its own amount, or one alone
         width = np.log1p((_ANY * self.weight) ** 2)
         unknown = Trial("unknown", 0.0, float(width[self.valid].sum()))
-        return [*stages, *beams, *self.wavelength(width), unknown]
+        return [*stages, *beams, *self.wavelength(width, sides), unknown]
 
-    def wavelength(self, width):
-        """Return the trial in which the data of one wavelength are off, of three or more."""
+    def wavelength(self, width, sides):
+        """Return the trials in which the data of one wavelength are off, of three or more."""
         n = int(self.valid.sum())
         if n < _FEW:
             return []
@@ -369,10 +370,12 @@ class Frame:
         along = np.array([self._sight @ left, whiten.T @ missed])
         fall = np.divide(along**2, seen, out=np.zeros(seen.shape), where=seen > _TINY).sum(axis=0)
         best = int(np.argmax(np.where(self.valid, fall, -1.0)))
-        cost = width[best] + np.log1p(_ANY**2 * seen[1, best]) + 2 * np.log(n)
-        return [
-            Trial("one wavelength", self.as_told().chi2 - float(fall[best]), float(cost), bin=best)
-        ]
+        cost = width[best] + np.log1p(_ANY**2 * seen[1, best])
+        name, chi2 = "one wavelength", self.as_told().chi2 - float(fall[best])
+        # or one beam is off there, which a law that bends enough describes as well
+        beams = [self.beam(np.eye(len(width))[:, [best]], side) for side in sides]
+        each = [Trial(name, chi2, float(cost)), *beams]
+        return [Trial(name, one.chi2, one.cost + 2 * np.log(n), bin=best) for one in each]
 
     def angle(self, stage):
         """Return the trial in which a stage stood elsewhere."""
@@ -408,14 +411,13 @@ class Frame:
             offset, half = grid[best], 2 * half / (_POINTS - 1)
         return float(offset), float(chi2[best])
 
-    def beam(self, degree, side):
+    def beam(self, law, side):
         """
         Return the trial in which the right (1) or left (-1) beam, or a single one, was off.
 
         The logarithm of the factor is a law in wavelength. The sums take part, too: they tell
         which of the beams it was where the lamp is steady.
         """
-        law = self.look.law(self.i)[:, : degree + 1]
         size = np.zeros(law.shape[1])
         for _ in range(_NEWTON):
             left, slopes = self._of_beam(law, size, side)

@@ -124,7 +124,9 @@ def labels(entry):
     known = {}
     if entry["cell"]:
         kind = entry["cell"]["dependence"].partition(":")[0]
+        of = " (half the difference of the beams)" * (entry["cell"]["kind"] == "gain")
         known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
+        known = {key: words + of for key, words in known.items()}
         known |= {"right": _BEAMS.get(entry["cell"]["kind"])}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]

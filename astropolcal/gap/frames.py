@@ -173,10 +173,10 @@ def _single(residual, tangent, weight, least):
             return 0.0 * found
         worst = off.argmax(axis=1)[frames]
         found[frames, worst] = off[frames, worst]
-    found = np.where(found > least * spread, found / spread, 0.0)
+    # what is in many frames is there, too, where it is weaker
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
-    return found
+    return np.where(found > least * spread, found / spread, 0.0)
 
 
 def unknown_angles(observations, effect):
@@ -256,7 +256,7 @@ def _verdict(look, place, trials, n_frames):
         worst_first = sorted(rest, key=lambda trial: -trial.total)
         rivals = {t.what: t for t in worst_first if by_kind[t.what] > 1 - _TELLS}
     fault = _fault(look.problem, place, best, float(evidence), min(by_kind[what], 1.0))
-    return _of_design(look.problem, fault, rivals, 1 - weight[0])
+    return _of_design(look.problem, fault, rivals, float(1 - weight[0]))
 
 
 def _of_groups(look, found, scatter):
@@ -293,8 +293,7 @@ def _of_design(problem, fault, rivals, probability):
     if len(rivals) > 1:
         kinds = [_fault(problem, fault.place, trial, 0.0, 0.0) for trial in rivals.values()]
         each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
-        unknown = Trial("unknown", 0.0, 0.0)
-        fault = _fault(problem, fault.place, unknown, fault.evidence, float(probability))
+        fault = _fault(problem, fault.place, Trial("unknown", 0, 0), fault.evidence, probability)
         fault.words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
     if channel.groups is None:
         return fault
@@ -322,13 +321,12 @@ def _fault(problem, place, trial, evidence, probability):
         others = np.rad2deg(told + others - stood)
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
     numbers = observations.frames["frame"]
-    fault = FrameFault(observations.name, int(numbers[f]), trial.what, place=place)
-    fault.evidence, fault.probability = evidence, probability
+    told_of = {"evidence": evidence, "probability": probability, "place": place, "bin": trial.bin}
+    fault = FrameFault(observations.name, int(numbers[f]), trial.what, **told_of)
     if np.isfinite(value):
         fault.value, fault.error = value, error
     if trial.partner is not None:
         fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
-    fault.bin = trial.bin
     nm = None if trial.bin is None else observations.wavelength[trial.bin].to_value("nm")
     fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others, nm)}"
     fault.error = float(np.abs(others - value).max()) if others.size else fault.error

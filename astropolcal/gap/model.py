@@ -21,7 +21,6 @@ from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, Obser
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
-from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
@@ -272,10 +271,17 @@ class Model:
             beyond = np.maximum(low - vector, vector - high)[where]
             if np.any(beyond > _AT_LIMIT * parameter.canonical_limit):
                 return False
-        # bounds that an effect sets itself may be those of no optic; a perturbation is a change of
-        # an optic, and need not be one by itself
-        carriers = [leaf for leaf in self._carriers(name) if not isinstance(leaf, Perturbation)]
-        matrices = [leaf.mueller(self.problem.wavelength * u.um) for leaf in carriers]
+        # the optics that have its parameters, or some that follow these: bounds that an effect sets
+        # itself may be those of no optic; a perturbation is a change of an optic, and need not be
+        # one by itself
+        own = {parameter.name for parameter in self.added[name]}
+        own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
+        names = {parameter.partition(".")[0] for parameter in own}
+        matrices = [
+            leaf.mueller(self.problem.wavelength * u.um)
+            for leaf in (leaf for chain in self.trains for leaf in leaves(chain))
+            if leaf.name in names and not isinstance(leaf, Perturbation)
+        ]
         return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
     def keeps_polarization(self, name):
@@ -307,13 +313,6 @@ class Model:
                     if np.any(polarized > row[..., 0] * (1 + _MORE_LIGHT)):
                         return False
         return True
-
-    def _carriers(self, name):
-        """Return the optics that have the parameters of an effect, or some that follow these."""
-        own = {parameter.name for parameter in self.added[name]}
-        own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
-        names = {parameter.partition(".")[0] for parameter in own}
-        return [leaf for chain in self.trains for leaf in leaves(chain) if leaf.name in names]
 
     def at_bound(self, name):
         """Return how many values of an effect are at a bound of their optic."""
@@ -431,25 +430,27 @@ def starting_model(calibration, observations, library, say):
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    chains = _set_apart(chains)
     # of a calibration too: in other data a wavelength may be in another branch
     made = nominal_calibration(chains, observations)
     if _may_be_wrong(made):
+        context = Context.of(common_wavelengths(observations), observations)
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         misfit, found = _misfit(made), []
         # tables are seldom misread: that is asked where signs and reflections leave much
         misread = [e for e in discrete if isinstance(e, Misread)]
         for some in ([e for e in discrete if e not in misread], misread):
             if not found or found[0][0] > _SETTLED * misfit:
-                found = _tried(chains, observations, some, say, found)
+                found = _tried(chains, observations, some, context, say, found)
         settled = found[0][1] if found and found[0][0] <= _SETTLED * misfit else None
         if len(observations) > 1 and (settled is None or settled in misread):
             # all but one of the tables may be right
             some = misread if settled is None else [settled]
             apart = [e.in_run(o.name) for e in some for o in observations]
-            found = _tried(chains, observations, apart, say, found)
+            found = _tried(chains, observations, apart, context, say, found)
         if found and found[0][0] < _FAR_BETTER * misfit:
             say(f"calibrating: {found[0][1].title}")
-            read = _read(found[0][1], chains, observations, _context(observations))
+            read = _read(found[0][1], chains, observations, context)
             best = nominal_calibration(*read)
             if _misfit(best) < _FAR_BETTER * misfit:
                 return _with_alternative(*read, made, best, found)
@@ -457,17 +458,28 @@ def starting_model(calibration, observations, library, say):
     return nominal, nominal, []
 
 
-def _tried(chains, observations, effects, say, known):
+def _set_apart(chains):
+    """Return chains in which what an earlier diagnosis found leaves its names to this one."""
+    found = [[leaf.copy() for leaf in leaves(chain)] for chain in chains]
+    known = [leaf for one in found for leaf in one if (leaf.name or "").startswith("gap_")]
+    for leaf in known:
+        leaf.name = f"gap_earlier_{leaf.name.removeprefix('gap_')}"
+    return [join(optics) for optics in found] if known else chains
+
+
+def _tried(chains, observations, effects, context, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
-    few, context = thinned(chains, observations, _FEW), _context(observations)
-    found = list(known)
+    few, found = thinned(chains, observations, _FEW), list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
-        # where it leaves too few frames it is not asked for
-        with suppress(FitError, ObservationError):
-            found.append((_misfit(nominal_calibration(*_read(effect, *few, context))), effect))
-    misfits = np.array([misfit for misfit, _ in found])
-    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf))]
+        for one in effect.ways():
+            # where it leaves too few frames it is not asked for
+            with suppress(FitError, ObservationError):
+                found.append((_misfit(nominal_calibration(*_read(one, *few, context))), one))
+    misfits, best = np.array([misfit for misfit, _ in found]), {}
+    for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf)):
+        best.setdefault(found[i][1].name, found[i])
+    return list(best.values())
 
 
 def _read(effect, chains, observations, context):
@@ -475,13 +487,6 @@ def _read(effect, chains, observations, context):
     edges = ((o, effect.edge(o)) for o in observations)
     kept = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     return effect.edit(chains, context).chains, kept
-
-
-def _context(observations):
-    """Return what a discrete effect may know: how the plates follow the sky."""
-    names = tuple(one.name for one in observations)
-    tracking = tracking_laws(observations)
-    return Context(common_wavelengths(observations), tracking=tracking, datasets=names)
 
 
 def _misfit(calibration):

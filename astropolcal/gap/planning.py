@@ -24,6 +24,7 @@ from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
+from astropolcal.gap.effects._laws import turned_by
 from astropolcal.gap.problem import OPEN, GapProblem
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES
@@ -49,7 +50,7 @@ _LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
 # have to bring
 _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
 # dependences that a run shows, and not the frames of any other block
-_TIMED = ("time", "time2", "step", "frame")
+_TIMED = ("time", "time2")
 # log Bayes factor at which two causes are told apart
 _APART = np.log(10)
 # entries of a plan
@@ -204,8 +205,7 @@ def _blocks(run):
     plate = np.unique(np.round(run.positions["hwp"], 2))
     # a plate that follows the sky has been everywhere
     cycle = _CYCLE if len(plate) > len(_TURN) else tuple(map(float, plate[:8]))
-    usual = {name: float(np.median(angles)) for name, angles in run.positions.items()}
-    del usual["hwp"]
+    usual = {name: float(np.median(a)) for name, a in run.positions.items() if name != "hwp"}
     moved = next((name for name in ("altitude", "derotator", *usual) if name in usual), None)
     if moved is None:
         return [replace(run, positions={"hwp": angles}) for angles in (cycle, _TURN)]
@@ -294,9 +294,11 @@ def _groups(diagnosis):
                 members[one.cell or one.name][2] += share
             elif share > _LEAST_SHARE:
                 members[one.cell or one.name] = [one.name, one.recipe, share]
-        smooth = [m for m in members.values() if m[1][0].kind != "discrete"]
-        if cause.name in diagnosis.improved.added and len(smooth) > 1:
-            found.append([tuple(m) for m in smooth[:_MOST_MEMBERS]])
+        # what happened at a frame of a run need not happen in another
+        asked = [m for m in members.values() if m[1][0].kind != "discrete"]
+        asked = [m for m in asked if Dependence(m[1][0].dependence).driver != "frame"]
+        if cause.name in diagnosis.improved.added and asked[1:] and asked[0][0] == cause.name:
+            found.append([tuple(m) for m in asked[:_MOST_MEMBERS]])
     return found
 
 
@@ -363,8 +365,7 @@ def _repetitions(diagnosis):
         f"Take the run of {name} {_REPEATS} times: tells structure that no cause explains from "
         f"noise larger than stated, at {_sigmas(gain)} standard deviations"
     )
-    after = float(stats.norm.cdf(gain))
-    found = _line(words, "structure", [], float(gain), 0.5, after)
+    found = _line(words, "structure", [], float(gain), 0.5, float(stats.norm.cdf(gain)))
     return [found] if gain > LEAST_GAIN else []
 
 
@@ -553,9 +554,7 @@ def _set_up(chain, exposure):
     """Return copies of the optics of a chain as the exposure needs them."""
     train = Train(leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
     if exposure.polarizer_turned:
-        theta, angle = Roles(train).polarizer.theta, exposure.polarizer_turned
-        theta.bounds = tuple(None if b is None else b + angle for b in theta.bounds)
-        theta.value = theta.value + angle
+        turned_by(exposure.polarizer_turned)(train, Roles(train).polarizer)
     return train
 
 

@@ -111,7 +111,6 @@ def _brought(cell, run, names, chains):
         if not (optic.name or "").startswith("gap_")
     ]
     others = {o.name for n, c in zip(names, chains, strict=True) if n != run for o in c}
-    own = [name for name in mine if name not in others]
     head, _, optic = cell.place.partition(":")
     if head == "detector":
         end = len(mine)
@@ -120,7 +119,7 @@ def _brought(cell, run, names, chains):
         end = mine.index(optic) + 1 + (head == "after")
     else:
         return []
-    return [name for name in own if mine.index(name) < end]
+    return [name for name in mine[:end] if name not in others]
 
 
 # ---- in words ----------------------------------------------------------------------------------
@@ -130,8 +129,11 @@ def paragraph(content, names, asked=False):
     """Return what is to be said of the changes between runs, in a few sentences."""
     found = content["changes"]
     if not found:
-        quoted = [f'"{name}"' for name in names]
-        return [f"Nothing changed between {listed(quoted)} that the data can tell."] * asked
+        quoted = listed([f'"{name}"' for name in names])
+        words = f"Nothing changed between {quoted} that the data can tell."
+        if content["verdict"] == "unexplained":
+            words = f"What changed between {quoted} cannot be told before the gap is explained."
+        return [words] * asked
     words = [one["words"] for one in found[:_MOST]]
     if len(found) > _MOST:
         words.append(f"{len(found) - _MOST} smaller changes are listed below.")
@@ -156,7 +158,8 @@ def _sentence(cell, entry, names, wavelength, of):
     plain = _in_any_run(cell)
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
-    size = _size(entry["size"], wavelength)
+    # the size of a gain is half the difference of the beams
+    size = _size(entry["size"], wavelength, 2.0 if cell.kind == "gain" else 1.0)
     chance = f"probability {100 * entry['probability']:.0f} %{of}"
     run = entry["dataset"]
     if constant and len(names) == 2 and size:
@@ -178,12 +181,12 @@ def _number(value, error):
     return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
-def _size(parameters, wavelength):
+def _size(parameters, wavelength, times):
     """Return value, error, and unit with where, of the clearest size; nothing if all are open."""
     found = [(-1.0,)]
     for one in parameters.values():
         # what has no unit is a share
-        factor, unit = (1.0, one["unit"]) if one["unit"] else (100.0, "%")
+        factor, unit = (times, one["unit"]) if one["unit"] else (100.0 * times, "%")
         values = np.array(np.ravel(one["value"]), dtype=float)
         errors = np.array(np.ravel(one["std"]), dtype=float)
         clear = np.divide(np.abs(values), errors, out=np.full(errors.shape, -1.0), where=errors > 0)

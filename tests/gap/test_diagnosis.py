@@ -18,7 +18,7 @@ from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
-from astropolcal.gap.report import to_dict
+from astropolcal.gap.report import to_dict, with_causes
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -244,6 +244,20 @@ def test_an_alternative_that_leaves_no_pair_of_frames_is_not_asked_for():
     options = QUICK | {"effects": ["hwp_late"], "cells": False}
     found = diagnose(chain, Observations.from_table(table), **options)
     assert found.verdict == "unexplained"
+
+
+@pytest.mark.slow
+def test_what_was_found_and_saved_may_have_changed_again():
+    nominal, options = data.chain(), {"effects": ["beam_gain"], "cells": False}
+    for night, gain in enumerate((1.01, 1.03, 1.05), 1):
+        seen = data.with_flux(data.observed(seed=night), np.full(32, gain))
+        diagnosis = diagnose(nominal, seen, **options, cross_validate=False)
+        assert [cause.name for cause in diagnosis.causes] == ["beam_gain"]
+        nominal = with_causes(diagnosis.improved)
+        gains = [o.imbalance.value for o in leaves(nominal.chains[0]) if "beam_gain" in o.name]
+        assert len(gains) == night
+        assert np.allclose(sum(gains), (gain - 1) / (gain + 1), atol=1e-3)
+    assert not diagnose(nominal, seen, **options, cross_validate=False).causes
 
 
 @pytest.mark.slow

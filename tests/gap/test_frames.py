@@ -9,6 +9,7 @@ import gap_data as data
 import numpy as np
 import pytest
 from astropy.table import QTable
+from gap_setups import SETUPS
 
 from astropolcal import instruments, optics
 from astropolcal.chain import join
@@ -114,6 +115,15 @@ def test_datum_of_one_wavelength_that_was_off():
         assert np.argwhere(kept.mask).tolist() == [[frame, k]]
 
 
+def test_one_wavelength_of_three_is_no_beam():
+    setup = SETUPS["vampires"]()
+    for factors, what in (((1, 1.1, 1), "one wavelength"), ((1.03, 1.05, 1.02), "one beam")):
+        seen = setup.observed(flux=1e6).to_table()
+        seen["flux_left"][seen["frame"] == 21] *= np.array(factors)
+        (fault,) = found_of(setup.nominal, Observations.from_table(seen, name="lamp"))
+        assert (fault.frame, fault.what) == (21, what)
+
+
 @pytest.mark.slow
 def test_single_data_in_many_frames_are_left_out_and_counted():
     observations, chains, case = make_challenge(6, kind="listed", snr=40)
@@ -140,6 +150,20 @@ def test_noise_of_one_wavelength_is_no_single_datum():
     seen["flux_left"][here] *= 1 + 0.1 * np.random.default_rng(6).normal(size=here.sum())
     assert single_data(data.fitted(Observations.from_table(seen, name="lamp"))) == []
     assert single_data(data.clean_model()) == []
+
+
+def test_what_is_narrow_in_wavelength_but_in_all_frames_is_no_single_data():
+    """Such as the line of a filter that turns with the derotator, a bin wide."""
+    charis = instruments.get("charis")
+    chain = charis.chain(derotator="linear")
+    frames = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
+    clean = simulate(chain, charis.wavelength, frames, flux=1e6, seed=1, name="lamp").to_table()
+    turn, line = np.cos(2 * clean["derotator"]), np.exp(-((clean["bin"] - 9.0) ** 2))
+    for size in (0.04, 0.1):
+        seen = clean.copy()
+        seen["flux_left"] *= 1 + size * turn * line
+        model = nominal_model([chain], [Observations.from_table(seen, name="lamp")])
+        assert single_data(model) == []
 
 
 def test_clean_frames_are_not_accused():

@@ -7,14 +7,16 @@ import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
+from gap_setups import SETUPS
 
 from astropolcal import instruments
 from astropolcal.gap import diagnose
 from astropolcal.gap.challenge import make_challenge
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.model import Model, nominal_model
+from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.gap.report import Fitted, to_dict
+from astropolcal.observations import Observations
 from astropolcal.simulation import simulate
 
 DIATTENUATOR = "static_diattenuator"
@@ -139,6 +141,19 @@ def test_wavelengths_in_a_wrong_mirror_branch_are_no_gap():
 
 
 @pytest.mark.slow
+def test_another_zero_of_a_stage_is_found_in_both_directions():
+    """A plate that is no exact half-wave plate is another one when it is turned by 90 deg."""
+    setup = SETUPS["irdis star"]()
+    for by in (45, -45):
+        table = setup.observed(flux=1e6).to_table()
+        table["derotator"] += by * u.deg
+        seen = [Observations.from_table(table, name="night")]
+        tried = [get_effect("derotator_offset")]
+        _, model, found = starting_model(setup.nominal, seen, tried, lambda line: None)
+        assert found, by
+        assert model.p_value > 0.01, by
+
+
 def test_a_known_mounting_is_no_row_of_the_data():
     """What is worked out of the rows knows which of them are data: page, proposals, places."""
     fault = {"type": "cell", "place": "in:hwp", "kind": "rotation", "dependence": "time"}

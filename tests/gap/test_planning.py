@@ -69,6 +69,11 @@ def test_what_is_the_same_everywhere_is_said_to_be(full):
     assert found["probability_after"] == found["probability_now"] == pytest.approx(0.52)
 
 
+def test_what_happened_at_a_frame_is_not_expected_in_another_run(model):
+    steps = [CellEffect(Cell("after:hwp", "rotation", f"step:{n}"), 0) for n in (14, 15)]
+    assert plan(even(model.with_effect(steps[0]), *steps)) == []
+
+
 def test_a_brighter_lamp_tells_more(full):
     where = {"hwp": CYCLE, "derotator": 150.0}
     gains = [

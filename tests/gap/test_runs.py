@@ -131,6 +131,24 @@ def test_nothing_changed_is_said_where_it_was_asked():
     assert "Nothing changed between" in summary(found)
 
 
+@pytest.mark.slow
+def test_a_gain_is_told_as_the_difference_of_the_beams():
+    runs = pair()
+    runs[1] = data.with_flux(runs[1], np.full(runs[1].n_frames, 1.02))
+    found = diagnose(data.chain(), runs, changes=True, cross_validate=False)
+    (change,) = to_dict(found)["changes"]
+    assert (
+        "the gain of one beam against the other at the detector changed by 2.0" in change["words"]
+    )
+    assert "size (half the difference of the beams): " in summary(found)
+
+
+def test_of_a_gap_without_a_cause_it_is_not_said_that_nothing_changed():
+    content = {"changes": [], "verdict": "unexplained"}
+    assert "cannot be told" in paragraph(content, (JULY, OCTOBER), asked=True)[0]
+    assert paragraph(content, (JULY, OCTOBER)) == []
+
+
 @pytest.mark.long
 def test_one_of_three_runs_differs():
     runs = [*pair(names=("a", "b")), data.observed(with_cell(BEHIND), seed=9, name="c")]

@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Effects that are laws of physics, or exchange optics, and no perturbations at a place."""
 
-import copy
-
 import astropy.units as u
 import numpy as np
 from scipy.linalg import helmert
@@ -402,6 +400,8 @@ class Alternative(Effect):
     reference = "McIntosh et al. 2026, Sec. 4; the reflections and signs of a chain"
     #: Function of chain, roles, the optic and the law of its tracking that changes the chain.
     change = None
+    #: The function that changes it the other way, where there are two that have one name.
+    back = None
 
     def __init__(self, name, title, words, role, change=None, shows=None, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role
@@ -410,6 +410,10 @@ class Alternative(Effect):
     def cells(self, chains):
         """Return none: an alternative is not a perturbation."""
         return ()
+
+    def ways(self):
+        """Return the alternative, and that which changes the chain the other way."""
+        return [self] if self.back is None else [self, self.changed(change=self.back)]
 
     def edge(self, observations):
         """Return the frames, (F,) of bool, of which the alternative knows no angle: none."""
@@ -452,10 +456,8 @@ class Misread(Alternative):
 
     def in_run(self, name):
         """Return the same for the table of one of several datasets."""
-        one = copy.copy(self)
-        one.run, one.name = name, f"{self.name}/dataset:{name}"
-        one.title = f'{self.title} of "{name}" only'
-        return one
+        title = f'{self.title} of "{name}" only'
+        return self.changed(run=name, name=f"{self.name}/dataset:{name}", title=title)
 
     def edit(self, chains, context):
         """Return the changed chains, of one dataset only where it is of one."""

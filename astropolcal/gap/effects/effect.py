@@ -8,6 +8,7 @@ effect would do to the data; fitted, the edited chains are ordinary chains again
 
 import copy
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -45,7 +46,7 @@ _SAME = 1e-9
 _SETTINGS = (
     *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
     *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
-    "change",
+    *("change", "back"),
 )
 
 
@@ -203,10 +204,9 @@ def tracking_laws(observations):
     """
     found = []
     for one in observations:
-        try:
+        law = None
+        with suppress(InstrumentError):
             law = one.instrument and instruments.get(one.instrument).plate_law(one)
-        except InstrumentError:
-            law = None
         found.append(law or TRACKING)
     return tuple(found)
 

@@ -527,9 +527,9 @@ _ALTERNATIVES = [
             "everywhere: the differences have the wrong sign"),
     # two plates 45 deg apart differ by the sign of Q and U: polarization turned by 90 deg
     _turned("hwp_offset", _OFFSET.format("half-wave plate"), "plate", laws.turned_by(45),
-            "everywhere: the polarization is turned by 90 deg"),
+            "everywhere: the polarization is turned by 90 deg", back=laws.turned_by(-45)),
     _turned("derotator_offset", _OFFSET.format("derotator"), "derotator", laws.turned_by(45),
-            _BY_DEROTATOR),
+            _BY_DEROTATOR, back=laws.turned_by(-45)),
     _turned("parallactic_sign", "parallactic angle with the wrong sign", "parallactic",
             laws.other_sign, "polarization of stars that turns with the parallactic angle",
             reference=_SIGNS),
