@@ -132,7 +132,7 @@ def paragraph(content, names, asked=False):
         quoted = listed([f'"{name}"' for name in names])
         words = f"Nothing changed between {quoted} that the data can tell."
         if content["verdict"] == "unexplained":
-            words = f"What changed between {quoted} cannot be told before the gap is explained."
+            words = f"What changed between {quoted} is not known before the gap is explained."
         return [words] * asked
     words = [one["words"] for one in found[:_MOST]]
     if len(found) > _MOST:
