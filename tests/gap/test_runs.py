@@ -145,7 +145,7 @@ def test_a_gain_is_told_as_the_difference_of_the_beams():
 
 def test_of_a_gap_without_a_cause_it_is_not_said_that_nothing_changed():
     content = {"changes": [], "verdict": "unexplained"}
-    assert "cannot be told" in paragraph(content, (JULY, OCTOBER), asked=True)[0]
+    assert "is not known" in paragraph(content, (JULY, OCTOBER), asked=True)[0]
     assert paragraph(content, (JULY, OCTOBER)) == []
 
 
