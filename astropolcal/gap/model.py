@@ -46,7 +46,7 @@ _MORE_LIGHT = 1e-3
 # alternatives are tried where double differences are off by more than this
 _WRONG_SIGN = 0.02
 # or by more than this share of the signal and so many times the noise, as those of stars are
-_WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
+_WRONG_SHARE, _ABOVE_NOISE = 0.1, 3.0
 # an alternative must lower the residuals to this share, and those within a tenth are aliases
 _FAR_BETTER, _ALIKE = 0.5, 1.1
 # one that leaves more than this share is no answer before the others were tried

@@ -210,6 +210,16 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
 
 
 @pytest.mark.slow
+def test_a_misread_angle_is_found_where_the_star_is_hardly_polarized():
+    setup = SETUPS["irdis star"]()
+    table = setup.observed(flux=1e6).to_table()
+    table["derotator"] /= 2
+    found = diagnose(setup.nominal, Observations.from_table(table, name="night"), **QUICK)
+    assert found.verdict == "named"
+    assert names(found.causes[0]) == ["derotator_halved"]
+
+
+@pytest.mark.slow
 def test_of_two_tables_the_one_that_is_misread_is_named():
     first, second = (data.observed(flux=1e7, seed=seed, name=f"run {seed}") for seed in (1, 2))
     table = second.to_table()
