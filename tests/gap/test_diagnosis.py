@@ -413,10 +413,11 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
         # two percent is a sign that may be wrong, whatever the signal
         (0.9, 0.021, 1e-3, True),
         (0.9, 0.019, 1e-3, False),
-        # of a small signal a third is enough, if it is above the noise
+        # of a small signal a tenth is enough, if it is above the noise
         (0.01, 0.004, 1e-3, True),
         (0.01, 0.004, 2e-3, False),
-        (0.01, 0.002, 1e-4, False),
+        (0.01, 0.0011, 1e-4, True),
+        (0.01, 0.0009, 1e-4, False),
         # what has no stated errors has no noise to compare with
         (0.01, 0.004, np.nan, True),
     ]
