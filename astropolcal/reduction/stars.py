@@ -54,13 +54,7 @@ def measure_stars(
     around them have beyond it. The options are described in `reduce_run`.
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked)
-    corrections = (False, True, "growth")
-    check_choice("aperture_correction", aperture_correction, corrections, ParameterError)
-    if aperture_correction is True and not layout.two_beams:
-        raise ParameterError(
-            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
-            "the wings is that of two beams, allowed are False and 'growth'"
-        )
+    _check_correction(aperture_correction, layout)
     result = Photometry.empty(len(cube), len(layout.beams))
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
@@ -119,6 +113,16 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
+
+
+def _check_correction(aperture_correction, layout):
+    corrections = (False, True, "growth")
+    check_choice("aperture_correction", aperture_correction, corrections, ParameterError)
+    if aperture_correction is True and not layout.two_beams:
+        raise ParameterError(
+            f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
+            "the wings is that of two beams, allowed are False and 'growth'"
+        )
 
 
 def _mean(cube, good):
