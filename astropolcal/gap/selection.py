@@ -82,9 +82,9 @@ _ONE_COURSE, _AS_WELL = 0.65, 1.5
 # and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
 # right, and none of 53 to cells; of other cells one or another is there
 _BETTER_COURSE, _BETTER = 0.85, -2.8
-# and where two causes have the same course, or the same place and kind: of such answers to
-# mechanisms 2 of 16 and 2 of 10 causes given with 0.8 were right; of 229 to pairs none was of the
-# first sort, and all six of the second were right
+# and where two causes have the same course, or the same place and kind: of such causes given to
+# mechanisms with 0.8 or more 2 of 16 and 2 of 10 were right (4 of 10 if any law counts); of 229
+# answers to pairs none was of the first sort, and all six of the second were right
 _ALIKE_CAUSES = {"course": 0.85, "action": 0.5, "": 0.0}
 # from this probability on it is told
 _MAY_BE = 0.3
