@@ -28,8 +28,13 @@ _SIZES = (0.1, 1.0, 10.0)
 # laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
 # None for one value per wavelength
 _DEGREES, _FREER = (0, 2), (4, None)
+# of so many cells a law that is free at each wavelength is asked for, where there is so many times
+# as much evidence for it as for any smooth one
+_SHARP, _SHARPER = 3, 2.0
 # so many named effects stand in the same chain: each sees the light through all the others
 _TOGETHER = 20
+#: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
+ENOUGH = 10.0
 #: What explains the data less well than another by less than this (log evidence) is its alias.
 ALIKE = 7.0
 #: Prior odds of a name against a cell of the table.
@@ -252,7 +257,42 @@ def _cells(probes, temper):
         for same, waves in probes.grouped(names):
             by_law = [(d, whole.first(law.shape[1]).normal(waves)) for d, law in laws.items()]
             found += _candidates(place, kind, same, by_law, temper)
+    # where none of these laws is half as good as one that is free
+    least = max([ENOUGH, *(_SHARPER * one.evidence for one in found)])
+    sharp = [
+        one
+        for cell in _sharpest(probes, temper, least)
+        for one in _of_cell(probes, cell, None, temper)
+    ]
+    better = {one.name: one for one in sharp if one.evidence > least}
+    found = [one for one in found if one.name not in better] + [*better.values()]
     return [one for one in found if one.name not in probes.own]
+
+
+def _sharpest(probes, temper, least):
+    """
+    Return the few cells with most evidence for another size at each wavelength, best first.
+
+    What changes from one wavelength to the next, as fringes do, is in no smooth law. What the model
+    absorbs of it is left out here, and no two wavelengths or waves are taken to share anything.
+    """
+    found = []
+    for (place, kind), slopes in probes.slopes.items():
+        scale, tables = Cell(place, kind, "constant").scale, probes.by_wavelength(slopes)
+        for names, waves in probes.grouped(probes.dependences_of(place, kind)):
+            target, gram = (
+                sum(
+                    np.einsum("nmf,fw->nmw", w**power, part[i])
+                    for w, part in zip(waves, tables, strict=True)
+                )
+                for i, power in enumerate((1, 2))
+            )
+            gram, target = (x.reshape(len(names), -1) for x in (gram, target))
+            share = np.divide(target**2, gram, out=np.zeros_like(gram), where=gram > 0)
+            factors = _log_factor(gram, share, scale, temper)
+            found += [(f + _prior(n), place, kind, n) for f, n in zip(factors, names, strict=True)]
+    found = sorted((one for one in found if one[0] > least), reverse=True)
+    return [Cell(*cell) for _, *cell in found[:_SHARP]]
 
 
 def _bent(probes, place, kind, law):

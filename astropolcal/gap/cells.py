@@ -397,6 +397,20 @@ class Probes:
             ]
         return self._groups[key]
 
+    def by_wavelength(self, slopes):
+        """Return, per dataset, derivative times residual and derivative squared, each (F, W)."""
+        problem, found = self.problem, []
+        for i, (dataset, channel, rows) in enumerate(
+            zip(problem.datasets, problem.channels, problem.segments, strict=True)
+        ):
+            tables = np.zeros((2, channel.shape[2], len(problem.wavelength)))
+            if i in slopes:
+                white = channel.whiten_frames(slopes[i])
+                both = white * self.residual[rows].reshape(white.shape), white**2
+                tables[..., dataset.bins] = [part.sum(axis=0).T for part in both]
+            found.append(tables)
+        return found
+
     def steps_near(self, cell):
         """Return the cells of the steps between one that was looked at and its neighbours."""
         text, run = split_run(cell.dependence)

@@ -20,7 +20,7 @@ from scipy.special import expit
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
-from astropolcal.gap.attribution import ALIKE, preference, scan
+from astropolcal.gap.attribution import ALIKE, ENOUGH, preference, scan
 from astropolcal.gap.cells import Cell, alike, count_runs
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -39,8 +39,6 @@ _AS_GOOD, _CLEARLY = 1.0, 3.0
 REMAINDER = 1e-4
 # and more probable than this they may be
 _NOISE = 1e-3
-#: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
-ENOUGH = 10.0
 _MOST = 8
 # of several runs together, for each run
 _MOST_TOGETHER = 10

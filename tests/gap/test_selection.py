@@ -14,7 +14,7 @@ from gap_setups import SETUPS
 
 from astropolcal.gap.attribution import Candidate, Scan
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.challenge import make_challenge, score_answer
+from astropolcal.gap.challenge import Setup, make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS
 from astropolcal.gap.model import nominal_model
@@ -134,6 +134,22 @@ def test_a_law_of_any_form_is_one_cause():
     assert [group.best.name for group in found.groups] == ["beam_gain"]
     sizes = Fitted(found.model).sizes("beam_gain")["gap_beam_gain.imbalance"]
     np.testing.assert_allclose(sizes["value"], true["gap_beam_gain"].imbalance.value, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_what_only_a_free_law_shows_is_found():
+    """Fringes change sign between wavelengths: no smooth law has anything of them."""
+    small = Setup(n_derotator=4)
+    for seed, turns in ((4, "hwp:2"), (8, "derotator:4"), (11, "hwp:1")):
+        made = make_challenge(
+            seed, kind="mechanism", snr=20, setup=small, fault={"what": "fringes"}
+        )
+        observations, chains, case = made
+        (cause,) = diagnose(chains, observations).causes
+        fault = case["faults"][0]
+        assert (cause.cell.place, cause.cell.kind) == (fault["place"], fault["kind"])
+        assert cause.cell.dependence == f"harmonic:{turns}"
+        assert cause.probability > 0.9
 
 
 def test_equally_probable_aliases_have_one_order():
