@@ -279,6 +279,10 @@ def details(entry, ranks):
             f"It resembles {listed(both)}: the data ask for both, "
             "but how much belongs to which is uncertain."
         )
+    cell = entry["cell"] or {"kind": ""}
+    if cell["kind"].startswith("depolarization") and cell["place"].startswith("after:"):
+        changes = not cell["dependence"].startswith(("constant", "dataset"))
+        texts += ["Added light, such as a background, that changes so may do the same."] * changes
     if entry["kind"] == "discrete":
         return [*texts, "It is an alternative to the model and has no size."]
     strength, rest = entry["significance"], entry["trades_with"]
@@ -330,6 +334,14 @@ def _faults(frames, several):
 def correct(entry):
     """Return what is to be done with a table of which the angles are misread."""
     return f"Correct the table first: {title(entry)} ({share(entry['probability'])})."
+
+
+def fails(name):
+    """Return that a part of a run does not fit, and what may be the matter."""
+    return (
+        f'The model does not fit "{name}", though it fits all other frames: look at what changed '
+        "there first, such as a frame that is missing or angles that are not those of the table."
+    )
 
 
 def _what(content):

@@ -223,6 +223,16 @@ def _gap_of_fit(model):
     return 100 * float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
 
 
+def _excess(model):
+    """Return the mean square of the differences' residuals over the errors that tables state."""
+    gaps, channels = model.problem.differences(model.fit.coefficients), model.problem.channels
+    parts = [
+        (np.square(c.gap(g)) - (c.variance[c.told] if c.stated else 0.0))[c.valid]
+        for g, c in zip(gaps, channels, strict=True)
+    ]
+    return max(float(np.mean(np.concatenate(parts))), 1e-300)
+
+
 @in_one_thread
 def diagnose(
     calibration,
@@ -302,7 +312,11 @@ def diagnose(
     observations = distinct(observations, changes)
     groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")
-    nominal, base, exchanged = starting_model(calibration, observations, library, say)
+    nominal, base, exchanged, where = starting_model(calibration, observations, library, say)
+    if len(base.observations) > len(observations):
+        # one of them in two parts
+        observations = base.observations
+        groups = groups and frame_groups(observations)
     edges = unknown_angles(observations, exchanged[0]) if exchanged else []
     say("looking for frames that are not what the table says")
     single = []
@@ -329,7 +343,7 @@ def diagnose(
         nominal = base = _with_noise_of(base, selection)
         selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     found = _conclude(nominal, base, exchanged, selection, edges + frames, started)
-    found.settings["changes"] = changes
+    found.settings |= {"changes": changes, "fails": where}
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)
         found.seconds = time.perf_counter() - started
@@ -435,7 +449,9 @@ def _exchanged(nominal, base, improved, exchanged, total):
     """Return the cause that an alternative is, as sure as all causes explain the gap."""
     effect, *others = exchanged
     excess = improved.fit.chi2 - (improved.problem.n_data - improved.problem.size)
-    sure = _SURE_SIGN * (1 - min(max(excess / total, 0.0), 1.0))
+    # noise that the residuals themselves told may hold much of what is left
+    left = max(excess / total, _excess(improved) / _excess(nominal))
+    sure = _SURE_SIGN * (1 - min(max(left, 0.0), 1.0))
     aliases = [(Candidate(other, None, 0.0, 1, 0.0), 1 / len(exchanged)) for other in others]
     share = (nominal.fit.chi2 - base.fit.chi2) / total
     return Cause(effect, None, float(sure), aliases, 1 / len(exchanged), 0.0, float(share))

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
+from astropy.modeling.fitting import TRFLSQFitter
 from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
@@ -51,9 +52,12 @@ _WRONG_SHARE, _ABOVE_NOISE = 0.1, 3.0
 _FAR_BETTER, _ALIKE = 0.5, 1.1
 # one that leaves more than this share is no answer before the others were tried
 _SETTLED = 0.25
+# the part of a run that a model fits is at least one in so many of the frames, and its misfit at
+# most such a share of that of the whole; with so many frames more it is twice that
+_LEAST_PART, _FITS, _SUDDEN = 4, 0.1, 4
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
-_FEW = 3
+_FEW, _EVALUATIONS = 3, 30
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -403,7 +407,14 @@ def _lower(problem, vector, found):
     return other if other.converged and other.chi2 < found.chi2 else found
 
 
-def nominal_calibration(chains, observations):
+class _Glance(TRFLSQFitter):
+    """A fitter that gives up soon: what fits gets there, and what does not is no answer."""
+
+    def __call__(self, *arguments, maxiter, **settings):
+        return super().__call__(*arguments, maxiter=min(maxiter, _EVALUATIONS), **settings)
+
+
+def nominal_calibration(chains, observations, fitter=None):
     """
     Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
     """
@@ -415,7 +426,7 @@ def nominal_calibration(chains, observations):
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         instrument = next((o.instrument for o in observations if o.instrument), None)
-        options = {"cross_validate": False, "instrument": instrument}
+        options = {"cross_validate": False, "instrument": instrument, "fitter": fitter}
         return calibrate(list(chains), list(observations), **options)
 
 
@@ -424,7 +435,8 @@ def starting_model(calibration, observations, library, say):
     Return the nominal model, that of the discrete alternative that beats it, and which this is.
 
     Where none does, the second is the nominal model again and the third an empty list; else the
-    alternative is followed by its aliases.
+    alternative is followed by its aliases. The fourth says up to or from which frame the model does
+    not fit, though it fits all others, where that is so.
     """
     chains = calibration.chains if isinstance(calibration, Calibration) else calibration
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
@@ -432,30 +444,91 @@ def starting_model(calibration, observations, library, say):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
     chains = _set_apart(chains)
     # of a calibration too: in other data a wavelength may be in another branch
-    made = nominal_calibration(chains, observations)
+    made, where = nominal_calibration(chains, observations), ""
     if _may_be_wrong(made):
-        context = Context.of(common_wavelengths(observations), observations)
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
-        misfit, found = _misfit(made), []
-        # tables are seldom misread: that is asked where signs and reflections leave much
-        misread = [e for e in discrete if isinstance(e, Misread)]
-        for some in ([e for e in discrete if e not in misread], misread):
-            if not found or found[0][0] > _SETTLED * misfit:
-                found = _tried(chains, observations, some, context, say, found)
-        settled = found[0][1] if found and found[0][0] <= _SETTLED * misfit else None
-        if len(observations) > 1 and (settled is None or settled in misread):
-            # all but one of the tables may be right
-            some = misread if settled is None else [settled]
-            apart = [e.in_run(o.name) for e in some for o in observations]
-            found = _tried(chains, observations, apart, context, say, found)
-        if found and found[0][0] < _FAR_BETTER * misfit:
+        found, read, where = _alternatives(chains, observations, made, discrete, say)
+        most = _FAR_BETTER * _misfit(made)
+        if found and found[0][0] < most:
             say(f"calibrating: {found[0][1].title}")
-            read = _read(found[0][1], chains, observations, context)
+            *read, given = read
+            read = _read(found[0][1], *read)
             best = nominal_calibration(*read)
-            if _misfit(best) < _FAR_BETTER * misfit:
-                return _with_alternative(*read, made, best, found)
+            if _misfit(best) < most:
+                return *_with_alternative(*read, given, best, found), where
     nominal = nominal_model(chains, observations, made)
-    return nominal, nominal, []
+    return nominal, nominal, [], where
+
+
+def _alternatives(chains, observations, made, discrete, say):
+    """
+    Return misfit and effect of discrete alternatives, best first.
+
+    With them, the chains, datasets and calibration of which they are alternatives, and the name of
+    the part of a dataset that does not fit, see `_parts`.
+    """
+    misfit, asked, found = _misfit(made), (chains, observations, made), []
+    # tables are seldom misread: that is asked where signs and reflections leave much
+    misread = [e for e in discrete if isinstance(e, Misread)]
+    for some in ([e for e in discrete if e not in misread], misread):
+        if not found or found[0][0] > _SETTLED * misfit:
+            found = _tried(chains, observations, some, say, found)
+    settled = bool(found) and found[0][0] <= _SETTLED * misfit
+    where = ""
+    if not settled:
+        # or in a part of the run: there is a frame too many, or one was lost
+        *parts, where = _parts(chains, observations, misfit, say)
+        partly = [e.in_run(where) for e in discrete if where and e.may_be_in_part]
+        inside = [one for one in _tried(*parts, partly, say, []) if one[0] < _SETTLED * misfit]
+        if inside:
+            return inside, (*parts, nominal_calibration(*parts)), where
+    if len(observations) > 1 and (not settled or found[0][1] in misread):
+        # all but one of the tables may be right
+        some = [found[0][1]] if settled else misread
+        apart = [e.in_run(o.name) for e in some for o in observations]
+        found = _tried(chains, observations, apart, say, found)
+    return found, asked, where
+
+
+def _parts(chains, observations, misfit, say):
+    """
+    Return chains and datasets, one of these in two parts, and the name of that which does not fit.
+
+    The other part is the longest that the model fits with all other datasets, from the first frame
+    on or up to the last. Without such a part they are as they were, and the name is empty.
+    """
+    say("where the model begins to fail")
+    few_chains, few = thinned(chains, observations, _FEW)
+    for i, whole in enumerate(observations):
+        forward = np.argsort(whole.position("sequence"), kind="stable")
+        for order, words in ((forward, "from"), (forward[::-1], "up to")):
+            others = few[:i], few[i + 1 :]
+            good = _fitting(few_chains, *others, few[i], order, misfit)
+            if good < len(order):
+                number = int(whole.frames["frame"][order[good]])
+                parts = [whole.select(np.sort(part)) for part in (order[:good], order[good:])]
+                parts[1].name = f"{whole.name} {words} frame {number}"
+                split = [*observations[:i], *parts, *observations[i + 1 :]]
+                return [*chains[: i + 1], *chains[i:]], split, parts[1].name
+    return chains, observations, ""
+
+
+def _fitting(chains, before, after, whole, order, misfit):
+    """Return how many frames of a dataset the model fits, all if it is not clear which."""
+
+    def share(n):
+        kept = [*before, whole.select(np.sort(order[:n])), *after]
+        return _tried_misfit(chains, kept) / misfit
+
+    good, bad = len(order) // _LEAST_PART, len(order)
+    if share(good) > _FITS:
+        return bad
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        good, bad = (middle, bad) if share(middle) <= _FITS else (good, middle)
+    # at once, not little by little
+    sudden = share(min(good + _SUDDEN, len(order))) > 2 * _FITS
+    return good if sudden else len(order)
 
 
 def _set_apart(chains):
@@ -467,23 +540,33 @@ def _set_apart(chains):
     return [join(optics) for optics in found] if known else chains
 
 
-def _tried(chains, observations, effects, context, say, known):
+def _tried(chains, observations, effects, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
     few, found = thinned(chains, observations, _FEW), list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
         for one in effect.ways():
-            # where it leaves too few frames it is not asked for
-            with suppress(FitError, ObservationError):
-                found.append((_misfit(nominal_calibration(*_read(one, *few, context))), one))
+            found.append((_tried_misfit(*_read(one, *few)), one))
+    # where it leaves too few frames it is not asked for
+    found = [one for one in found if np.isfinite(one[0])]
     misfits, best = np.array([misfit for misfit, _ in found]), {}
     for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf)):
         best.setdefault(found[i][1].name, found[i])
     return list(best.values())
 
 
-def _read(effect, chains, observations, context):
+def _tried_misfit(chains, observations):
+    """Return the misfit of a fit on the way, infinite where frames are too few."""
+    with warnings.catch_warnings(), suppress(FitError, ObservationError):
+        # of what is not the answer a user is not warned
+        warnings.simplefilter("ignore", AstropolcalWarning)
+        return _misfit(nominal_calibration(chains, observations, _Glance()))
+    return np.inf
+
+
+def _read(effect, chains, observations):
     """Return the chains with an alternative, and the frames of which it knows the angles."""
+    context = Context.of(common_wavelengths(observations), observations)
     edges = ((o, effect.edge(o)) for o in observations)
     kept = [o.with_mask(f, "angle in no row") if f.any() else o for o, f in edges]
     return effect.edit(chains, context).chains, kept

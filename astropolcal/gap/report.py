@@ -158,6 +158,8 @@ def _worked_out(diagnosis):
     if misread and causes[0]["probability"] >= 0.5:
         # before all optics, and before what else is not known
         words.insert(0, _words.correct(causes[0]))
+    if diagnosis.settings.get("fails") and diagnosis.verdict == "unexplained":
+        words.insert(0, _words.fails(diagnosis.settings["fails"]))
     return plain(content | {"sentences": words})
 
 

@@ -149,7 +149,7 @@ def test_another_zero_of_a_stage_is_found_in_both_directions():
         table["derotator"] += by * u.deg
         seen = [Observations.from_table(table, name="night")]
         tried = [get_effect("derotator_offset")]
-        _, model, found = starting_model(setup.nominal, seen, tried, lambda line: None)
+        _, model, found, _ = starting_model(setup.nominal, seen, tried, lambda line: None)
         assert found, by
         assert model.p_value > 0.01, by
 

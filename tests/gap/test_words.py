@@ -96,6 +96,17 @@ def said(one, ranks=()):
     return _words.cause(one | {"details": _words.details(one, dict(ranks))})
 
 
+def test_added_light_that_changes_looks_like_a_depolarization():
+    for where_it_is, kind, dependence, told in (
+        ("after:derotator", "depolarization_h", "time", True),
+        ("after:derotator", "depolarization_h", "constant", False),
+        ("in:derotator", "depolarization_h", "time", False),
+        ("after:derotator", "retardance_h", "time", False),
+    ):
+        words = said(entry(cell(where_it_is, kind, dependence)))
+        assert ("background" in words) == told
+
+
 # ---- numbers and names ----------------------------------------------------------------------
 
 

@@ -402,6 +402,9 @@ class Alternative(Effect):
     change = None
     #: The function that changes it the other way, where there are two that have one name.
     back = None
+    #: Name of the only dataset of several in which it is so, None for all; whether it may be so in
+    #: one of them, or in a part of it.
+    run, may_be_in_part = None, False
 
     def __init__(self, name, title, words, role, change=None, shows=None, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role
@@ -415,19 +418,25 @@ class Alternative(Effect):
         """Return the alternative, and that which changes the chain the other way."""
         return [self] if self.back is None else [self, self.changed(change=self.back)]
 
+    def in_run(self, name):
+        """Return the same for the table of one of several datasets."""
+        title = f'{self.title} of "{name}" only'
+        return self.changed(run=name, name=f"{self.name}/dataset:{name}", title=title)
+
     def edge(self, observations):
         """Return the frames, (F,) of bool, of which the alternative knows no angle: none."""
         return np.zeros(observations.n_frames, dtype=bool)
 
     def edit(self, chains, context):
         """Return the changed chains; nothing is added that could be fitted."""
+        names = (None,) * len(chains) if self.run is None else context.datasets
         # tables hold true angles; the law tells which part of them came from the sky
         laws = () if context is None else context.tracking
         laws = laws if len(laws) == len(chains) else [TRACKING] * len(chains)
         edited = []
-        for chain, law in zip(chains, laws, strict=True):
+        for chain, law, name in zip(chains, laws, names, strict=True):
             roles = self.roles(chain)
-            if self.applies_to(roles):
+            if name == self.run and self.applies_to(roles):
                 index = roles.leaves.index(self.where.anchor(roles))
                 chain = chain.copy()
                 own = leaves(chain)[index]
@@ -440,8 +449,7 @@ class Misread(Alternative):
     """Angles of stages that are not those of the table; asked for where no other alternative is."""
 
     reference = "the writing of tables; no paper is known"
-    #: Name of the only dataset of several whose table is misread, None for all.
-    run = None
+    may_be_in_part = True
 
     def __init__(self, name, title, words, role, shows, stages, what, rate):
         super().__init__(name, title, words, role, shows=shows)
@@ -453,19 +461,6 @@ class Misread(Alternative):
         """Return whether there are optics on all of the stages."""
         stages = {leaf.stage for leaf in roles.leaves}
         return super().applies_to(roles) and stages.issuperset(self.stages)
-
-    def in_run(self, name):
-        """Return the same for the table of one of several datasets."""
-        title = f'{self.title} of "{name}" only'
-        return self.changed(run=name, name=f"{self.name}/dataset:{name}", title=title)
-
-    def edit(self, chains, context):
-        """Return the changed chains, of one dataset only where it is of one."""
-        edited = super().edit(chains, context).chains
-        if self.run is not None:
-            trios = zip(context.datasets, chains, edited, strict=True)
-            edited = [new if name == self.run else old for name, old, new in trios]
-        return Edit(edited, [])
 
     def edge(self, observations):
         """Return the frames, (F,) of bool, whose angle is in no row of their table."""
@@ -504,6 +499,13 @@ def other_sign(chain, optic, **_):
     """Return a chain with the sign of the stage of an optic turned."""
     optic.mount = optic.stage if optic.stage_sign < 0 else f"-{optic.stage}"
     return chain
+
+
+def exchanged(chain, optic, *, label, **_):
+    """Return a chain in which the two beams of a splitter are exchanged."""
+    # half a turn of its axes, by which it stays as it is itself
+    turn = optics.Rotator(theta=90 * u.deg, name=label, fixed={"theta": True})
+    return insert_optic(chain, turn, before=optic.name)
 
 
 def turned_by(degrees):

@@ -522,9 +522,8 @@ _ALTERNATIVES = [
     _turned("hwp_sign", _SIGN.format("half-wave plate"), "plate", laws.other_sign, _TURNED),
     _turned("derotator_sign", _SIGN.format("derotator"), "derotator", laws.other_sign,
             _BY_DEROTATOR),
-    # T(-90) exchanges the axes of the prism, and with them the beams
-    _turned("beams_swapped", "right and left beam exchanged", "splitter", laws.turned_by(90),
-            "everywhere: the differences have the wrong sign"),
+    _turned("beams_swapped", "right and left beam exchanged", "splitter", laws.exchanged,
+            "everywhere: the differences have the wrong sign").changed(may_be_in_part=True),
     # two plates 45 deg apart differ by the sign of Q and U: polarization turned by 90 deg
     _turned("hwp_offset", _OFFSET.format("half-wave plate"), "plate", laws.turned_by(45),
             "everywhere: the polarization is turned by 90 deg", back=laws.turned_by(-45)),
