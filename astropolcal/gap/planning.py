@@ -16,8 +16,8 @@ from itertools import product
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import ndtr
 
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves, stages
@@ -365,7 +365,7 @@ def _repetitions(diagnosis):
         f"Take the run of {name} {_REPEATS} times: tells structure that no cause explains from "
         f"noise larger than stated, at {_sigmas(gain)} standard deviations"
     )
-    found = _line(words, "structure", [], float(gain), 0.5, float(stats.norm.cdf(gain)))
+    found = _line(words, "structure", [], float(gain), 0.5, float(ndtr(gain)))
     return [found] if gain > LEAST_GAIN else []
 
 
