@@ -342,7 +342,7 @@ def _words(fault, told, beam, others, nm):
             "exchanged": f"its data are those of frame {fault.with_}, and the other way round",
             "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
             "brightness": f"its brightness is off that of its group by {off}",
-            "one wavelength": f"its data at {nm or 0:.0f} nm are off, those at others are not",
+            "one wavelength": f"its data at {nm or 0:.0f} nm do not fit those at others",
             "lamp": f"the lamp is off its drift by {off}",
             "unknown": "its differences fit no angle of a stage and no factor of a beam",
         }[fault.what]
