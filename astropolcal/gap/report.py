@@ -416,8 +416,8 @@ def accuracies(model, cross_validate=True):
     Return what `calibrate` says of a model, with the sizes of its causes held, ready for JSON.
 
     ``rms_percent`` is the root mean square of the double differences over all data: of left-out
-    frames, or of the fit where there is no cross-validation. Where such a calibration is not
-    possible it is None, and the lists are empty.
+    frames that others foresee, or of the fit where there is no cross-validation. Where such a
+    calibration is not possible it is None, and the lists are empty.
     """
     instrument = next((o.instrument for o in model.observations if o.instrument), None)
     found = {
@@ -446,8 +446,11 @@ def accuracies(model, cross_validate=True):
     tables = [record.accuracy for record in calibration.datasets]
     count = np.concatenate([table["n"] for table in tables])
     gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
+    # what is left out may be all that determines a wavelength
+    known = np.isfinite(gap)
+    rms = np.sqrt(np.average(gap[known] ** 2, weights=count[known])) if known.any() else None
     return found | {
-        "rms_percent": float(np.sqrt(np.nansum(count * gap**2) / count.sum())),
+        "rms_percent": rms,
         "datasets": [
             {"name": record.name, "source": record.source}
             | {f"{key}_percent": _median(record.accuracy[key].value) for key in ACCURACIES}

@@ -27,6 +27,7 @@ from astropolcal.gap.report import (
     MAP,
     Fitted,
     _about_frames,
+    accuracies,
     causes_table,
     summary,
     to_dict,
@@ -170,6 +171,19 @@ def test_double_differences_are_those_of_calibrate(found, content):
     alone = simulate(chain(), WAVELENGTH, single, seed=1)
     unpaired = SimpleNamespace(chains=[chain()], observations=[alone], problem=model.problem)
     assert Fitted(unpaired).doubles is None
+
+
+def test_frames_that_no_other_foresees_do_not_make_the_gap_smaller():
+    """A wavelength has data at one derotator angle only, which alone determine its retardance."""
+    clouds = np.zeros((32, len(WAVELENGTH)), dtype=bool)
+    clouds[8:, 3] = True
+    seen = observed(flux=1e4).with_mask(clouds, "clouds")
+    model = nominal_model([chain()], [seen])
+    (table,) = [record.accuracy for record in calibrate(chain(), seen).datasets]
+    known = np.isfinite(table["s_cv"].value)
+    gap = np.sqrt(np.average(table["s_cv"].value[known] ** 2, weights=table["n"][known]))
+    assert not known.all()
+    assert accuracies(model)["rms_percent"] == pytest.approx(gap, rel=1e-3)
 
 
 @pytest.mark.slow
