@@ -677,7 +677,7 @@ def _narrow(figure):
     ticks = [axis.get_tick_params() for axes in panels for axis in (axes.xaxis, axes.yaxis)]
     # names of groups of frames, which stand side by side; those of columns are turned already
     named = [axes for axes in panels if axes.xaxis.get_tick_params().get("length") == 0]
-    named = [axes for axes in named if axes.get_xticklabels()[0].get_rotation() == 0]
+    named = [axes for axes in named if not any(x.get_rotation() for x in axes.get_xticklabels())]
     own = list(dict.fromkeys(places))
     rows = max((place.get_gridspec().nrows for place in own), default=1)
     if len(own) > rows:

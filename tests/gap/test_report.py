@@ -349,7 +349,10 @@ def test_page_is_self_contained_and_complete(found, content, tmp_path):
 
     figure.savefig = lambda *args, **options: drawn.append(look())
     before = look(), axes.get_subplotspec()
-    write_html(found, path, figures={"Gap": figure})
+    image = Figure()
+    image.subplots().set_xticks([])
+    image.axes[0].tick_params(axis="x", length=0)
+    write_html(found, path, figures={"Gap": figure, "without ticks": image})
     assert (look(), axes.get_subplotspec()) == before, "the figures are the caller's"
     # on a telephone names of groups of frames do not stand in each other
     assert [turned for turned, _ in drawn] == [{0}, {90}]
