@@ -630,7 +630,7 @@ def _about_frames(diagnosis):
             count = int(mask.any(axis=1).sum())
             why = f" ({', '.join(reasons)})" if reasons else ""
             lines += [f"{count} of {len(mask)} frames of {o.name}{why}"] if count else []
-    lines = [f"Left out, as the tables mask them: {_words.listed(masked)}."] if masked else []
+    lines = [f"Left out in whole or in part: {_words.listed(masked)}."] if masked else []
     if used:
         lines.append(f"Used here, though calibrate masks them: {_words.listed(used)}.")
     return lines
