@@ -312,7 +312,7 @@ class Fitted:
         without[rows] = problem.absent[rows]
         others = np.setdiff1d(np.arange(problem.size), rows)
         lost = problem.residual(without) - problem.residual(full)
-        slopes = problem.jacobian(full)[:, others]
+        slopes = self.model.jacobian[:, others]
         without[others] += np.linalg.lstsq(slopes, lost, rcond=_TINY)[0]
         pairs = zip(problem.differences(without), problem.differences(full), strict=True)
         single = self._in_pairs([one[0] - other[0] for one, other in pairs])

@@ -89,7 +89,8 @@ class _Whitened:
     def __init__(self, model):
         problem = model.problem
         self.problem, self.segments = problem, problem.segments
-        tangent, residual = problem.tangent(model.fit.coefficients), model.residual
+        tangent = problem.tangent(model.fit.coefficients, model.jacobian)
+        residual = model.residual
         # what is known of a mounting has no place among the frames
         seen = slice(0, self.segments[-1].stop)
         self.tangent = tangent[seen]
