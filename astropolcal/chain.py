@@ -16,7 +16,7 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ObservationError, ParameterError
-from astropolcal.mueller import _rotation_matrix
+from astropolcal.mueller import phase_of, turned
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
 from astropolcal.optics.positions import FLUXES, PLACES, finite_position
@@ -560,21 +560,22 @@ def system_mueller(chain, wavelength=None, positions=None):
     """
     positions, shape = _check_axes(wavelength, positions)
     warn_beyond(chain, positions)
-    # one turn from optic to optic, where there is one: most of the time goes to products
+    # rows from the detector back, with one turn from optic to optic: what turns them is a phase
     total, frame = np.eye(4), 0.0
-    for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
+    nodes = list(_oriented_leaves(chain, wavelength, positions))
+    for leaf, dispersion, angle, values in nodes[::-1]:
         if leaf.rotates_frame:
-            frame = frame - angle
+            frame = frame + angle
         else:
-            total = leaf._matrix(dispersion, *values) @ _turned(total, angle - frame)
+            total = _turned(total, angle - frame) @ leaf._matrix(dispersion, *values)
             frame = angle
     total, whole = _turned(total, -frame), (*shape, 4, 4)
     return total if total.shape == whole else np.broadcast_to(total, whole).copy()
 
 
-def _turned(matrix, angle):
-    """Return T(angle) times the matrix."""
-    return _rotation_matrix(angle) @ matrix if np.any(angle) else matrix
+def _turned(rows, angle):
+    """Return rows times T(-angle), in place where they have room."""
+    return turned(rows, phase_of(np.asarray(angle)[..., None]), in_place=True)
 
 
 def _check_axes(wavelength, positions):

@@ -56,6 +56,40 @@ def _rotate(matrix, theta):
     return np.swapaxes(turn, -1, -2) @ matrix @ turn
 
 
+def phase_of(angle):
+    """Return what T(angle) multiplies Q + iU by, for floats in radian, or None for 1."""
+    # np.any takes three times as long
+    return np.exp(-2j * angle) if np.asarray(angle).any() else None
+
+
+def turned(light, phase, in_place=False):
+    """Return T(angle) times Stokes vectors (..., 4), for the phase of the angle."""
+    if phase is None:
+        return light
+    shape = np.broadcast(light[..., 0], phase).shape
+    if not in_place or shape != light.shape[:-1]:
+        light, given = np.empty((*shape, 4)), light
+        light[...] = given
+    both = plane(light)
+    np.multiply(both, phase, out=both)
+    return light
+
+
+def turned_back(light, phase):
+    """Return T(-angle) times Stokes vectors, for the phase of the angle."""
+    return turned(light, None if phase is None else phase.conjugate())
+
+
+def crossed(row, light):
+    """Return a G s of rows a and light s, a_Q s_U - a_U s_Q; G is the generator of rotations."""
+    return (plane(row).conj() * plane(light)).imag
+
+
+def plane(light):
+    """Return Q + iU as a view."""
+    return light[..., 1:3].view(complex)[..., 0]
+
+
 def _linear_retarder(retardance):
     """Return a linear retarder for floats in radian."""
     matrix = blank(retardance)

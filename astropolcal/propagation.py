@@ -21,6 +21,7 @@ import numpy as np
 
 from astropolcal.chain import check_inputs, leaves
 from astropolcal.exceptions import ChainError
+from astropolcal.mueller import crossed, phase_of, turned, turned_back
 from astropolcal.optics import FrameOptic
 
 __all__ = []
@@ -66,8 +67,7 @@ class _Node:
         """
         if self.leaf.rotates_frame:
             return frame - self.stage_angle
-        turn = self.stage_angle - frame
-        self.phase = np.exp(-2j * turn) if np.any(turn) else None
+        self.phase = phase_of(self.stage_angle - frame)
         return self.stage_angle
 
     def matrix(self, values):
@@ -282,7 +282,7 @@ def _at(nodes, values, frame):
             frame = frame - theta
             steps.append(_Step(node, own))
         else:
-            phase = phase_of(node.phase, theta - frame)
+            phase = _turned_on(node.phase, theta - frame)
             steps.append(_Step(node, own, phase, node.matrix(own)))
             frame = theta
     return steps, frame
@@ -353,9 +353,7 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
                     slope = (adjoint * changed) @ np.ones(4)
                     _add(result, (step.node.index, parameter), slope)
         behind = pair
-        # the way back
-        phase = None if step.phase is None else step.phase.conjugate()
-        adjoint = turned(pair[0][0], phase)
+        adjoint = turned_back(pair[0][0], step.phase)
     return adjoint, behind
 
 
@@ -365,16 +363,15 @@ def _add(result, key, value):
 
 def _crossed(pairs):
     """Return the sum of a . G s over pairs; G is the generator of rotations."""
-    # a_Q s_U - a_U s_Q, with Q + iU as one number
-    products = [(plane(a).conj() * plane(s)).imag for a, s in pairs]
+    products = [crossed(a, s) for a, s in pairs]
     return sum(products[1:], start=products[0]) if products else np.zeros((1, 1))
 
 
 # ---- Stokes vectors through Mueller matrices ----------------------------------------------------
 
 
-def phase_of(stage, theta):
-    """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
+def _turned_on(stage, theta):
+    """Return the phase at the entrance of an optic, of that of its stage, or None for 1."""
     if np.ndim(theta):
         # one value per wavelength goes along the first axis, positions along the second
         turn = np.exp(-2j * (theta[:, None] if theta.ndim == 1 else theta))
@@ -383,30 +380,6 @@ def phase_of(stage, theta):
     else:
         return stage
     return turn if stage is None else stage * turn
-
-
-def turned(light, phase, in_place=False):
-    """Return T(angle) applied to the light, for the phase exp(-2i angle)."""
-    if phase is None:
-        return light
-    rows, columns, _ = light.shape
-    dimensions = np.ndim(phase)
-    if dimensions:
-        # the shape of the product, without asking numpy for it
-        columns = max(columns, phase.shape[-1])
-        rows = max(rows, phase.shape[0]) if dimensions == 2 else rows
-    if not in_place or (rows, columns) != light.shape[:2]:
-        out = np.empty((rows, columns, 4))
-        out[:] = light
-        light = out
-    both = plane(light)
-    np.multiply(both, phase, out=both)
-    return light
-
-
-def plane(light):
-    """Return Q + iU as a view."""
-    return light[..., 1:3].view(complex)[..., 0]
 
 
 def act(matrix, light):

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.chain import leaves
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import COORDINATES
@@ -89,7 +89,7 @@ class Look:
     @cached_property
     def is_noise(self):
         """Whether what is left may be noise."""
-        return stats.chi2.sf(self.chi2, self.freedom) > NOISE
+        return chi2_above(self.chi2, self.freedom) > NOISE
 
     def _less_groups(self, columns):
         """Return columns, (n_rows, k), less the brightness of groups as frames that count say."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from scipy import stats
 
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.problem import GapProblem, law_basis
@@ -139,7 +139,7 @@ class Candidate:
     @property
     def p_value(self):
         """Probability of the statistic by chance, for this cause alone."""
-        return float(stats.chi2.sf(self.statistic, max(self.rank, 1)))
+        return float(chi2_above(self.statistic, max(self.rank, 1)))
 
 
 @dataclass
@@ -495,7 +495,9 @@ def _with_name(effect, model, values, share, temper, context=None):
 
 
 def false_discovery(p_values):
-    """Return p-values corrected for the number of looks."""
-    if not len(p_values):
-        return []
-    return [float(p) for p in stats.false_discovery_control(p_values, method="by")]
+    """Return p-values corrected for the number of looks (Benjamini & Yekutieli 2001)."""
+    p, ranks = np.array(p_values, dtype=float), np.arange(1, len(p_values) + 1)
+    order = np.argsort(p)[::-1]
+    more = p[order] * (len(p) / ranks[::-1]) * np.sum(1 / ranks)
+    p[order] = np.minimum(np.minimum.accumulate(more), 1.0)
+    return p.tolist()

@@ -279,9 +279,15 @@ def dependences(problem):
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
-        if name == "constant" or np.ptp(np.concatenate(waves, axis=1), axis=1).max() > _SAME:
+        if name == "constant" or _varies(waves, problem):
             found[name] = waves
     return found
+
+
+def _varies(waves, problem):
+    """Return whether functions, (count, F) per dataset, differ between frames that have data."""
+    seen = [w[:, c.valid.any(axis=0)] for w, c in zip(waves, problem.channels, strict=True)]
+    return np.ptp(np.concatenate(seen, axis=1), axis=1).max() > _SAME
 
 
 _MOVED = ("direction", "move")
@@ -423,7 +429,8 @@ class Probes:
         after = min((frame for frame in frames if frame > at), default=at + 1)
         others = [f"step:{frame}" for frame in range(before + 1, after) if frame != at]
         others = others if run is None else [f"{name}/dataset:{run}" for name in others]
-        return [replace(cell, dependence=name) for name in others]
+        near = [replace(cell, dependence=name) for name in others]
+        return [one for one in near if _varies(self.waves_of(one), self.problem)]
 
     def _at_places(self):
         """Return the derivative of both channels to a constant perturbation, by place and kind."""

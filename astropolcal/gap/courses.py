@@ -12,9 +12,9 @@ as several causes do together, these may be one thing that no table has.
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
 from scipy.linalg import block_diag, eigh
 
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.problem import law_basis
 
@@ -129,7 +129,7 @@ def courses(model, base):
             # the law is chosen: of k singular values the largest is more than a share of their sum
             k = len(one.reduced.target[0][0])
             gain = 2 * np.sqrt((k - 1) * max(one.freedom - k + 1, 0))
-            one.p_value = float(stats.chi2.sf(max(one.lowered / temper - gain, 0), one.freedom))
+            one.p_value = float(chi2_above(one.lowered / temper - gain, max(one.freedom, 1)))
             one.std = [np.sqrt(temper) * std for std in one.std]
             known = best.setdefault((one.place, one.kind), one)
             best[one.place, one.kind] = max(known, one, key=lambda course: course.gained)

@@ -14,8 +14,9 @@ import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammaincinv, ndtr
 
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Trial, angle_stages
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem, law_basis
@@ -134,7 +135,7 @@ def single_data(model, known=()):
         off = _single(residual[..., 0], tangent, weight, _ALSO if known else _OFF)
         for f, k in zip(*np.nonzero(off), strict=True):
             trial = Trial("one wavelength", 0.0, 0.0, bin=int(k))
-            chance = float(1 - 2 * off.size * stats.norm.sf(off[f, k]))
+            chance = float(1 - 2 * off.size * ndtr(-off[f, k]))
             found.append(_fault(problem, (i, int(f)), trial, float(off[f, k] ** 2), chance))
     few = max(_LEAST_MOST, _MOST * sum(c.valid.any(axis=0).sum() for c in problem.channels))
     data = sum(c.valid.sum() for c in problem.channels)
@@ -274,7 +275,7 @@ def _of_groups(look, found, scatter):
             continue
         chi2, before = trials[0].chi2, group.as_told().chi2
         # one angle explains all of them, down to the noise or to what the fit is uncertain by
-        if stats.chi2.sf(chi2, max(group.freedom, 1)) < NOISE and chi2 > _LEFT * before:
+        if chi2_above(chi2, max(group.freedom, 1)) < NOISE and chi2 > _LEFT * before:
             continue
         near = trials[0].total - 2 * np.log(1 - _TELLS)
         rivals = {t.what: t for t in reversed(trials) if t.total < near}
@@ -341,7 +342,7 @@ def _words(fault, told, beam, others, nm):
             "exchanged": f"its data are those of frame {fault.with_}, and the other way round",
             "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
             "brightness": f"its brightness is off that of its group by {off}",
-            "one wavelength": f"its data at {nm or 0:.0f} nm are off, those at others are not",
+            "one wavelength": f"its data at {nm or 0:.0f} nm do not fit those at others",
             "lamp": f"the lamp is off its drift by {off}",
             "unknown": "its differences fit no angle of a stage and no factor of a beam",
         }[fault.what]
@@ -391,7 +392,7 @@ def _lamp(model):
         for f in np.flatnonzero(np.abs(np.nan_to_num(score)) > _FAR):
             size, off = float(np.exp(deviation[f])), float(abs(score[f]))
             trial = Trial("lamp", 0.0, 0.0, size, float(abs(deviation[f]) / off))
-            chance = float(1 - 2 * score.size * stats.norm.sf(off))
+            chance = float(1 - 2 * score.size * ndtr(-off))
             found.append(_fault(problem, (i, int(f)), trial, off**2, chance))
     return sorted(found, key=_order)
 
@@ -538,7 +539,8 @@ def _worst(look, n_frames):
         for fall, freedom in tests:
             fall = np.where(keep, fall, 0.0) / usual(fall, freedom, keep)
             # far out the chance is no number any more
-            log = stats.chi2.logsf(fall, np.maximum(freedom, 1))
+            with np.errstate(divide="ignore"):
+                log = np.log(chi2_above(fall, np.maximum(freedom, 1)))
             chances.append(np.minimum(-log, fall / 2))
         scores.append(np.max(chances, axis=0))
     places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
@@ -551,5 +553,6 @@ def usual(fall, freedom, keep):
     """Return how much larger than noise a statistic, (F,), is in most frames, at least 1."""
     if not keep.any():
         return 1.0
-    usual = stats.chi2.median(np.maximum(np.median(freedom[keep]), 1))
+    # the median of chi-square
+    usual = 2 * gammaincinv(max(np.median(freedom[keep]), 1) / 2, 0.5)
     return float(max(np.median(fall[keep]) / usual, 1.0))

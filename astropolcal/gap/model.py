@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
-from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.strategies import BinProblem, few_frames, search_branches
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.calibration.system import at_wavelengths
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
@@ -126,7 +126,7 @@ class Model:
     @cached_property
     def p_value(self):
         """Probability of the residuals by noise alone."""
-        return float(stats.chi2.sf(self.fit.chi2, self.linear.freedom))
+        return float(chi2_above(self.fit.chi2, self.linear.freedom))
 
     @cached_property
     def alike(self):

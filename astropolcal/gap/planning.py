@@ -16,8 +16,8 @@ from itertools import product
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import ndtr
 
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves, stages
@@ -354,10 +354,11 @@ def _repetitions(diagnosis):
     if diagnosis.remainder_p_value >= REMAINDER:
         return []
     problem, model = diagnosis.improved.problem, diagnosis.improved
-    squares = [model.residual[rows] ** 2 for rows in problem.segments]
-    worst = int(np.argmax([np.mean(one) for one in squares]))
-    n = problem.channels[worst].count * int(problem.channels[worst].valid.sum())
-    excess = float(np.sum(squares[worst])) / n
+    squares = [np.sum(model.residual[rows] ** 2) for rows in problem.segments]
+    # what is masked is no datum
+    counts = [channel.count * int(channel.valid.sum()) for channel in problem.channels]
+    worst = int(np.argmax(np.divide(squares, counts)))
+    n, excess = counts[worst], float(squares[worst] / counts[worst])
     # the scatter of repetitions has a variance that is known to this share
     gain = np.log(max(excess, 1.0)) / np.sqrt(2 / n + 2 / (n * (_REPEATS - 1)))
     name = model.observations[worst].name
@@ -365,7 +366,7 @@ def _repetitions(diagnosis):
         f"Take the run of {name} {_REPEATS} times: tells structure that no cause explains from "
         f"noise larger than stated, at {_sigmas(gain)} standard deviations"
     )
-    found = _line(words, "structure", [], float(gain), 0.5, float(stats.norm.cdf(gain)))
+    found = _line(words, "structure", [], float(gain), 0.5, float(ndtr(gain)))
     return [found] if gain > LEAST_GAIN else []
 
 

@@ -314,7 +314,7 @@ class Fitted:
         without[rows] = problem.absent[rows]
         others = np.setdiff1d(np.arange(problem.size), rows)
         lost = problem.residual(without) - problem.residual(full)
-        slopes = problem.jacobian(full)[:, others]
+        slopes = self.model.jacobian[:, others]
         without[others] += np.linalg.lstsq(slopes, lost, rcond=_TINY)[0]
         pairs = zip(problem.differences(without), problem.differences(full), strict=True)
         single = self._in_pairs([one[0] - other[0] for one, other in pairs])
@@ -418,8 +418,8 @@ def accuracies(model, cross_validate=True):
     Return what `calibrate` says of a model, with the sizes of its causes held, ready for JSON.
 
     ``rms_percent`` is the root mean square of the double differences over all data: of left-out
-    frames, or of the fit where there is no cross-validation. Where such a calibration is not
-    possible it is None, and the lists are empty.
+    frames that others foresee, or of the fit where there is no cross-validation. Where such a
+    calibration is not possible it is None, and the lists are empty.
     """
     instrument = next((o.instrument for o in model.observations if o.instrument), None)
     found = {
@@ -448,8 +448,11 @@ def accuracies(model, cross_validate=True):
     tables = [record.accuracy for record in calibration.datasets]
     count = np.concatenate([table["n"] for table in tables])
     gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
+    # what is left out may be all that determines a wavelength
+    known = np.isfinite(gap)
+    rms = np.sqrt(np.average(gap[known] ** 2, weights=count[known])) if known.any() else None
     return found | {
-        "rms_percent": float(np.sqrt(np.nansum(count * gap**2) / count.sum())),
+        "rms_percent": rms,
         "datasets": [
             {"name": record.name, "source": record.source}
             | {f"{key}_percent": _median(record.accuracy[key].value) for key in ACCURACIES}
@@ -629,7 +632,7 @@ def _about_frames(diagnosis):
             count = int(mask.any(axis=1).sum())
             why = f" ({', '.join(reasons)})" if reasons else ""
             lines += [f"{count} of {len(mask)} frames of {o.name}{why}"] if count else []
-    lines = [f"Left out, as the tables mask them: {_words.listed(masked)}."] if masked else []
+    lines = [f"Left out in whole or in part: {_words.listed(masked)}."] if masked else []
     if used:
         lines.append(f"Used here, though calibrate masks them: {_words.listed(used)}.")
     return lines
@@ -676,7 +679,7 @@ def _narrow(figure):
     ticks = [axis.get_tick_params() for axes in panels for axis in (axes.xaxis, axes.yaxis)]
     # names of groups of frames, which stand side by side; those of columns are turned already
     named = [axes for axes in panels if axes.xaxis.get_tick_params().get("length") == 0]
-    named = [axes for axes in named if axes.get_xticklabels()[0].get_rotation() == 0]
+    named = [axes for axes in named if not any(x.get_rotation() for x in axes.get_xticklabels())]
     own = list(dict.fromkeys(places))
     rows = max((place.get_gridspec().nrows for place in own), default=1)
     if len(own) > rows:

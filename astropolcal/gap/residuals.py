@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import stats
 
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import false_discovery
 from astropolcal.gap.problem import law_basis
@@ -89,7 +89,8 @@ class _Whitened:
     def __init__(self, model):
         problem = model.problem
         self.problem, self.segments = problem, problem.segments
-        tangent, residual = problem.tangent(model.fit.coefficients), model.residual
+        tangent = problem.tangent(model.fit.coefficients, model.jacobian)
+        residual = model.residual
         # what is known of a mounting has no place among the frames
         seen = slice(0, self.segments[-1].stop)
         self.tangent = tangent[seen]
@@ -291,7 +292,9 @@ def _test(gram, target, where, total, freedom):
         return _Tested(0.0, 0, root, 0.0, -np.inf)
     # what the others leave is no noise either where a gap is large
     scatter = max(1.0, (total - statistic) / (freedom - rank))
-    log_p = stats.chi2.logsf(statistic / scatter, rank)
+    # far out the chance is no number any more
+    with np.errstate(divide="ignore"):
+        log_p = np.log(chi2_above(statistic / scatter, rank))
     evidence = statistic / scatter - rank * np.log(max(freedom, 2))
     return _Tested(statistic, rank, root, log_p, evidence)
 
@@ -454,7 +457,7 @@ def most_uneven(data, axis, label, names, template):
     p = (more + 1) / (_DRAWS + 1)
     if more < _RELIABLE:
         # too few draws reach that far: Bonferroni's bound
-        p = min(p if more else 1.0, len(pairs) * stats.chi2.sf(2 * ratio[best], 1) / 2)
+        p = min(p if more else 1.0, len(pairs) * chi2_above(2 * ratio[best], 1) / 2)
     start, stop = pairs[best]
     share = (squares[start:stop].sum() - freedom[start:stop].sum()) / data.scale
     detail = _name(names, start, stop, template)

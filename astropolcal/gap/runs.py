@@ -78,7 +78,7 @@ def changes(diagnosis, causes):
             brought = _brought(cell, run, names, chains)
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
-            of = "" if _is_told(cell, cause) else " of this or what looks the same"
+            of = "" if _is_told(cell, cause, names) else " of this or what looks the same"
             entry["words"] = _sentence(cell, entry, names, wavelength, of)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
@@ -96,9 +96,10 @@ def _in_any_run(cell):
     return Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
 
 
-def _is_told(cell, cause):
-    """Return whether nothing looks like a change but the opposite one of another run."""
+def _is_told(cell, cause, names):
+    """Return whether nothing looks like a change but, of two runs, the opposite of the other."""
     there = [(Cell(**one["cell"]), one["probability"]) for one in cause["aliases"] if one["cell"]]
+    there = there if len(names) == 2 else []
     same = sum(chance for one, chance in there if _in_any_run(one) == _in_any_run(cell))
     return cause["share"] + same >= ONE
 

@@ -161,14 +161,18 @@ def foreseen(model, groups):
     group, scale = (np.concatenate([np.ravel(one) for one in each]) for each in (group, scale))
     for i in range(len(labels)):
         rows = np.flatnonzero(group == i)
+        # N (1 - N^T N)^-1 N^T r is what (1 - N N^T)^-1 r has beyond r; there are fewer parameters
+        # than data of a group
         here = tangent[rows]
-        # there are fewer parameters than data of a group
-        lever, along = np.linalg.eigh(here.T @ here)
-        # what the group alone determines cannot be foreseen at all; it is not counted
-        along = along / np.sqrt(1 - np.clip(lever, 0.0, _MOST_LEVER))
-        pull = (here @ along).T @ residual[rows]
-        # N (1 - N^T N)^-1 N^T r is what (1 - N N^T)^-1 r has beyond r
-        gap = residual[rows] + here @ (along @ pull)
+        pull, left = here.T @ residual[rows], np.eye(here.shape[1]) - here.T @ here
+        try:
+            np.linalg.cholesky(left - (1 - _MOST_LEVER) * np.eye(len(left)))
+            pull = np.linalg.solve(left, pull)
+        except np.linalg.LinAlgError:
+            # what the group alone determines cannot be foreseen at all; it is not counted
+            values, along = np.linalg.eigh(left)
+            pull = along @ (along.T @ pull / np.maximum(values, 1 - _MOST_LEVER))
+        gap = residual[rows] + here @ pull
         whitened = np.sum(gap**2) / problem.channels[0].count
         found.append((np.sum((gap * scale[rows]) ** 2), whitened, len(rows) // 2))
     return HeldOut.of_rows(labels, found)

@@ -218,14 +218,20 @@ class Perturbation(_BeamOptic, _Modulated):
 
     def _of(self, x):
         """Return exp(x G); G G G is G, -G (4 times that for rotations), or G is diagonal."""
-        x = np.asarray(x)[..., None, None]
+        x = np.asarray(x)
         if self._kind == "gain":
-            return (1 + BEAMS[self._beam] * x) * np.eye(4)
+            return np.multiply.outer(1 + BEAMS[self._beam] * x, np.eye(4))
         rate, unit, square = _POWERS[self._kind]
         if self._kind in _ROTATING:
-            return np.eye(4) + np.sin(rate * x) * unit + (1 - np.cos(rate * x)) * square
-        # for a projector and its negative, sinh and cosh are those of the exponential as well
-        return np.eye(4) + np.sinh(x) * unit + (np.cosh(x) - 1) * square
+            odd, even = np.sin(rate * x), 1 - np.cos(rate * x)
+        else:
+            # for a projector and its negative, sinh and cosh are those of the exponential as well
+            odd, even = np.sinh(x), np.cosh(x) - 1
+        # in place: half the time of a sum of products
+        out = np.multiply.outer(odd, unit)
+        out += np.eye(4)
+        out += np.multiply.outer(even, square)
+        return out
 
     def _slope(self, x):
         """Return the derivative of the exponential."""

@@ -51,6 +51,18 @@ def differences(model, cell):
         yield (ends[1] - ends[0]) / (2 * EPS)
 
 
+def test_a_step_among_masked_frames_is_no_dependence():
+    """It would be the same as a constant, and take a part of its probability."""
+    seen = data.observed()
+    clouds = np.tile((np.arange(seen.n_frames) < 9)[:, None], seen.n_bins)
+    model = data.fitted(seen.with_mask(clouds, "clouds"))
+    probes, cell = Probes(model), Cell("after:hwp", "rotation", "step:11")
+    names = [*dependences(model.problem), *(one.dependence for one in probes.steps_near(cell))]
+    steps = [int(name[5:]) for name in names if name.startswith("step:")]
+    assert min(steps) == 10
+    assert "step:9" in dependences(data.fitted(seen).problem)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["charis", "cassegrain", "irdis lamp", "vampires"])
 def test_derivative_of_every_cell_is_that_of_the_chain_with_its_optic(name):

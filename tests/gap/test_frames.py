@@ -144,6 +144,17 @@ def test_single_data_in_many_frames_are_left_out_and_counted():
     assert score_answer(case, content) == "right"
 
 
+def test_of_two_single_data_of_a_frame_neither_is_said_to_be_the_only_one():
+    seen = observed().to_table()
+    for frame, k in ((2, 0), (9, 1), (16, 3), (23, 4), (30, 1), (30, 5), (37, 6)):
+        here = (seen["frame"] == frame) & (seen["bin"] == np.unique(seen["bin"])[k])
+        seen["flux_left"][here] *= 1.1
+    found = single_data(data.fitted(Observations.from_table(seen, name="lamp")))
+    words = [fault.words for fault in found if fault.frame == 30]
+    assert len(words) == 2
+    assert not any("others are not" in one for one in words)
+
+
 def test_noise_of_one_wavelength_is_no_single_datum():
     seen = observed().to_table()
     here = np.asarray(seen["bin"] == 2)

@@ -27,6 +27,7 @@ from astropolcal.gap.report import (
     MAP,
     Fitted,
     _about_frames,
+    accuracies,
     causes_table,
     summary,
     to_dict,
@@ -170,6 +171,19 @@ def test_double_differences_are_those_of_calibrate(found, content):
     alone = simulate(chain(), WAVELENGTH, single, seed=1)
     unpaired = SimpleNamespace(chains=[chain()], observations=[alone], problem=model.problem)
     assert Fitted(unpaired).doubles is None
+
+
+def test_frames_that_no_other_foresees_do_not_make_the_gap_smaller():
+    """A wavelength has data at one derotator angle only, which alone determine its retardance."""
+    clouds = np.zeros((32, len(WAVELENGTH)), dtype=bool)
+    clouds[8:, 3] = True
+    seen = observed(flux=1e4).with_mask(clouds, "clouds")
+    model = nominal_model([chain()], [seen])
+    (table,) = [record.accuracy for record in calibrate(chain(), seen).datasets]
+    known = np.isfinite(table["s_cv"].value)
+    gap = np.sqrt(np.average(table["s_cv"].value[known] ** 2, weights=table["n"][known]))
+    assert not known.all()
+    assert accuracies(model)["rms_percent"] == pytest.approx(gap, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -335,7 +349,10 @@ def test_page_is_self_contained_and_complete(found, content, tmp_path):
 
     figure.savefig = lambda *args, **options: drawn.append(look())
     before = look(), axes.get_subplotspec()
-    write_html(found, path, figures={"Gap": figure})
+    image = Figure()
+    image.subplots().set_xticks([])
+    image.axes[0].tick_params(axis="x", length=0)
+    write_html(found, path, figures={"Gap": figure, "without ticks": image})
     assert (look(), axes.get_subplotspec()) == before, "the figures are the caller's"
     # on a telephone names of groups of frames do not stand in each other
     assert [turned for turned, _ in drawn] == [{0}, {90}]
@@ -398,4 +415,9 @@ def test_frames_of_an_unstable_lamp_are_said_to_be_used():
     # who masks them first, as calibrate does, has them left out
     lit = np.repeat(scale[:, None] > 1, data.n_bins, axis=1)
     masked = data.with_mask(lit, "unstable lamp")
-    assert about(masked) == [f"Left out, as the tables mask them: {words}"]
+    (told,) = about(masked)
+    assert told.endswith(words)
+    # a datum that the diagnosis itself leaves out is no frame that the table masks
+    lit[:, 1:] = False
+    told, *_ = about(data.with_mask(lit, "not as the table says"))
+    assert told.startswith("Left out in whole or in part: 2 of ")

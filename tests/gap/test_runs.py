@@ -3,6 +3,7 @@
 
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import astropy.units as u
 import gap_data as data
@@ -97,6 +98,17 @@ def test_a_change_that_others_look_like_is_not_told_as_sure():
     # the opposite change of the other run is the same one
     (change,) = changed_content()["changes"]
     assert change["words"].endswith("(probability 97 %).")
+
+
+def test_which_of_three_runs_changed_is_not_told_as_sure_where_two_may_have():
+    cell = {"place": "after:derotator", "kind": "retardance_d", "dependence": "dataset:a"}
+    alias = {"cell": cell | {"dependence": "dataset:b"}, "probability": 0.48}
+    cause = {"cell": cell, "share": 0.5, "aliases": [alias], "size": {}}
+    cause |= {"probability": 0.97, "significance": 5.0}
+    for names, end in (("ab", "97 %)."), ("abc", "97 % of this or what looks the same).")):
+        model = data.fitted([data.observed(name=name) for name in names])
+        (change,) = changes(SimpleNamespace(improved=model), [cause])
+        assert change["words"].endswith(end)
 
 
 def test_changes_come_first_and_the_shared_cause_after():

@@ -311,7 +311,7 @@ def _test_of_priors(measurement, vector, hat):
     chi2 = np.sum(measurement.free.prior_residuals(vector) ** 2)
     rows = np.arange(n, len(hat.basis))
     mean, dof = _moments(hat, len(rows), hat.products(rows), 0.0)
-    p = _chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
+    p = chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
     return {"chi2": float(chi2), "expected": float(mean), "p_value": float(p)}
 
 
@@ -335,7 +335,7 @@ def _test_by_wavelength(measurement, vector, noise, hat):
     with np.errstate(invalid="ignore"):
         reduced = chi2 / np.where(mean > _LEAST_FREEDOM, mean, np.nan)
         known = np.isinf(noise.dof)
-        p = np.where(known, _chi2_above(reduced * dof, dof), fdtrc(dof, noise.dof, reduced))
+        p = np.where(known, chi2_above(reduced * dof, dof), fdtrc(dof, noise.dof, reduced))
     table = QTable(
         {
             "dataset": numbers,
@@ -399,7 +399,7 @@ class _Hat:
         return np.trace(first) - np.trace(ab), square
 
 
-def _chi2_above(chi2, dof):
+def chi2_above(chi2, dof):
     """Return the probability of a larger chi-square; `scipy.stats` takes long to import."""
     from scipy.special import gammaincc
 
@@ -430,12 +430,12 @@ def _together(table, whole, noise, priors):
         return chi2, mean, np.nan
     if np.isinf(noise.dof).all():
         mean, dof = whole
-        return chi2, float(mean), float(_chi2_above(chi2 / mean * dof, dof))
+        return chi2, float(mean), float(chi2_above(chi2 / mean * dof, dof))
     with np.errstate(divide="ignore"):
         # p of the wavelengths are uniform if the model is true: of independent ones -2 sum ln p is
         # then chi-square of twice their number, and of others of as many as are independent
         fisher = -2 * np.sum(shares[known] * np.log(p[known]))
-    return chi2, mean, float(_chi2_above(fisher, 2 * shares[known].sum()))
+    return chi2, mean, float(chi2_above(fisher, 2 * shares[known].sum()))
 
 
 def _verdict(chi2, expected, p_value, noise, priors):
