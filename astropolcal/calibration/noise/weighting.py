@@ -154,6 +154,9 @@ _SETTLED = 1e-2
 # fewer degrees of freedom than this tell no noise
 _LEAST_FREEDOM = 0.5
 _MAX_EVALUATIONS = 100
+# a derivative below this share of the largest may vanish at an extremum; then it is this many
+# times larger, and this share of the largest, so many degrees, micrometres or percent beside it
+_WEAK, _GROWN, _SEEN, _BESIDE = 3e-3, 10.0, 1e-6, 5.0
 # normalized data do not reach this; one over a noise does
 _LARGEST = 1.0
 
@@ -241,7 +244,45 @@ class Problem:
         vector, free = self.solution if vector is None else vector, self.measurement.free
         data = self.measurement.jacobian(vector) * self.weights
         priors = free.prior_jacobian(vector, for_errors=True) * self.noise
-        return Whitened(data, free.steps, priors, free.at_bounds(vector))
+        whitened = Whitened(data, free.steps, priors, free.at_bounds(vector))
+        bent = self._beside_extrema(vector, data, whitened)
+        if not bent.size:
+            return whitened
+        # the mean slope on a way that is as long as the error which follows from it
+        whitened = Whitened(data, free.steps, priors, whitened.held)
+        share = self._errors(whitened)[bent] / _BESIDE / 2
+        data[bent] *= np.sqrt(np.where(share > 0, share, 1.0))[:, None]
+        return Whitened(data, free.steps, priors, whitened.held)
+
+    def _errors(self, whitened):
+        """Return standard errors in steps, NaN of what is open."""
+        weighting = self.weighting
+        level = (weighting if weighting.is_known else weighting.started(self.measurement)).level
+        return level * np.sqrt(np.diag(whitened.covariance())) / whitened.scale
+
+    def _beside_extrema(self, vector, data, whitened):
+        """Take the derivatives beside an extremum, as half a wave is, where they vanish at it.
+
+        The data change there in second order only, and what trades with such a parameter would
+        seem to be known well. Returns which elements these are.
+        """
+        size, steps = np.linalg.norm(whitened.rows, axis=0), whitened.scale
+        largest, bent = size.max(initial=0.0), []
+        weak = ~whitened.held & (size < _WEAK * largest)
+        if weak.any():
+            weak &= ~(self._errors(whitened) < _BESIDE)
+        for slot in self.measurement.free.slots:
+            own = np.arange(slot.start, slot.start + slot.size)[weak[slot.slice]]
+            if not own.size:
+                continue
+            beside, way = vector.copy(), _BESIDE * steps[own]
+            beside[own] += np.where(vector[own] + way > self._high[own], -way, way)
+            there = self.measurement.jacobian(beside)[own] * self.weights
+            grown = np.linalg.norm(there, axis=1) * steps[own]
+            grown = (grown > _GROWN * size[own]) & (grown > _SEEN * largest)
+            data[own[grown]] = there[grown]
+            bent += own[grown].tolist()
+        return np.array(bent, dtype=int)
 
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
         """Return the vector, chi-square, and what scipy says of the fit.
