@@ -331,6 +331,10 @@ def _at_gauge(measurement, weighting, origin, gauge):
     hold_silent(measurement, origin)
     problem = BinProblem(measurement, weighting)
     whitened = settled(problem, origin) if gauge == "minimal" else problem.around()
+    beside = problem.beside_extrema(measurement.vector(), whitened)
+    if beside is not None:
+        measurement.stand_at(beside)
+        whitened = problem.around(beside)
     chosen = open_parameters(measurement.free, whitened)
     if len(whitened.data.null):
         hold_silent(measurement, origin)
