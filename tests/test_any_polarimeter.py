@@ -2,6 +2,7 @@
 """Five polarimeters without a half-wave plate in pairs: simulated, calibrated, diagnosed, used."""
 
 import inspect
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -495,3 +496,22 @@ def test_states_of_a_modulator_may_be_named():
     frames["flc_state"][3] = "C"
     with pytest.raises(ObservationError, match="flc_state = 'C' in frame 3; allowed are A and B"):
         simulate(vampires.published(), vampires.wavelength, frames)
+
+
+def test_a_v_that_is_taken_as_zero_is_spoken_of():
+    """A quarter-wave plate at few angles gives V to Q; at many of equal weight it does not."""
+    plate = optics.LinearRetarder(retardance=90 * u.deg, mount="qwp", name="qwp")
+    chain = plate | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    for angles, speaks in (([-45, 45, -45, 45, 0, 22.5, 67.5], True), (range(0, 180, 15), False)):
+        where = {"qwp": [*angles] * u.deg}
+        beams = measurement_rows(chain, where, [0.6] * u.um) @ [1e6, 1e4, -2e4, 3e4]
+        right, left = np.moveaxis(beams, 1, 2)
+        frames = ScienceFrames.from_arrays(right, left, [0.6] * u.um, where)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            linear = correct(chain, frames)
+        assert any("V is taken as zero: 1 % of V" in str(one.message) for one in told) == speaks
+        # 3 % of V
+        assert (abs(linear.q[0] - 0.01) > 0.009) == speaks
+        full = correct(chain, frames, components="IQUV")
+        np.testing.assert_allclose(full.stokes[:, 0] / 1e6, [1, 0.01, -0.02, 0.03], atol=1e-9)
