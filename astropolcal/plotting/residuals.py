@@ -399,8 +399,9 @@ def plot_residuals(calibration, *, figure=None):
     Draw a map of the residuals: wavelength against datum, by derotator angle; one per dataset.
 
     Above it stands the rms of each datum, at its right that of each wavelength. All maps have the
-    same colours, or where the residuals differ much in size each its own. Masked data are grey.
-    Datasets of one wavelength each are bars. The calibration needs its data.
+    same colours, or where the residuals differ much in size each its own. Grey is what is masked,
+    and of single beams the frame with which a group begins. Datasets of one wavelength each are
+    bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
     count = len(grids)
@@ -464,7 +465,7 @@ def _draw_bars(figure, grids):
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
         below = words
-    figure.supylabel(f"observed {st.MINUS} model (%); grey: masked", fontsize=11)
+    figure.supylabel(f"observed {st.MINUS} model (%); grey: no datum", fontsize=11)
     size = max(100 * _HEADROOM * max(np.nanmax(np.abs(grid.residual)) for grid in grids), 1e-12)
     panels[0].set_ylim(-size, size)
 

@@ -459,7 +459,7 @@ def test_labels_have_units(drawn):
     main, above, right = parts(figure)
     assert main.get_ylabel() == "wavelength (nm)"
     assert above.get_ylabel() == right.get_xlabel() == "rms (%)"
-    assert figure.axes[-1].get_ylabel() == "observed \N{MINUS SIGN} model (%); grey: masked"
+    assert figure.axes[-1].get_ylabel() == "observed \N{MINUS SIGN} model (%); grey: no datum"
     assert "derotator angle; at each, left to right, half-wave plate at" in main.get_xlabel()
     assert figure.get_suptitle().startswith("Residuals of the normalized double difference")
 
