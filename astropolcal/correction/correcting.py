@@ -234,7 +234,7 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
 
 
 def _circular(solution):
-    """Say what V does to Q and U where it is taken as zero and they hang on it."""
+    """Say what V does to Q and U where it is taken as zero and they depend on it."""
     leaks = np.abs(solution.leakage[:, 1:3][solution.determined[:, 1:3].all(axis=1)])
     if not np.median(leaks.max(axis=1)) > _LEAKS:
         return []
