@@ -195,7 +195,8 @@ def correct(
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
     unmeasured += _mirrored(calibration)
-    unmeasured += _circular(solution)
+    # a half-wave plate is there for linear polarization, of light that has hardly any V
+    unmeasured += _circular(solution) if "hwp" not in frames.positions else []
     for words in doubts + unmeasured:
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
