@@ -2,6 +2,7 @@
 """Five polarimeters without a half-wave plate in pairs: simulated, calibrated, diagnosed, used."""
 
 import inspect
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 from astropy.table import QTable
 
 from astropolcal import calibrate, instruments, optics
+from astropolcal.calibration.uncertainty import derived_retardance
 from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.efficiency import demodulation
-from astropolcal.exceptions import AstropolcalWarning, FitError, ObservationError
+from astropolcal.exceptions import AstropolcalWarning, ChainError, FitError, ObservationError
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
@@ -20,6 +22,7 @@ from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.observations.grid import mask_incomplete_cycles
 from astropolcal.observations.pointings import motion
+from astropolcal.plotting import save_all
 from astropolcal.simulation import simulate
 from astropolcal.testing import check_instrument
 
@@ -495,3 +498,44 @@ def test_states_of_a_modulator_may_be_named():
     frames["flc_state"][3] = "C"
     with pytest.raises(ObservationError, match="flc_state = 'C' in frame 3; allowed are A and B"):
         simulate(vampires.published(), vampires.wavelength, frames)
+
+
+def test_a_v_that_is_taken_as_zero_is_spoken_of():
+    """A quarter-wave plate at few angles gives V to Q; at many of equal weight it does not."""
+    plate = optics.LinearRetarder(retardance=90 * u.deg, mount="qwp", name="qwp")
+    chain = plate | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    for angles, speaks in (([-45, 45, -45, 45, 0, 22.5, 67.5], True), (range(0, 180, 15), False)):
+        where = {"qwp": [*angles] * u.deg}
+        beams = measurement_rows(chain, where, [0.6] * u.um) @ [1e6, 1e4, -2e4, 3e4]
+        right, left = np.moveaxis(beams, 1, 2)
+        frames = ScienceFrames.from_arrays(right, left, [0.6] * u.um, where)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            linear = correct(chain, frames)
+        assert any("V is taken as zero: 1 % of V" in str(one.message) for one in told) == speaks
+        # 3 % of V
+        assert (abs(linear.q[0] - 0.01) > 0.009) == speaks
+        full = correct(chain, frames, components="IQUV")
+        np.testing.assert_allclose(full.stokes[:, 0] / 1e6, [1, 0.01, -0.02, 0.03], atol=1e-9)
+
+
+def test_a_diattenuation_is_no_retardance(tmp_path):
+    """Components of both have the same names; of a diattenuator they have no unit."""
+    lamp = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    lens = optics.VectorDiattenuator(horizontal=[0.01, 0.02], diagonal=0.0, name="lens")
+    wollaston = optics.WollastonPrism(efficiency=[0.9, 0.9], name="wollaston")
+    frames = QTable({"calibrator": np.arange(0, 180, 15) * u.deg})
+    chain = lamp | lens | wollaston
+    calibration = calibrate(chain, simulate(chain, [0.5, 0.6] * u.um, frames, seed=1))
+    with pytest.raises(ChainError, match="VectorDiattenuator, which has no retardance"):
+        derived_retardance(calibration, "lens")
+    names = [path.name for path in save_all(calibration, tmp_path)]
+    assert "retardances.png" not in names
+    assert "other_parameters.png" in names
+
+
+def test_fluxes_of_several_beams_need_one_unit():
+    wide = QTable({"frame": [0, 1], "bin": [0, 0], "wavelength": [0.6, 0.6] * u.um})
+    wide["flux_a"], wide["flux_b"] = [1, 2] * u.adu, [1, 2] * u.electron
+    with pytest.raises(ObservationError, match="one unit, not flux_a in adu, flux_b in electron"):
+        Observations.from_table(wide)

@@ -33,6 +33,8 @@ __all__ = ["correct"]
 MODES = ("stokes", "ip")
 
 # what a result keeps of the solution and of the frames
+# share of V in Q or U, of most wavelengths, that is worth a word
+_LEAKS = 0.3
 _OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
 _OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
 # what a caller can do about frames that do not say enough
@@ -193,6 +195,8 @@ def correct(
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
     unmeasured += _mirrored(calibration)
+    # a half-wave plate is there for linear polarization, of light that has hardly any V
+    unmeasured += _circular(solution) if "hwp" not in frames.positions else []
     for words in doubts + unmeasured:
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -228,6 +232,17 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     if n_samples:
         return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, **how)
     return linear_systematic(model, solution, **how)
+
+
+def _circular(solution):
+    """Say what V does to Q and U where it is taken as zero and they depend on it."""
+    leaks = np.abs(solution.leakage[:, 1:3][solution.determined[:, 1:3].all(axis=1)])
+    if not np.median(leaks.max(axis=1)) > _LEAKS:
+        return []
+    return [
+        f"V is taken as zero: 1 % of V would add up to {leaks.max():.2g} % to Q or U of these "
+        'frames; components="IQUV" (--components IQUV) solves for V too'
+    ]
 
 
 def _mirrored(calibration):

@@ -276,7 +276,8 @@ class Instrument(ABC):
     files : FileLayout or None
         How the instrument's FITS files look; None if they cannot be reduced here.
     headers : FileLayout or None
-        How headers of its frames are read where its files cannot be reduced here.
+        How headers of its frames are read where its files cannot be reduced here: by ``keywords``,
+        and those that are common in FITS files for date, coordinates and instrument.
     references : tuple of str
         Where the values come from.
     entrance : str
@@ -315,7 +316,7 @@ class Instrument(ABC):
     keywords = {}
     sources = ()
     optional_optics = ()
-    files = headers = None
+    files = None
     references = ()
     sky_options = ()
     entrance = "hwp"
@@ -480,7 +481,7 @@ class Instrument(ABC):
 
         Parameters
         ----------
-        downstream of : list of Optic
+        behind : list of Optic
             The optics from the half-wave plate on, whose wavelengths the telescope must have.
         **options
             Particular to the instrument, see ``sky_options``.
@@ -496,6 +497,14 @@ class Instrument(ABC):
             If the instrument has no telescope of known values.
         """
         raise InstrumentError(f"{self.name}: no chain from the sky is known")
+
+    @property
+    def headers(self):
+        """Layout that reads the headers of frames, None without keywords."""
+        own = self.keywords
+        common = {key: word for key, word in COMMON.items() if word not in own.values()}
+        common.pop("exposure_time", None)
+        return FileLayout(common | own, (1, 1, 1)) if own else None
 
     @property
     def has_telescope(self):

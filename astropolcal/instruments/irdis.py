@@ -469,7 +469,7 @@ class IRDIS(Instrument):
 
         Parameters
         ----------
-        downstream of : list of Optic
+        behind : list of Optic
             The optics from the half-wave plate on.
         wavelength : `~astropy.units.Quantity`, optional
             Filters of the chain by their central wavelengths; needed if it is not of all four.

@@ -156,7 +156,8 @@ def parameter_table(chains):
     Raises
     ------
     ParameterError
-        If an optic with parameters has no name, or optics of one name differ.
+        If an optic with parameters has no name, or one with a dot or a bracket, or optics of one
+        name differ.
 
     Examples
     --------
@@ -171,6 +172,12 @@ def parameter_table(chains):
         for leaf in leaves(chain):
             if not leaf.name:
                 raise ParameterError(f"{type(leaf).__name__} needs a name to be calibrated")
+            # elements are called optic.parameter[index]
+            if set(".[]") & set(leaf.name):
+                raise ParameterError(
+                    f"optic {leaf.name!r} needs a name without dot and brackets to be calibrated, "
+                    f"such as {re.sub(r'[][.]+', '_', leaf.name).strip('_') or 'optic'!r}"
+                )
             # one name is one piece of glass: it cannot be a mirror for
             # one dataset and a plate for another
             if kinds.setdefault(leaf.name, type(leaf)) is not type(leaf):

@@ -196,7 +196,11 @@ def beams_as_frames(table, label):
             part["beam"] = name.removeprefix("flux_")
             part["group"] = part["group"] if "group" in part.colnames else frame
         parts.append(part)
-    return vstack(parts, metadata_conflicts="silent")
+    try:
+        return vstack(parts, metadata_conflicts="silent")
+    except u.UnitConversionError:
+        units = ", ".join(f"{name} in {table[name].unit or 'no unit'}" for name in named)
+        raise ObservationError(f"{label}: fluxes need one unit, not {units}") from None
 
 
 def _positions(table, label):

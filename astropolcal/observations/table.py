@@ -373,9 +373,8 @@ class Observations:
             return frame_coordinate(self, column)
         if column not in frames.colnames:
             angles = [name for name in frames.colnames if _is_angle(frames[name])]
-            raise ObservationError(
-                f"{self._label}: no column {column!r}; its angles are {', '.join(angles)}"
-            )
+            known = ", ".join(angles) or "none"
+            raise ObservationError(f"{self._label}: no column {column!r}; its angles are {known}")
         if not _is_angle(frames[column]):
             raise ObservationError(
                 f"{self._label}: column {column} is not an angle; a unit such as deg is needed"

@@ -178,7 +178,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         }
         try:
             super().__init__(name=name, **values, **kwargs)
-        except (TypeError, InputParameterError) as error:
+        except (TypeError, AttributeError, InputParameterError) as error:
             self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
@@ -196,8 +196,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             parameter.std = None if std is None else to_unit(std, parameter.unit, f"{key}.std")
 
     def _check_names(self, kwargs):
-        known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
-        for key in kwargs:
+        rules = ("bounds", "fixed", "tied")
+        known = [*inspect.signature(type(self)).parameters, *rules, "meta"]
+        for key in [*kwargs, *(name for rule in rules for name in kwargs.get(rule) or ())]:
             if key not in known:
                 raise ParameterError(
                     f"{type(self).__name__}: no parameter {key!r}{did_you_mean(key, known)} (its "
@@ -232,6 +233,11 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"{self.__dict__[attr].shape}, not {np.shape(value)}; "
                     f"optic.with_parameters({attr}=...) returns a copy of another shape"
                 )
+        # a parameter whose name is misspelt would keep its value without a word
+        elif attr[0] != "_" and not hasattr(type(self), attr) and attr not in self.__dict__:
+            near = did_you_mean(attr, self.param_names, cutoff=0.8)
+            if near:
+                raise ParameterError(f"{type(self).__name__}: no parameter {attr!r}{near}")
         super().__setattr__(attr, value)
 
     __deepcopy__ = deep_copied
@@ -895,6 +901,10 @@ class Chain(OwnUnits, CompoundModel):
         return curve_of(self, list(self), what, element, against, wavelength, **positions)
 
     def __getitem__(self, index):
+        if isinstance(index, str) and index not in self.submodel_names:
+            known = ", ".join(self.submodel_names)
+            near = did_you_mean(index, self.submodel_names)
+            raise ChainError(f"no optic {index!r} in the chain; it has {known}{near}")
         if not isinstance(index, slice):
             return super().__getitem__(index)
         # astropy finds only what is one branch of its tree

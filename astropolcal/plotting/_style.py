@@ -252,7 +252,7 @@ def color_bar(figure, drawn, panels, clipped, scale=";"):
     """Add the bar of one or several maps."""
     extend = "both" if clipped else "neither"
     bar = figure.colorbar(drawn, ax=panels, extend=extend, shrink=0.8, aspect=35)
-    bar.set_label(f"observed {MINUS} model (%){scale} grey: masked")
+    bar.set_label(f"observed {MINUS} model (%){scale} grey: no datum")
 
 
 def name_groups(axes, ends, labels, label):

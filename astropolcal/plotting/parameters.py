@@ -18,6 +18,7 @@ from astropolcal.calibration.uncertainty.derived import (
     mirror_values,
     of_law,
     of_optic,
+    retardances_of,
 )
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
@@ -240,6 +241,8 @@ def plot_retardances(calibration, *, figure=None):
 def _has_retardance(leaf, key, known):
     """Return whether an optic retards in this way: a law, or a parameter that is not fixed at 0."""
     if key in leaf.param_names:
+        if key not in retardances_of(leaf):
+            return False
         entry = known[f"{leaf.name}.{key}"]
         # a component that is held at zero is one that the retarder does not have
         return not entry["fixed"] or bool(np.any(entry["value"] != 0))
@@ -337,10 +340,11 @@ def _per_wavelength(known):
 
 def other_parameters(calibration):
     """Return the free parameters given per wavelength that no other figure shows."""
-    shown = {*_RETARDANCES, "efficiency"}
-    mirrors = {f"{name}.diattenuation" for name in mirror_names(calibration)}
+    optics = _optics(calibration).values()
+    shown = {f"{leaf.name}.{key}" for leaf in optics for key in retardances_of(leaf)}
+    shown |= {f"{name}.diattenuation" for name in mirror_names(calibration)}
     names = _per_wavelength(calibration.parameter_values())
-    return [n for n in names if n not in mirrors and n.rpartition(".")[2] not in shown]
+    return [n for n in names if n not in shown and not n.endswith(".efficiency")]
 
 
 # ---- common to all figures of parameters ------------------------------------------

@@ -9,6 +9,7 @@ import numpy as np
 from astropolcal.chain import stages, standing
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
 from astropolcal.observations.grid import clusters, is_star
+from astropolcal.optics import COORDINATES
 from astropolcal.plotting import _style as st
 from astropolcal.propagation import Propagator
 
@@ -17,6 +18,9 @@ __all__ = ["plot_double_differences"]
 # angles (deg) that differ by less are the same setting of a stage
 SAME_ANGLE = 0.5
 
+
+# what tells where the sky stands, the first is drawn against
+_SKY = {"altitude": "altitude of the star (°)", "parallactic": "parallactic angle (°)"}
 
 # data taken with the same setting of the half-wave plate: which they are, indices on the second
 # axis of the grids, and the mean position (rad) of every stage, or None if one moves
@@ -48,13 +52,20 @@ class DataGrid:
         self.residual = self._grid(residuals[measurement.segments[dataset]])
         self.sigma = self._grid(self.part.sigma)
         self.calibrated_um = measurement.wavelength
-        self.is_star = is_star(self.part.observations.source) and "altitude" in self.part.positions
-        self.derotator = np.rad2deg(self.position("derotator")[0])
+        sky = [stage for stage in _SKY if stage in self.part.positions]
+        self.is_star = is_star(self.part.observations.source) and bool(sky)
+        # the stage by which data are grouped, and drawn where the sky does not move
+        self.turning = self._turning()
+        self.angle = np.zeros(len(self.part.frames))
+        if self.turning is not None:
+            self.angle = np.rad2deg(self.position(self.turning)[0])
         # what the data are drawn against, in degree, and how that is called
-        self.abscissa, self.label = self.derotator, "derotator angle (°)"
+        self.abscissa, self.label = self.angle, f"{_stage_words(self.turning)} (°)"
         if self.is_star:
-            self.abscissa = np.rad2deg(self.position("altitude").mean(axis=0))
-            self.label = "altitude of the star (°)"
+            self.abscissa = np.rad2deg(self.position(sky[0]).mean(axis=0))
+            self.label = _SKY[sky[0]]
+        # whether the half-wave plate makes the series
+        self.by_plate = self.turning == "derotator" or (self.is_star and "hwp" in self._still())
         # the observable in words
         self.quantity = self.observable.name.replace("_", " ")
 
@@ -72,8 +83,28 @@ class DataGrid:
             return self.part.positions[stage]
         return self.part.observations.position(stage)[self.part.frames.T]
 
+    def _turning(self):
+        """Return the derotator where there is one, else the stage with the most settings."""
+        if "derotator" in {*self.part.positions, *self.part.observations.frames.colnames}:
+            return "derotator"
+        counts = {stage: clusters(self.degrees(stage), SAME_ANGLE).max() for stage in self._still()}
+        # of a star the plate makes the series
+        counts.pop("hwp" if self.is_star else None, None)
+        return max(counts, key=counts.get, default=None)
+
+    def _still(self):
+        """Return the stages whose position is an angle, without those of the sky."""
+        known = [stage for stage in stages(self.chain) if stage not in COORDINATES]
+        return [stage for stage in known if stage not in _SKY]
+
+    def degrees(self, stage):
+        """Return the position of a stage in the first frame of each datum."""
+        return np.rad2deg(self.position(stage)[0])
+
     def series(self):
-        """Return the data by setting of the half-wave plate, ordered by its angle."""
+        """Return the data by setting of the half-wave plate, or what else sets them apart."""
+        if not self.by_plate:
+            return self._other_series()
         observations, frames = self.part.observations, self.part.frames
         # as commanded where it follows the sky
         plate = observations.position("hwp")[frames.T] if self.is_star else self.position("hwp")
@@ -95,6 +126,34 @@ class DataGrid:
             found.append(Series(label, np.flatnonzero(member), positions))
         return found
 
+    def _other_series(self):
+        """Return the data by the settings of all stages but the one that turns."""
+        table, first = self.part.observations.frames, self.part.frames[:, 0]
+        labels = np.full(len(first), "", dtype=object)
+        for stage in self._still():
+            if stage != self.turning:
+                number, angle = clusters(self.degrees(stage), SAME_ANGLE), self.degrees(stage)
+                middle = [st.degrees(np.median(angle[number == n])) for n in number]
+                labels += [f", {stage} {one}" for one in middle]
+        devices = (stage.partition("=")[0] for stage in stages(self.chain) if "=" in stage)
+        for device in dict.fromkeys(devices):
+            labels += [f", {device} {state}" for state in table[device][first]]
+        found = []
+        for label in dict.fromkeys(labels.tolist()):
+            member = labels == label
+            at = {stage: a[:, member] for stage, a in self.part.positions.items()}
+            moving = any(
+                np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE)
+                for stage, a in at.items()
+                if stage != self.turning
+            )
+            # states are of frames, and what a single beam shows hangs on its group
+            drawn = not moving and not any(stage in COORDINATES for stage in stages(self.chain))
+            drawn &= self.observable.name != "intensity"
+            positions = {stage: a.mean(axis=1) for stage, a in at.items()} if drawn else None
+            found.append(Series(label[2:] or "all", np.flatnonzero(member), positions))
+        return found
+
     def _state(self):
         """Return the states of a modulator in the frames of a datum, empty without one."""
         if "flc_state" not in stages(self.chain):
@@ -106,17 +165,19 @@ class DataGrid:
 
     # ---- the model ---------------------------------------------------------------
 
-    def curve(self, series, bins, derotator):
+    def curve(self, series, bins, angle):
         """
         Return the model between the data, shape (n_bins, n_angles).
 
-        The derotator turns (``derotator`` in degree); every other stage stays
-        where it stands in the series.
+        One stage turns (``angle`` in degree, that of the first frame of a datum); every other
+        stays where it stands in the series.
         """
-        angle = np.deg2rad(derotator)
+        angle = np.deg2rad(angle)
         per_datum, n = self.part.frames.shape[1], len(angle)
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
-        positions["derotator"] = np.tile(angle, per_datum)
+        where = self.position(self.turning)[:, series.data]
+        apart = np.median(where - where[0], axis=1)
+        positions[self.turning] = np.tile(angle, per_datum) + np.repeat(apart, n)
         # between the data there is neither a time nor a flux: such optics do nothing there
         positions |= {stage: np.full(1, x.value) for stage, x in standing(self.chain).items()}
         if "flc_state" in stages(self.chain):
@@ -165,8 +226,9 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     Draw observed and modelled differences against the derotator angle, or a star's altitude.
 
     One pair of panels per wavelength: above the observed data and the model, evaluated between the
-    data too; below their difference in percent. Stars are drawn against their altitude, by the
-    commanded angle of the half-wave plate. Where another stage than the derotator moves within a
+    data too; below their difference in percent. Stars are drawn against their altitude, or the
+    parallactic angle without one, by the commanded angle of the half-wave plate. Without a
+    derotator the stage with the most settings takes its place. Where another stage moves within a
     series, the model is drawn at the data only.
 
     Parameters
@@ -255,6 +317,11 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     return figure
 
 
+def _stage_words(stage):
+    """Return what the angle of a stage is called."""
+    return {"hwp": "half-wave plate angle"}.get(stage, f"{stage} angle")
+
+
 def _panels(figure, count, rows, columns):
     """Return (data, residual) axes for each wavelength, all with the same scales."""
     # residuals need less height than data
@@ -314,6 +381,7 @@ def _legend(figure, grid, series, bins, s_res):
         handles.append(Patch(color="0.92", label="± s_res"))
     frames = f"plus {st.MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
     plate = "half-wave plate\nas commanded" if grid.is_star else "half-wave plate"
+    plate = plate if grid.by_plate else "settings"
     # at the top a long title would run into it
     place = "outside right center"
     st.legend_outside(figure, handles, place=place, title=f"{plate},\n{frames}")
@@ -331,8 +399,9 @@ def plot_residuals(calibration, *, figure=None):
     Draw a map of the residuals: wavelength against datum, by derotator angle; one per dataset.
 
     Above it stands the rms of each datum, at its right that of each wavelength. All maps have the
-    same colours, or where the residuals differ much in size each its own. Masked data are grey.
-    Datasets of one wavelength each are bars. The calibration needs its data.
+    same colours, or where the residuals differ much in size each its own. Grey is what is masked,
+    and of single beams the frame with which a group begins. Datasets of one wavelength each are
+    bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
     count = len(grids)
@@ -396,7 +465,7 @@ def _draw_bars(figure, grids):
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
         below = words
-    figure.supylabel(f"observed {st.MINUS} model (%); grey: masked", fontsize=11)
+    figure.supylabel(f"observed {st.MINUS} model (%); grey: no datum", fontsize=11)
     size = max(100 * _HEADROOM * max(np.nanmax(np.abs(grid.residual)) for grid in grids), 1e-12)
     panels[0].set_ylim(-size, size)
 
@@ -424,22 +493,25 @@ def _draw_dataset(main, above, right, grid, limit):
 
 def _layout(grid):
     """Return the data by derotator then half-wave plate angle, groups, and where these end."""
-    derotator = clusters(grid.derotator, SAME_ANGLE)
+    turning = clusters(grid.angle, SAME_ANGLE)
     # number of the setting of the plate of each datum
-    plate = np.empty(len(derotator), dtype=int)
+    plate = np.empty(len(turning), dtype=int)
     for i, series in enumerate(grid.series()):
         plate[series.data] = i
     # the last key is the first: by derotator angle, within it by plate
-    order = np.lexsort((plate, derotator))
-    group = derotator[order]
+    order = np.lexsort((plate, turning))
+    group = turning[order]
     ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
     return order, group, ends
 
 
 def _name_axis(axes, grid):
     order, group, ends = _layout(grid)
-    angles = [st.degrees(np.median(grid.derotator[order][group == g])) for g in range(len(ends))]
+    angles = [st.degrees(np.median(grid.angle[order][group == g])) for g in range(len(ends))]
     labels = [series.label for series in grid.series()]
     within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
-    words = f"derotator angle; at each, left to right, half-wave plate at\n{within}"
-    st.name_groups(axes, ends, angles, words)
+    words = [_stage_words(grid.turning)] if grid.turning else []
+    if len(labels) > 1:
+        plate = "half-wave plate at" if grid.by_plate else "settings"
+        words.append(f"{'at each, ' if words else ''}left to right, {plate}\n{within}")
+    st.name_groups(axes, ends, angles if grid.turning else [""], "; ".join(words))

@@ -512,7 +512,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             parameter.fixed = False
     for text in fix:
         name, _, value = text.partition("=")
-        for parameter in _parameters(chains, name):
+        for parameter in _valued(chains, name, f"--fix {text}" if value else ""):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
@@ -522,7 +522,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             warnings.warn(message, AstropolcalWarning, stacklevel=2)
     for text in prior:
         name, _, value = text.partition("=")
-        for parameter in _parameters(chains, name):
+        for parameter in _valued(chains, name, f"--prior {text}"):
             parameter.prior = _normal(name, parameter, value)
             parameter.fixed = False
     return chains
@@ -591,6 +591,16 @@ def _parameters(chains, name):
             hint = did_you_mean(key, leaf.param_names)
             raise ParameterError(f"{optic} has no parameter {key!r}; it has {known}{hint}")
         found += [getattr(leaf, each) for each in ([key] if key else leaf.param_names)]
+    return found
+
+
+def _valued(chains, name, option):
+    """Return the same, of a single parameter where an option gives it a value."""
+    found = _parameters(chains, name)
+    keys = list(dict.fromkeys(parameter.name for parameter in found))
+    if option and len(keys) > 1:
+        known = ", ".join(f"{name}.{key}" for key in keys)
+        raise ParameterError(f"{option}: name the parameter that has this value, of {known}")
     return found
 
 

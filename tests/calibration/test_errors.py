@@ -4,11 +4,14 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from scipy.optimize import curve_fit
 
+from astropolcal import Observations, optics
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.uncertainty import standard_errors
 from astropolcal.exceptions import CalibrationFileError, FitError
+from astropolcal.simulation import simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
 
@@ -114,3 +117,33 @@ def test_bad_input_is_refused(cal, tmp_path):
     with pytest.raises(CalibrationFileError, match="holds no observations"):
         standard_errors(again, "van-holstein")
     assert len(standard_errors(again)) == len(standard_errors(cal))
+
+
+def test_half_a_wave_hides_no_error():
+    """The derivative to a retardance vanishes there, and what trades with it is not known well."""
+    chain = (
+        optics.LinearPolarizer(name="lamp")
+        | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    angle = np.array([0.0, 36, 38, 40, 42, 44, 46, 48, 50, 52])
+    data = simulate(chain, [0.6] * u.um, QTable({"hwp": angle * u.deg}), noise=False, flux=1e6)
+    kept = data.to_table()
+    kept["flux_right_err"] = kept["flux_left_err"] = 500 * kept["flux_right"].unit
+    data = Observations.from_table(kept)
+    single = {"observable": "normalized_single_difference", "weights": "errors"}
+    found = calibrate(chain, data, cross_validate=False, errors="white", **single)
+    # x = efficiency ((1 + c) / 2 + (1 - c) / 2 cos 4 angle), with c the cosine of the retardance
+    wave = np.cos(4 * np.deg2rad(angle))
+    sigma = np.sqrt(500**2 * 2 * (1 + (0.98 * wave) ** 2)) / 5e5
+    slopes = np.stack([wave, 0.98 * (1 - wave) / 2]) / sigma
+    of_efficiency, of_cosine = np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T)))
+    alone = 1 / np.linalg.norm(slopes[0])
+    assert of_efficiency > 1.5 * alone
+    values = found.parameter_values()
+    assert values["wollaston.efficiency"]["std"] == pytest.approx(of_efficiency, rel=0.05)
+    # it stands far nearer to half a wave than where the cosine changes by its error
+    there = 180 - np.rad2deg(np.arccos(of_cosine - 1))
+    assert abs(values["hwp.retardance"]["value"] - 180) < 0.05 * there
+    assert values["hwp.retardance"]["std"] > there
+    assert values["hwp.retardance"]["status"] == "badly determined"

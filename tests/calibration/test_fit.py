@@ -557,3 +557,20 @@ def test_wrong_derivatives_of_an_optic_of_a_user_are_refused(few):
         chain["fading"].wrong = wrong
         with pytest.raises(FitError, match=r"fading.share: the derivative"):
             calibrate(chain, data, cross_validate=False)
+
+
+def test_names_alone_hold_parameters_where_they_start():
+    chain = (
+        optics.LinearPolarizer(name="lamp", fixed={"theta": False})
+        | optics.LinearRetarder(
+            retardance=170 * u.deg, mount="hwp", name="hwp", fixed={"theta": False}
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[0, 0, 0] * u.deg)
+    observations = simulate(chain, [0.6] * u.um, frames, seed=1)
+    for fix in ("hwp.theta", ["hwp.theta"], {"hwp.theta": None}):
+        held = calibrate(chain, observations, fix=fix, cross_validate=False)
+        assert held.chain["hwp"].theta.fixed
+    with pytest.raises(FitError, match=r"no parameter 'hwp.tetha'.*did you mean 'hwp.theta'"):
+        calibrate(chain, observations, fix=["hwp.tetha"])

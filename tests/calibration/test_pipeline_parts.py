@@ -221,6 +221,19 @@ def test_an_unknown_instrument_is_asked_for():
             describe(header)
 
 
+def test_a_package_that_cannot_be_imported_hides_no_instrument(monkeypatch):
+    """Its name comes first, so that it is asked before the one whose frame it is."""
+
+    def fail():
+        raise ModuleNotFoundError("No module named 'missing'")
+
+    broken = SimpleNamespace(name="broken", load=fail)
+    monkeypatch.setattr(instruments, "entry_points", lambda group: [broken])
+    assert describe(_header())["instrument"] == "charis"
+    with pytest.raises(InstrumentError, match="'CIAO', which is not known"):
+        describe({"INSTRUME": "CIAO"})
+
+
 def test_a_date_that_is_none_is_shown():
     with pytest.raises(CalibrationFileError, match="date 'yesterday' cannot be understood"):
         describe(_header(MJD="yesterday"))

@@ -17,7 +17,7 @@ from astropolcal import Calibration, Observations, calibrate, instruments, optic
 from astropolcal.calibration.result import verdict as verdicts
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
-from astropolcal.simulation import half_wave_plate_cycles
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
 
@@ -294,3 +294,21 @@ def test_errors_that_rest_on_few_numbers_are_named_so(make):
     data = make.observe(chain, half_wave_plate_cycles(plate, [50, 80] * u.deg), lam, seed=2)
     cautions = calibrate(chain, data, cross_validate=False).verdict().cautions
     assert any("1 degree of freedom only" in one for one in cautions)
+
+
+def test_only_what_an_instrument_has_is_advised():
+    """FORS2 has neither an internal source nor a derotator."""
+    fors2 = instruments.get("fors2")
+    frames = QTable({"hwp": np.tile(np.arange(0, 180, 22.5), 2) * u.deg})
+    frames["parallactic"] = np.repeat([0, 90], 8) * u.deg
+    frames["altitude"] = np.full(16, 60) * u.deg
+    meta = {"instrument": "fors2", "source": "unpolarized standard star"}
+    chain = fors2.chain(meta["source"])
+    star = simulate(chain, fors2.wavelength, frames, flux=1e9, seed=1, meta=meta)
+    told = []
+    for theta, free in ((True, False), (False, True)):
+        chain["hwp"].retardance.fixed = chain["wollaston"].efficiency.fixed = True
+        chain["hwp"].theta.fixed, chain["hwp"].retardance.fixed = theta, not free
+        cal = calibrate(chain, star, instrument="fors2", cross_validate=False)
+        told.append(fits_a_terminal(cal)[4])
+    assert not any("internal" in line or "derotator" in line for line in told), told

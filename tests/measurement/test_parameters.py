@@ -35,6 +35,12 @@ def test_table_joins_optics_of_one_name():
     assert table["plate.retardance"] == [first["plate"].retardance, second["plate"].retardance]
 
 
+def test_names_that_would_be_read_as_others_are_refused():
+    for name, other in (("hwp[1]", "hwp_1"), ("hwp.1", "hwp_1"), ("[", "optic")):
+        with pytest.raises(ParameterError, match=f"without dot and brackets .* as '{other}'"):
+            parameter_table([optics.WollastonPrism(name=name)])
+
+
 def test_optics_that_cannot_be_listed_are_refused():
     with pytest.raises(ParameterError, match="WollastonPrism needs a name"):
         parameter_table([optics.WollastonPrism()])

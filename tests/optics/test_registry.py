@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from astropolcal import mueller, optics
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.materials import get_material
 from astropolcal.optics import COORDINATES, OPTICS, FrameOptic, Optic
 from astropolcal.optics.perturbations import GENERATORS
@@ -923,6 +923,19 @@ def test_value_of_other_number_of_wavelengths_is_refused(label):
                 optic.mueller(wavelength)
         with pytest.raises(ParameterError, match=message.format(3)):
             optic(WAVELENGTH, 1, 0, 0, 0)
+
+
+def test_misspelt_names_are_refused_wherever_they_are_given():
+    plate = optics.LinearRetarder(retardance=170 * u.deg, name="plate")
+    chain = plate | optics.WollastonPrism(name="wollaston")
+    for call, error, words in (
+        (lambda: optics.LinearRetarder(fixed={"tehta": False}), ParameterError, "mean 'theta'"),
+        (lambda: optics.LinearRetarder(bounds={"tehta": (0, 1)}), ParameterError, "mean 'theta'"),
+        (lambda: setattr(plate, "retardence", 1 * u.deg), ParameterError, "mean 'retardance'"),
+        (lambda: chain["plat"], ChainError, "it has plate, wollaston; did you mean 'plate'"),
+    ):
+        with pytest.raises(error, match=words):
+            call()
 
 
 @every

@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from matplotlib.figure import Figure
 
 from astropolcal import Observations, calibrate, instruments, optics
-from astropolcal.chain import leaves
+from astropolcal.chain import join, leaves
 from astropolcal.exceptions import CalibrationFileError, ParameterError, WavelengthRangeError
 from astropolcal.observations.observables import get_observable
 from astropolcal.plotting import _style, plot_double_differences
@@ -416,7 +417,7 @@ def test_cells_are_the_residuals_in_percent(drawn):
 def test_data_are_ordered_by_derotator_and_then_by_plate(drawn):
     _, grid = drawn
     order, group, ends = _layout(grid)
-    assert np.all(np.diff(grid.derotator[order]) >= -0.5)
+    assert np.all(np.diff(grid.angle[order]) >= -0.5)
     plate = np.rad2deg(grid.position("hwp")[0]) % 90
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
         assert np.all(np.diff(plate[order][start:end]) > 0)
@@ -458,7 +459,7 @@ def test_labels_have_units(drawn):
     main, above, right = parts(figure)
     assert main.get_ylabel() == "wavelength (nm)"
     assert above.get_ylabel() == right.get_xlabel() == "rms (%)"
-    assert figure.axes[-1].get_ylabel() == "observed \N{MINUS SIGN} model (%); grey: masked"
+    assert figure.axes[-1].get_ylabel() == "observed \N{MINUS SIGN} model (%); grey: no datum"
     assert "derotator angle; at each, left to right, half-wave plate at" in main.get_xlabel()
     assert figure.get_suptitle().startswith("Residuals of the normalized double difference")
 
@@ -496,12 +497,57 @@ def test_many_groups_have_few_labels():
     n = 30
     parts = np.array_split(np.arange(n), 9)
     series = [SimpleNamespace(label=f"{i}°", data=data) for i, data in enumerate(parts)]
-    grid = SimpleNamespace(derotator=np.arange(n) * 5.0, series=lambda: series)
+    grid = SimpleNamespace(
+        angle=np.arange(n) * 5.0, turning="derotator", by_plate=True, series=lambda: series
+    )
     axes = Figure().subplots()
     _name_axis(axes, grid)
     assert len(axes.get_xticks()) <= 12
     # more than eight settings of the plate are named by the first and the last
     assert axes.get_xlabel().endswith("0° to 8°")
+
+
+def test_data_without_a_derotator_are_drawn():
+    """Against the stage that turns, by the states of a device, or of a star by the plate."""
+    plate = optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+    lamp = (
+        optics.LinearPolarizer(name="lamp")
+        | plate
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    frames = QTable({"hwp": np.arange(0, 180, 22.5) * u.deg})
+    wheel = [
+        optics.StateAnalyser(
+            efficiency=0.9, theta=angle * u.deg, name=f"p{angle}", mount=f"filter=P{angle}"
+        )
+        for angle in (0, 60, 120)
+    ]
+    turned = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    states = QTable({"calibrator": np.repeat(np.arange(0, 180, 15), 3) * u.deg})
+    states["filter"] = np.tile(["P0", "P60", "P120"], 12)
+    states["group"] = np.arange(36) // 3
+    sky = optics.PolarizedSource(q=0.05, u=0.0, name="star")
+    star = sky | optics.Rotator(mount="parallactic", name="p") | plate | lamp["wollaston"]
+    night = QTable({"hwp": np.tile([0, 45, 22.5, 67.5], 4) * u.deg})
+    night["parallactic"] = np.linspace(-40, 40, 16) * u.deg
+    pairs = {f" {_style.MINUS} ".join(pair) for pair in (("0°", "45°"), ("22.5°", "67.5°"))}
+    for chain, table, source, label, names, between in (
+        (lamp, frames, "polarized", "half-wave plate angle (°)", {"all"}, True),
+        (join([turned, *wheel]), states, "lamp", "calibrator angle (°)",
+         {"filter P0", "filter P60", "filter P120"}, False),
+        (star, night, "star", "parallactic angle (°)", pairs, False),
+    ):  # fmt: skip
+        data = simulate(chain, [0.6] * u.um, table, seed=1, meta={"source": source})
+        calibration = calibrate(chain, data, cross_validate=False)
+        top, bottom = plot_double_differences(calibration).axes
+        assert bottom.get_xlabel() == label
+        assert set(points(top)) == names
+        assert bool(curves(top)) == between
+        for curve in curves(top):
+            measured = np.concatenate(list(points(top).values()))
+            model = np.interp(measured[:, 0], *curve.get_data())
+            np.testing.assert_allclose(model, measured[:, 1], atol=0.01)
+        assert plot_residuals(calibration).axes
 
 
 def test_one_derotator_angle_and_single_frames(single_angle):

@@ -435,3 +435,15 @@ def test_a_unit_given_once_holds_for_mean_and_std(chains):
         prior = _normal("hwp.theta", parameter(chains[0], "hwp.theta"), text)
         assert prior.mean.to_value(u.deg) == pytest.approx(mean), (text, mean, std)
         assert prior.std.to_value(u.deg) == pytest.approx(std), (text, mean, std)
+
+
+def test_a_value_is_of_one_parameter():
+    """One value for theta and retardance is what nobody means."""
+    charis = instruments.get("charis")
+    chains = [charis.chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)]
+    for options in ({"fix": ["derotator=3deg"]}, {"prior": ["derotator=0+-1deg"]}):
+        with pytest.raises(ParameterError, match=r"of derotator.theta, derotator.retardance"):
+            edit_chains(chains, **options)
+    edit_chains(chains, fix=["derotator"])
+    assert chains[0]["derotator"].theta.fixed
+    assert chains[0]["derotator"].retardance.fixed

@@ -15,6 +15,7 @@ user names another gauge by holding parameters (``fix=``) or by a prior.
 import platform
 import time
 import warnings
+from collections.abc import Mapping
 from importlib.metadata import version as installed
 
 import astropy.units as u
@@ -61,7 +62,7 @@ from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["calibrate"]
 
@@ -147,8 +148,8 @@ def calibrate(
         from the model count less. It sets the noise of each datum, so ``weights`` counts for the
         first fit only. Errors of parameters allow for weights that follow the residuals; a profile,
         a bootstrap and samples take them as known, and may be a third narrower.
-    fix : dict of str to `~astropy.units.Quantity` or None, optional
-        Parameters to hold, ``"optic.parameter"``, at a value or (None) at
+    fix : dict of str to `~astropy.units.Quantity` or None, or sequence of str, optional
+        Parameters to hold, ``"optic.parameter"``, at a value or (None, or a name alone) at
         that of the chain: another way to choose a gauge.
     instrument : str, optional
         Name to record.
@@ -251,9 +252,11 @@ def _fixed(chain, fix):
     single = isinstance(chain, Model)
     copies = [item.copy() for item in ([chain] if single else chain)]
     table = parameter_table(copies)
+    fix = fix if isinstance(fix, Mapping) else dict.fromkeys([fix] if isinstance(fix, str) else fix)
     for name, value in fix.items():
         if name not in table:
-            raise FitError(f"fix: no parameter {name!r}; there are {', '.join(table)}")
+            known, near = ", ".join(table), did_you_mean(name, table)
+            raise FitError(f"fix: no parameter {name!r}; there are {known}{near}")
         for parameter in table[name]:
             if value is not None:
                 # every dataset's chain has its own Parameter object of the name
@@ -328,6 +331,10 @@ def _at_gauge(measurement, weighting, origin, gauge):
     hold_silent(measurement, origin)
     problem = BinProblem(measurement, weighting)
     whitened = settled(problem, origin) if gauge == "minimal" else problem.around()
+    beside = problem.beside_extrema(measurement.vector(), whitened)
+    if beside is not None:
+        measurement.stand_at(beside)
+        whitened = problem.around(beside)
     chosen = open_parameters(measurement.free, whitened)
     if len(whitened.data.null):
         hold_silent(measurement, origin)

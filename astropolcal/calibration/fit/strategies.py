@@ -111,8 +111,11 @@ class BinProblem(Problem):
 
     def of_bins(self, vector):
         """Return weighted residuals by bin, zero where a bin has fewer data."""
-        # all bins at once: a prediction costs as much for one bin as for all
-        residual = (self.measurement.predict(vector) - self.measurement.observed) * self.weights
+        # all bins at once: a prediction costs as much for one bin as for all; a trial that lets no
+        # light pass is not better than another
+        with np.errstate(divide="ignore", invalid="ignore"):
+            predicted = self.measurement.predict(vector)
+        residual = (predicted - self.measurement.observed) * self.weights
         return residual[self._data] * self._present
 
     def costs(self, vector):

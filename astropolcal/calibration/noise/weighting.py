@@ -154,6 +154,11 @@ _SETTLED = 1e-2
 # fewer degrees of freedom than this tell no noise
 _LEAST_FREEDOM = 0.5
 _MAX_EVALUATIONS = 100
+# a derivative below this share of the largest may vanish at an extremum; then it is this many
+# times larger, and this share of the largest, so many degrees, micrometres or percent beside it
+_WEAK, _GROWN, _SEEN, _BESIDE = 3e-3, 10.0, 1e-6, 5.0
+# the share of the way at which the data change by the noise that changes nothing else
+_PART_OF_WAY = 0.02
 # normalized data do not reach this; one over a noise does
 _LARGEST = 1.0
 
@@ -242,6 +247,48 @@ class Problem:
         data = self.measurement.jacobian(vector) * self.weights
         priors = free.prior_jacobian(vector, for_errors=True) * self.noise
         return Whitened(data, free.steps, priors, free.at_bounds(vector))
+
+    def beside_extrema(self, vector, whitened):
+        """Return a vector a little beside the extrema, as half a wave is, of what is hardly known.
+
+        Derivatives vanish there, and what trades with such a parameter would seem to be known well.
+        A small part of the way at which the data change by the noise changes nothing else.
+        """
+        data, steps = whitened.rows.T, whitened.scale
+        size = np.linalg.norm(data, axis=1)
+        weak = ~whitened.held & (size < _WEAK * size.max(initial=0.0))
+        if weak.any():
+            weak &= ~(self._errors(whitened) < _BESIDE)
+        bent, moved = data.copy(), vector.copy()
+        ways = np.full(vector.size, np.nan)
+        for slot in self.measurement.free.slots:
+            own = np.arange(slot.start, slot.start + slot.size)[weak[slot.slice]]
+            if not own.size:
+                continue
+            there, way = vector.copy(), _BESIDE * steps[own]
+            sign = np.where(vector[own] + way > self._high[own], -1, 1)
+            there[own] += sign * way
+            beside = self.measurement.jacobian(there)[own] * self.weights * steps[own, None]
+            grown = np.linalg.norm(beside, axis=1)
+            grown = (grown > _GROWN * size[own]) & (grown > _SEEN * size.max())
+            # away from the extremum, on whose other side the derivative has the other sign
+            sign = np.where(np.sum(beside * data[own], axis=1) < 0, -sign, sign)
+            ways[own[grown]] = sign[grown]
+            bent[own[grown]] = beside[grown]
+        if np.isnan(ways).all():
+            return None
+        around = Whitened(bent / steps[:, None], steps, whitened.prior_rows.T / steps[:, None])
+        errors = np.nan_to_num(self._errors(around), nan=_BESIDE, posinf=_BESIDE)
+        # the slope grows with the way: there it is as long as the error that follows from it
+        ways *= _PART_OF_WAY * np.sqrt(2 * _BESIDE * errors) * steps
+        moved += np.nan_to_num(ways)
+        return np.clip(moved, self._low, self._high)
+
+    def _errors(self, whitened):
+        """Return standard errors in steps, NaN of what is open."""
+        weighting = self.weighting
+        level = (weighting if weighting.is_known else weighting.started(self.measurement)).level
+        return level * np.sqrt(np.diag(whitened.covariance())) / whitened.scale
 
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
         """Return the vector, chi-square, and what scipy says of the fit.

@@ -7,16 +7,21 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.chain import stages
 from astropolcal.measurement.parameters import are_outside, limits
-from astropolcal.words import HEIGHT, WIDTH, counted, p_words, shortened
+from astropolcal.optics import COORDINATES
+from astropolcal.words import HEIGHT, WIDTH, counted, listed, p_words, shortened
 
 __all__ = ["Verdict"]
 
+# what may send the light
+_KINDS = ("polarized", "unpolarized", "star")
 # what holds at more than this share of the wavelengths holds of the calibration
 _MOST = 0.5
 # bare metals polarize by a few percent at most, coated ones by little more
@@ -375,22 +380,30 @@ def _with_status(free, status):
 def _next(calibration, free, wrong, sky):
     """Return the one thing that would help most."""
     kinds = {kind_of_source(r.source) for r in calibration.datasets}
+    instrument = known_instrument(calibration.settings.get("instrument"))
+    # of a chain without an instrument it is not known what there is
+    offered = {kind_of_source(source) for source in instrument.sources} if instrument else set()
+    missing = (offered or set(_KINDS)) - kinds
+    turning = {stage for chain in calibration.chains for stage in stages(chain)}
+    derotator = "derotator" in turning
+    published = instrument and instrument.has_telescope
+    telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
     advice = (
         (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
         (wrong, "check mounts, beams, angles, source; or run astropolcal diagnose"),
         (
-            unknown and "polarized" not in kinds,
-            "the internal source with its polarizer, at several derotator angles",
+            unknown and "polarized" in missing,
+            f"the internal source with its polarizer{', at several derotator angles' * derotator}",
         ),
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
-        (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
+        (unknown or not calibration.converged, _more_angles(turning)),
         (
-            "star" not in kinds,
-            "an unpolarized standard star; the telescope counts as published, without error",
+            "star" in missing,
+            f"an unpolarized standard star; the telescope {telescope}",
         ),
-        ("unpolarized" not in kinds, "the internal source without its polarizer"),
+        ("unpolarized" in missing, "the internal source without its polarizer"),
         (
             any(entry["status"] == "by priors" for entry in _orientations(free).values()),
             "a polarized standard star: the AoLP rests on how optics are mounted",
@@ -399,6 +412,15 @@ def _next(calibration, free, wrong, sky):
         (True, "a dataset that no fit saw, as a test (--standard FILE)"),
     )
     return next(words for applies, words in advice if applies)
+
+
+def _more_angles(turning):
+    """Say which stages should stand at more angles, of all whose position the chains need."""
+    angles = turning - {*COORDINATES, "parallactic", "altitude"}
+    known = {"derotator": "derotator", "hwp": "half-wave plate"}
+    names = [words for stage, words in known.items() if stage in angles]
+    names += sorted(angles - set(known))
+    return f"more angles of {listed(names) if names else 'the sky'}"
 
 
 def _mount(calibration, free, sky):

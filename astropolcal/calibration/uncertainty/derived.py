@@ -281,8 +281,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     True
     """
     leaf = find_optic(calibration.chains[dataset], optic)
-    components = ("retardance", "horizontal", "diagonal", "circular")
-    components = [key for key in components if key in leaf.param_names]
+    components = retardances_of(leaf)
     if components:
         return of_optic(calibration, dataset, optic, components, wavelength)
     if not callable(getattr(leaf, "retardance", None)):
@@ -290,6 +289,12 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     lam = calibration.wavelength if wavelength is None else wavelengths_of(wavelength)
     _check_laws(leaf, leaf.own_names)
     return of_law(calibration, optic, "retardance", lam)
+
+
+def retardances_of(leaf):
+    """Return the parameters that are retardances; those of a diattenuator have no unit."""
+    names = ("retardance", "horizontal", "diagonal", "circular")
+    return [key for key in names if key in leaf.param_names and getattr(leaf, key).unit == u.deg]
 
 
 def derived_efficiency(calibration, wavelength=None, dataset=0):
