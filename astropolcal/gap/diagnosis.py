@@ -18,7 +18,13 @@ from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.frames import single_data, suspect_frames, unknown_angles, without_frames
+from astropolcal.gap.frames import (
+    lamp_faults,
+    single_data,
+    suspect_frames,
+    unknown_angles,
+    without_frames,
+)
 from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
@@ -315,10 +321,8 @@ def diagnose(
     # What depends on the last move of a stage shows in a few frames too, and is one cause
     smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
-        frames = [fault for fault in frames if fault.what == "lamp"]
-    else:
-        nominal, base = _without(nominal, base, wrong, say)
-    frames = single + frames
+        wrong = []
+    nominal, base = _without(nominal, base, wrong, say)
     if single or wrong:
         groups = groups and frame_groups(base.observations)
     say("looking for causes")
@@ -328,7 +332,11 @@ def diagnose(
         say("looking for causes again: they leave less than what was taken for noise")
         nominal = base = _with_noise_of(base, selection)
         selection = select(base, smooth, groups, say, cells=cells, changes=changes)
-    found = _conclude(nominal, base, exchanged, selection, edges + frames, started)
+    # what dims a frame may be a cause of the gap, and then the lamp did not
+    frames = edges + single + wrong
+    named = {fault.place for fault in frames}
+    frames += [fault for fault in lamp_faults(selection.model) if fault.place not in named]
+    found = _conclude(nominal, base, exchanged, selection, frames, started)
     found.settings["changes"] = changes
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)

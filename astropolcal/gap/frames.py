@@ -113,7 +113,7 @@ def suspect_frames(model):
         found = [fault for fault in found if fault.place in search.worst]
         found = found if search.is_settled([fault.place for fault in found], last) else []
     named = {fault.place for fault in found}
-    return found + [fault for fault in _lamp(model) if fault.place not in named]
+    return found + [fault for fault in lamp_faults(model) if fault.place not in named]
 
 
 def single_data(model, known=()):
@@ -379,7 +379,7 @@ def _exchanges(place, frames, trials):
 # ---- the lamp --------------------------------------------------------------------------------
 
 
-def _lamp(model):
+def lamp_faults(model):
     """Return the frames of which the brightness is off the drift of the lamp."""
     found = []
     problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
@@ -409,9 +409,10 @@ def _off_the_drift(channel, gap):
         # a frame that is masked at all wavelengths has no median
         warnings.simplefilter("ignore", RuntimeWarning)
         common = np.nanmedian(table - np.nanmedian(table, axis=1, keepdims=True), axis=0)
-        # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared
+        # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared; some
+        # frames may be noisier than others
         count = np.maximum(np.isfinite(table).sum(axis=0), 1)
-        error = np.nanmedian(np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count))
+        error = np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count)
     least, n = np.inf, np.isfinite(common).sum()
     # the curve whose median deviation is least for what its degree costs
     for degree in range(min(_LARGEST_DRIFT, n // 4) + 1):
@@ -419,7 +420,7 @@ def _off_the_drift(channel, gap):
         middle = np.nanmedian(np.abs(common - curve))
         cost = n * np.log(max(middle, 1e-12)) + degree * np.log(max(n, 2))
         if cost < least:
-            least, deviation, spread = cost, common - curve, max(MAD_TO_SIGMA * middle, error)
+            least, deviation, spread = cost, common - curve, np.fmax(MAD_TO_SIGMA * middle, error)
     return deviation, deviation / spread
 
 

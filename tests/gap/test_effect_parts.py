@@ -21,7 +21,6 @@ from astropolcal.gap.effects import (
     get_effect,
 )
 from astropolcal.gap.effects._laws import (
-    able_to_hold,
     around,
     held_star,
     lagging,
@@ -365,17 +364,6 @@ def test_only_a_star_whose_polarization_is_held_is_held():
     assert held_star([plate(), star]) is star
     star.u.fixed = False
     assert held_star([star]) is None
-
-
-def test_a_basis_is_widened_only_if_it_cannot_hold_the_values():
-    basis = Context(GRID).basis(1)
-    assert able_to_hold(3 - 2 * GRID, basis) is basis
-    bent = np.array([0.0, 0.01, 0.05, 0.01, 0.0])
-    wide = able_to_hold(bent, basis)
-    assert wide.shape == (5, 3)
-    solution = np.linalg.lstsq(wide, bent, rcond=None)[0]
-    np.testing.assert_allclose(wide @ solution, bent, atol=1e-12)
-    assert np.abs(wide[:, 2]).max() == pytest.approx(1)
 
 
 # ---- laws of special effects ---------------------------------------------------------------

@@ -141,6 +141,11 @@ class Edit:
         return {p.name: p.basis for p in self.parameters if p.basis is not None}
 
     @property
+    def neutral(self):
+        """Value of every parameter at which the effect is absent, canonical, by name."""
+        return {p.name: p.canonical_neutral for p in self.parameters}
+
+    @property
     def limits(self):
         """Largest physical size of every parameter, canonical, by name."""
         return {p.name: p.canonical_limit for p in self.parameters}
