@@ -20,6 +20,7 @@ from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.frames import (
     lamp_faults,
+    not_off,
     single_data,
     suspect_frames,
     unknown_angles,
@@ -311,7 +312,7 @@ def diagnose(
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     edges = unknown_angles(observations, exchanged[0]) if exchanged else []
     say("looking for frames that are not what the table says")
-    single = []
+    whole, single = (nominal, base), []
     while more := single_data(base, single):
         nominal, base = _without(nominal, base, more, say)
         single += more
@@ -319,7 +320,9 @@ def diagnose(
     wrong = [fault for fault in frames if fault.what != "lamp"]
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
-    smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
+    n = len(base.problem.wavelength)
+    fitting = (effect for effect in adapted(library, base.chains) if effect.is_told(n))
+    smooth = [effect for effect in fitting if effect.kind != "discrete"]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
         wrong = []
     nominal, base = _without(nominal, base, wrong, say)
@@ -327,6 +330,12 @@ def diagnose(
         groups = groups and frame_groups(base.observations)
     say("looking for causes")
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+    if single and (right := not_off(selection.model, whole[1].observations, single)):
+        say("looking for causes again: they explain data that were left out")
+        single = [fault for fault in single if fault not in right]
+        nominal, base = _without(*whole, single + wrong, say)
+        groups = groups and frame_groups(base.observations)
+        selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     left = selection.model
     if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
         say("looking for causes again: they leave less than what was taken for noise")

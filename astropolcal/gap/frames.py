@@ -56,6 +56,8 @@ _AT_ONCE, _NEARLY = 12, 0.5
 # as bad frames are found, so little of the excess is left that the noise is measured anew
 _NEARLY_GONE = 0.1
 _STEPS, _SHARE = 20, 1e-5
+# what a problem knows beside its chains
+_KNOWN = ("ties", "laws", "priors", "neutral", "limits")
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
 
@@ -177,6 +179,20 @@ def _single(residual, tangent, weight, least):
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
     return np.where(found > least * spread, found / spread, 0.0)
+
+
+def not_off(model, observations, faults):
+    """Return those of single data that agree with a model fitted without them."""
+    known = {key: getattr(model.problem, key) for key in _KNOWN}
+    problem = GapProblem(model.trains, observations, **known)
+    problem.settle_noise()
+    found, gaps = [], problem.differences(problem.start)
+    for fault in faults:
+        i, f = fault.place
+        place = problem.channels[i].told, fault.bin, f
+        if abs(gaps[i][place]) < _ALSO * problem.channels[i].sigma[place]:
+            found.append(fault)
+    return found
 
 
 def unknown_angles(observations, effect):
@@ -495,7 +511,7 @@ class Search:
             seen = zip(self.model.observations, out, strict=True)
             left = [o.with_mask(mask, "accused") for o, mask in seen]
             chains = nominal_calibration(chains, left).chains
-        known = {key: getattr(old, key) for key in ("ties", "laws", "priors", "neutral", "limits")}
+        known = {key: getattr(old, key) for key in _KNOWN}
         problem = GapProblem(chains, self.model.observations, **known)
         problem.settle_noise(look.coefficients if look.is_noise else problem.start, out)
         self.model, self.problem = Model(problem, self.model.fit), problem

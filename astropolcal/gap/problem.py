@@ -314,7 +314,8 @@ class GapProblem:
         residual, cost = self._cost(q, take)
         converged, damping, slow = not live.any(), 0.0, False
         for _ in range(steps):
-            if converged:
+            # from where the model is not defined no step leads down
+            if converged or not np.isfinite(cost):
                 break
             normal, growth = self._normal(q, residual, take, live), 2
             if not np.isfinite(normal[0]).all():

@@ -119,10 +119,13 @@ class Fringes(Effect):
             title=f"{title}, period 1/({thickness:.3g} um)",
         )
 
+    def is_told(self, n_wavelengths):
+        """Return whether there are as many as a sine, a cosine and what they are told from."""
+        return n_wavelengths > 4
+
     def law(self, context, chains=()):
         """Return a sine and a cosine in the wavenumber."""
-        # fewer wavelengths than a sine, a cosine and what they must be told from
-        if len(context.wavelength) < 5:
+        if not self.is_told(len(context.wavelength)):
             return None
         # two reflections interfere with the phase of their difference of path
         phase = 2 * np.pi * self.thickness / context.wavelength

@@ -560,6 +560,10 @@ class Effect:
             return None
         return self.degree(context) if callable(self.degree) else context.basis(self.degree)
 
+    def is_told(self, n_wavelengths):
+        """Return whether so many wavelengths tell its law from any other."""
+        return n_wavelengths > 1 or not (self.degree is None or callable(self.degree))
+
     def free_of(self, optic):
         """Return the names of the parameters of its optic that the effect frees."""
         if self.free is not None:

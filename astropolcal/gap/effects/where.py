@@ -261,7 +261,7 @@ def adapted(effects, chains):
         if own_name and one.acts_on == "plate":
             words["half-wave plate"] = one.optic or plates[0].name
         if all(roles.derotator is None for roles in every):
-            words[_BEHIND] = _BEHIND_PLATE
+            words[_BEHIND] = f"downstream of the {plates[0].name}" if own_name else _BEHIND_PLATE
         for old, new in words.items():
             if old in one.title + one.place:
                 title, place = (text.replace(old, new) for text in (one.title, one.place))
