@@ -47,7 +47,8 @@ class Channels:
         self.told, self.count = (1, 1) if obs.single_beam else (0, 2)
         self.groups = obs.brightness_groups if obs.single_beam else None
         usable = ~obs.mask.T if obs.single_beam else dataset.valid
-        self.valid = usable & np.isfinite(self.observed).all(axis=0)
+        lit = np.add(*beams.fluxes) > 0
+        self.valid = usable & lit & np.isfinite(self.observed).all(axis=0)
         if obs.single_beam:
             # the logarithm of a flux within its noise is none; the differences are 1, and told
             self.valid &= ~(self.variance[1] > _FAINT**-2)

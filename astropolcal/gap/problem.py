@@ -68,10 +68,11 @@ class GapProblem:
     Chains against all frames of their datasets, whitened by the noise.
 
     Parameters may have ``laws``, a basis (W, k) each; ``priors``, the standard deviation of a
-    normal prior on their coefficients; ``neutral``, the value about which law, prior and limits are
-    (0 if none is given); and ``limits``, the most by which they may differ from it, where they follow
-    no law: those are held to the bounds of their optic. All by ``"optic.parameter"``, canonical.
-    Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be called.
+    normal prior on their coefficients; ``neutral``, the value about which law, prior and limits
+    are (0 if none is given); and ``limits``, the most by which they may differ from it, where they
+    follow no law: those are held to the bounds of their optic. All by ``"optic.parameter"``,
+    canonical. Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be
+    called.
     """
 
     def __init__(

@@ -246,8 +246,10 @@ def test_words_name_the_plate_where_there_is_no_derotator():
     assert one.title == "diattenuator that is static downstream of the half-wave plate"
     assert one.place == "relay downstream of the half-wave plate"
     with_it = plate() | turned() | WOLLASTON
-    (same,) = adapted([get_effect("static_diattenuator")], [with_it])
+    same, between = adapted([get_effect("static_diattenuator")], [with_it])
     assert same is get_effect("static_diattenuator")
+    assert between.title == "diattenuator that is static downstream of the half-wave plate (hwp)"
+    assert {cell.place for cell in between.cells([with_it])} == {"after:hwp"}
     # what says nothing of it stays itself
     assert adapted([get_effect("beam_gain")], [chain]) == [get_effect("beam_gain")]
 

@@ -120,7 +120,7 @@ class Fringes(Effect):
         )
 
     def is_told(self, n_wavelengths):
-        """Return whether there are as many as a sine, a cosine and what they are told from."""
+        """Return whether a sine and a cosine can be distinguished from other laws."""
         return n_wavelengths > 4
 
     def law(self, context, chains=()):

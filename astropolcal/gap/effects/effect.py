@@ -561,7 +561,7 @@ class Effect:
         return self.degree(context) if callable(self.degree) else context.basis(self.degree)
 
     def is_told(self, n_wavelengths):
-        """Return whether so many wavelengths tell its law from any other."""
+        """Return whether so many wavelengths distinguish its law from any other."""
         return n_wavelengths > 1 or not (self.degree is None or callable(self.degree))
 
     def free_of(self, optic):
