@@ -392,10 +392,14 @@ class GapProblem:
         """
         return orthonormal(self.open_slopes(coefficients, jacobian, kept))
 
+    def at_bound(self, coefficients):
+        """Return which coefficients are at their bounds, (n_coefficients,) of bool."""
+        below, above = self.low + _AT_BOUND, self.high - _AT_BOUND
+        return (coefficients <= below) | (coefficients >= above)
+
     def open_slopes(self, coefficients, jacobian=None, kept=True):
         """Return the derivatives in the directions that no bound closes, shape (n_rows, k)."""
-        inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        inside &= kept
+        inside = ~self.at_bound(coefficients) & kept
         jacobian = self.jacobian(coefficients) if jacobian is None else jacobian
         slopes, (rows, ends) = jacobian[:, inside], self._walls
         held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
