@@ -433,7 +433,10 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
-    causes = [_exchanged(nominal, base, improved, exchanged, total)] if exchanged else []
+    # what improbable causes take up is not explained
+    sure = all(group.probability >= _LIKELY for group in selection.groups)
+    beside = improved if sure else base
+    causes = [_exchanged(nominal, base, beside, exchanged, total)] if exchanged else []
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
