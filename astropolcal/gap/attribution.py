@@ -209,14 +209,17 @@ class Scan:
     def named_as(self, candidate, effects):
         """Return the names of a cell, each with the law for which there is most evidence."""
         chains, own = self.probes.model.trains, self.probes.own
-        same = [
+        return self.with_laws(
             effect
             for effect in effects
             if effect.name not in own and candidate.cell in effect.cells(chains)
-        ]
-        best = {}
-        for degree in (*_DEGREES, *_FREER) if same else ():
-            for one in _named(self.probes, same, self.temper, degree):
+        )
+
+    def with_laws(self, effects):
+        """Return named effects, each with the law for which there is most evidence."""
+        best, effects = {}, list(effects)
+        for degree in (*_DEGREES, *_FREER) if effects else ():
+            for one in _named(self.probes, effects, self.temper, degree):
                 if one.name not in best or best[one.name].evidence < one.evidence:
                     best[one.name] = one
         return list(best.values())
@@ -405,7 +408,8 @@ def _columns(model, effects, degree):
     waiting = [effect for name, effect in asked.items() if (name, degree) not in known]
     context = replace(model.context, degree=degree)
     while waiting:
-        edited, parameters, ties, laws, later = list(model.held_chains), {}, {}, {}, []
+        edited, parameters, later = list(model.held_chains), {}, []
+        ties, laws, neutral = {}, {}, {}
         for effect in waiting:
             # what is absent does nothing to another, but two may free the same parameter, or
             # exchange the same optic
@@ -418,8 +422,8 @@ def _columns(model, effects, degree):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-            laws |= edit.laws
-        how = {"ties": ties, "laws": laws, "like": model.problem}
+            laws, neutral = laws | edit.laws, neutral | edit.neutral
+        how = {"ties": ties, "laws": laws, "neutral": neutral, "like": model.problem}
         problem = GapProblem(edited, model.observations, **how, copy=False)
         jacobian = problem.jacobian(problem.start) if problem.size else None
         for name, own in parameters.items():

@@ -28,6 +28,8 @@ _LARGEST_COLOR = 2
 _LARGE_FLICKER = 0.1
 # a single beam of fewer standard deviations than this is no datum
 _FAINT = 5.0
+# a model without any light, as behind crossed polarizers, has this flux, and no derivative
+_DARK = 1e-30
 
 
 class Channels:
@@ -45,7 +47,8 @@ class Channels:
         self.told, self.count = (1, 1) if obs.single_beam else (0, 2)
         self.groups = obs.brightness_groups if obs.single_beam else None
         usable = ~obs.mask.T if obs.single_beam else dataset.valid
-        self.valid = usable & np.isfinite(self.observed).all(axis=0)
+        lit = np.add(*beams.fluxes) > 0
+        self.valid = usable & lit & np.isfinite(self.observed).all(axis=0)
         if obs.single_beam:
             # the logarithm of a flux within its noise is none; the differences are 1, and told
             self.valid &= ~(self.variance[1] > _FAINT**-2)
@@ -66,7 +69,7 @@ class Channels:
     def predicted(sweep):
         """Return both channels of the fluxes of a forward sweep, (2, W, F)."""
         right, left = sweep.fluxes
-        total = right + left
+        total = np.maximum(right + left, _DARK)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([(right - left) / total, np.log(total)])
 
@@ -75,9 +78,10 @@ class Channels:
         """Return the derivative of each channel to the two fluxes."""
         right, left = sweep.fluxes
         total = right + left
+        inverse = np.where(total > _DARK, 1 / np.maximum(total, _DARK), 0.0)
         # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2,
         # d ln(R + L) = (dR + dL) / (R + L)
-        return (2 * left / total**2, -2 * right / total**2), (1 / total, 1 / total)
+        return (2 * left * inverse**2, -2 * right * inverse**2), (inverse, inverse)
 
     # ---- noise and lamp -----------------------------------------------------------------
 

@@ -18,7 +18,14 @@ from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.frames import single_data, suspect_frames, unknown_angles, without_frames
+from astropolcal.gap.frames import (
+    lamp_faults,
+    not_off,
+    single_data,
+    suspect_frames,
+    unknown_angles,
+    without_frames,
+)
 from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
@@ -319,7 +326,7 @@ def diagnose(
         groups = groups and frame_groups(observations)
     edges = unknown_angles(observations, exchanged[0]) if exchanged else []
     say("looking for frames that are not what the table says")
-    single = []
+    whole, single = (nominal, base), []
     while more := single_data(base, single):
         nominal, base = _without(nominal, base, more, say)
         single += more
@@ -327,22 +334,32 @@ def diagnose(
     wrong = [fault for fault in frames if fault.what != "lamp"]
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
-    smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
+    n = len(base.problem.wavelength)
+    fitting = (effect for effect in adapted(library, base.chains) if effect.is_told(n))
+    smooth = [effect for effect in fitting if effect.kind != "discrete"]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
-        frames = [fault for fault in frames if fault.what == "lamp"]
-    else:
-        nominal, base = _without(nominal, base, wrong, say)
-    frames = single + frames
+        wrong = []
+    nominal, base = _without(nominal, base, wrong, say)
     if single or wrong:
         groups = groups and frame_groups(base.observations)
     say("looking for causes")
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+    if single and (right := not_off(selection.model, whole[1].observations, single)):
+        say("looking for causes again: they explain data that were left out")
+        single = [fault for fault in single if fault not in right]
+        nominal, base = _without(*whole, single + wrong, say)
+        groups = groups and frame_groups(base.observations)
+        selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     left = selection.model
     if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
         say("looking for causes again: they leave less than what was taken for noise")
         nominal = base = _with_noise_of(base, selection)
         selection = select(base, smooth, groups, say, cells=cells, changes=changes)
-    found = _conclude(nominal, base, exchanged, selection, edges + frames, started)
+    # what dims a frame may be a cause of the gap, and then the lamp did not
+    frames = edges + single + wrong
+    named = {fault.place for fault in frames}
+    frames += [fault for fault in lamp_faults(selection.model) if fault.place not in named]
+    found = _conclude(nominal, base, exchanged, selection, frames, started)
     found.settings |= {"changes": changes, "fails": where}
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)
@@ -430,7 +447,10 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
-    causes = [_exchanged(nominal, base, improved, exchanged, total)] if exchanged else []
+    # what improbable causes take up is not explained
+    sure = all(group.probability >= _LIKELY for group in selection.groups)
+    beside = improved if sure else base
+    causes = [_exchanged(nominal, base, beside, exchanged, total)] if exchanged else []
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))

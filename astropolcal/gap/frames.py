@@ -57,6 +57,8 @@ _AT_ONCE, _NEARLY = 12, 0.5
 # as bad frames are found, so little of the excess is left that the noise is measured anew
 _NEARLY_GONE = 0.1
 _STEPS, _SHARE = 20, 1e-5
+# what a problem knows beside its chains
+_KNOWN = ("ties", "laws", "priors", "neutral", "limits")
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
 
@@ -114,7 +116,7 @@ def suspect_frames(model):
         found = [fault for fault in found if fault.place in search.worst]
         found = found if search.is_settled([fault.place for fault in found], last) else []
     named = {fault.place for fault in found}
-    return found + [fault for fault in _lamp(model) if fault.place not in named]
+    return found + [fault for fault in lamp_faults(model) if fault.place not in named]
 
 
 def single_data(model, known=()):
@@ -178,6 +180,20 @@ def _single(residual, tangent, weight, least):
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
     return np.where(found > least * spread, found / spread, 0.0)
+
+
+def not_off(model, observations, faults):
+    """Return those of single data that agree with a model fitted without them."""
+    known = {key: getattr(model.problem, key) for key in _KNOWN}
+    problem = GapProblem(model.trains, observations, **known)
+    problem.settle_noise()
+    found, gaps = [], problem.differences(problem.start)
+    for fault in faults:
+        i, f = fault.place
+        place = problem.channels[i].told, fault.bin, f
+        if abs(gaps[i][place]) < _ALSO * problem.channels[i].sigma[place]:
+            found.append(fault)
+    return found
 
 
 def unknown_angles(observations, effect):
@@ -380,7 +396,7 @@ def _exchanges(place, frames, trials):
 # ---- the lamp --------------------------------------------------------------------------------
 
 
-def _lamp(model):
+def lamp_faults(model):
     """Return the frames of which the brightness is off the drift of the lamp."""
     found = []
     problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
@@ -410,9 +426,10 @@ def _off_the_drift(channel, gap):
         # a frame that is masked at all wavelengths has no median
         warnings.simplefilter("ignore", RuntimeWarning)
         common = np.nanmedian(table - np.nanmedian(table, axis=1, keepdims=True), axis=0)
-        # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared
+        # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared; some
+        # frames may be noisier than others
         count = np.maximum(np.isfinite(table).sum(axis=0), 1)
-        error = np.nanmedian(np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count))
+        error = np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count)
     least, n = np.inf, np.isfinite(common).sum()
     # the curve whose median deviation is least for what its degree costs
     for degree in range(min(_LARGEST_DRIFT, n // 4) + 1):
@@ -420,7 +437,7 @@ def _off_the_drift(channel, gap):
         middle = np.nanmedian(np.abs(common - curve))
         cost = n * np.log(max(middle, 1e-12)) + degree * np.log(max(n, 2))
         if cost < least:
-            least, deviation, spread = cost, common - curve, max(MAD_TO_SIGMA * middle, error)
+            least, deviation, spread = cost, common - curve, np.fmax(MAD_TO_SIGMA * middle, error)
     return deviation, deviation / spread
 
 
@@ -495,7 +512,7 @@ class Search:
             seen = zip(self.model.observations, out, strict=True)
             left = [o.with_mask(mask, "accused") for o, mask in seen]
             chains = nominal_calibration(chains, left).chains
-        known = {key: getattr(old, key) for key in ("ties", "laws", "priors", "neutral", "limits")}
+        known = {key: getattr(old, key) for key in _KNOWN}
         problem = GapProblem(chains, self.model.observations, **known)
         problem.settle_noise(look.coefficients if look.is_noise else problem.start, out)
         self.model, self.problem = Model(problem, self.model.fit), problem

@@ -176,14 +176,12 @@ class Model:
                 trains = edits[effect.name].chains
         if not edits:
             return self
-        settings = {"neutral": dict(mine.neutral)}
-        for key in ("ties", "laws", "priors", "limits"):
+        settings = {}
+        for key in ("ties", "laws", "priors", "neutral", "limits"):
             settings[key] = dict(getattr(mine, key))
             for edit in edits.values():
                 settings[key] |= getattr(edit, key)
         added = {name: edit.parameters for name, edit in edits.items()}
-        parameters = [p for own in added.values() for p in own]
-        settings["neutral"] |= {p.name: p.canonical_neutral for p in parameters}
         problem = GapProblem(trains, self.observations, like=mine, **settings)
         return Model(problem, Fit(problem.start, np.inf, False), self.added | added)
 

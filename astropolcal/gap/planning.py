@@ -471,7 +471,8 @@ class Forecast:
             for name, tie in self.problem.ties.items()
             if {name.split(".")[0], tie.source.split(".")[0]} <= own
         }
-        problem = GapProblem([chain], [observations], ties=ties, laws=self.problem.laws)
+        how = {"laws": self.problem.laws, "neutral": self.problem.neutral}
+        problem = GapProblem([chain], [observations], ties=ties, **how)
         _settle_noise(problem.channels[0], self.model.problem.channels[exposure.dataset], exposure)
         slopes = problem.jacobian(problem.start)[problem.segments[0]]
         out = np.zeros((len(slopes), self.problem.size))

@@ -68,10 +68,11 @@ class GapProblem:
     Chains against all frames of their datasets, whitened by the noise.
 
     Parameters may have ``laws``, a basis (W, k) each; ``priors``, the standard deviation of a
-    normal prior on their coefficients; ``neutral``, the value about which prior and limits are (0
-    if none is given); and ``limits``, the most by which they may differ from it, where they follow
-    no law: those are held to the bounds of their optic. All by ``"optic.parameter"``, canonical.
-    Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be called.
+    normal prior on their coefficients; ``neutral``, the value about which law, prior and limits
+    are (0 if none is given); and ``limits``, the most by which they may differ from it, where they
+    follow no law: those are held to the bounds of their optic. All by ``"optic.parameter"``,
+    canonical. Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be
+    called.
     """
 
     def __init__(
@@ -155,31 +156,34 @@ class GapProblem:
     def _set_laws(self, laws):
         """Note the linear map from the coefficients to the flat vector."""
         blocks, self.names, self.slices = [], [], {}
-        low, high = self._bounds()
+        (low, high), absent, rest = self._bounds(), self._absent(), []
         self.low, self.high, start, walls = [], [], 0, []
         for slot in self.free.slots:
             basis = laws.get(slot.name)
             follows = basis is not None and slot.per_wavelength and np.shape(basis)[1] < slot.size
             block = basis if follows else np.eye(slot.size)
             blocks.append(block)
+            # what a law cannot describe of the value about which it is stays as it is
+            around = absent[slot.slice] * follows
+            rest.append(around - block @ np.linalg.lstsq(block, around, rcond=None)[0])
             k = block.shape[1]
             self.slices[slot.name] = slice(start, start + k)
             self.names += [slot.name if k == 1 else f"{slot.name}[{i}]" for i in range(k)]
             self.low += [-np.inf] * k if follows else list(low[slot.slice])
             self.high += [np.inf] * k if follows else list(high[slot.slice])
-            walls += [(self.slices[slot.name], block, slot.canonical_bounds())] * follows
+            walls += [(self.slices[slot.name], block, slot.canonical_bounds(), rest[-1])] * follows
             start += k
-        self._blocks = blocks
+        self._blocks, self._rest = blocks, np.concatenate([np.empty(0), *rest])
         self.low, self.high = np.array(self.low), np.array(self.high)
         self.size = start
         # the bounds of the values of laws: rows, and what each is at most
         rows, ends = [np.empty((0, self.size))], [np.empty(0)]
-        for where, block, bounds in walls:
+        for where, block, bounds, beside in walls:
             for sign, end in zip((-1, 1), bounds, strict=True):
                 if np.isfinite(end):
                     rows.append(np.zeros((len(block), self.size)))
                     rows[-1][:, where] = sign * block
-                    ends.append(np.full(len(block), sign * end))
+                    ends.append(sign * (end - beside))
         self._walls = np.concatenate(rows), np.concatenate(ends)
 
     def _bounds(self):
@@ -200,6 +204,7 @@ class GapProblem:
 
     def coefficients(self, vector):
         """Return the coefficients whose laws are nearest to canonical values, see `vector`."""
+        vector = vector - self._rest
         parts = [
             np.linalg.lstsq(block, vector[slot.slice], rcond=None)[0]
             for slot, block in zip(self.free.slots, self._blocks, strict=True)
@@ -212,7 +217,7 @@ class GapProblem:
             block @ coefficients[self.slices[slot.name]]
             for slot, block in zip(self.free.slots, self._blocks, strict=True)
         ]
-        return np.concatenate(parts) if parts else np.empty(0)
+        return np.concatenate(parts) + self._rest if parts else np.empty(0)
 
     # ---- data ------------------------------------------------------------------------
 
@@ -310,7 +315,8 @@ class GapProblem:
         residual, cost = self._cost(q, take)
         converged, damping, slow = not live.any(), 0.0, False
         for _ in range(steps):
-            if converged:
+            # from where the model is not defined no step leads down
+            if converged or not np.isfinite(cost):
                 break
             normal, growth = self._normal(q, residual, take, live), 2
             if not np.isfinite(normal[0]).all():
@@ -386,10 +392,14 @@ class GapProblem:
         """
         return orthonormal(self.open_slopes(coefficients, jacobian, kept))
 
+    def at_bound(self, coefficients):
+        """Return which coefficients are at their bounds, (n_coefficients,) of bool."""
+        below, above = self.low + _AT_BOUND, self.high - _AT_BOUND
+        return (coefficients <= below) | (coefficients >= above)
+
     def open_slopes(self, coefficients, jacobian=None, kept=True):
         """Return the derivatives in the directions that no bound closes, shape (n_rows, k)."""
-        inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        inside &= kept
+        inside = ~self.at_bound(coefficients) & kept
         jacobian = self.jacobian(coefficients) if jacobian is None else jacobian
         slopes, (rows, ends) = jacobian[:, inside], self._walls
         held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]

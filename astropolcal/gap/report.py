@@ -282,7 +282,7 @@ class Fitted:
             unit, factor = self.unit_of(parameter.name)
             block = parameter.basis if slot.per_wavelength else None
             block = np.eye(where.stop - where.start) if block is None else block
-            value = block @ self.model.fit.coefficients[where] / factor
+            value = self.problem.vector(self.model.fit.coefficients)[slot.slice] / factor
             std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
             # one open coefficient leaves every value of a law open
             std = np.where(self.is_open[where].any(), np.nan, std / factor)

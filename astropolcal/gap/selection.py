@@ -723,6 +723,11 @@ def _as_free(chosen, beside):
     """Return the rivals of a cause; those that are most like it have a law as free as its own."""
     rivals, cell = beside.candidates, chosen.cell
     seen = next((one for one in rivals if one.name == chosen.name), chosen)
+    # a name is not behind what does the same because its usual law has more freedom than is asked
+    least = (1 - _NEAR) * seen.statistic
+    names = [one.named for one in rivals if one.is_named and one.statistic > least]
+    asked = {one.name: one for one in beside.with_laws(names)}
+    rivals = [max(one, asked.get(one.name, one), key=attrgetter("evidence")) for one in rivals]
     if cell is None or chosen.is_named or beside.probes is None or seen.degree == chosen.degree:
         return rivals
     # of place, kind and dependence no more than one is another, or the dependence is the same

@@ -186,7 +186,8 @@ def stability(model, groups, temper):
     effect is asked for where the evidence for its size by Schwarz (1978) is above that for none.
     """
     problem, q = model.problem, model.fit.coefficients
-    absent, jacobian = problem.absent, model.jacobian
+    # what is at its bound does not give way to an effect that does the same
+    absent, jacobian = problem.absent, model.jacobian * ~problem.at_bound(q)
     found = {name: [] for name in model.added}
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)

@@ -21,7 +21,6 @@ from astropolcal.gap.effects import (
     get_effect,
 )
 from astropolcal.gap.effects._laws import (
-    able_to_hold,
     around,
     held_star,
     lagging,
@@ -247,8 +246,10 @@ def test_words_name_the_plate_where_there_is_no_derotator():
     assert one.title == "diattenuator that is static downstream of the half-wave plate"
     assert one.place == "relay downstream of the half-wave plate"
     with_it = plate() | turned() | WOLLASTON
-    (same,) = adapted([get_effect("static_diattenuator")], [with_it])
+    same, between = adapted([get_effect("static_diattenuator")], [with_it])
     assert same is get_effect("static_diattenuator")
+    assert between.title == "diattenuator that is static downstream of the half-wave plate (hwp)"
+    assert {cell.place for cell in between.cells([with_it])} == {"after:hwp"}
     # what says nothing of it stays itself
     assert adapted([get_effect("beam_gain")], [chain]) == [get_effect("beam_gain")]
 
@@ -365,17 +366,6 @@ def test_only_a_star_whose_polarization_is_held_is_held():
     assert held_star([plate(), star]) is star
     star.u.fixed = False
     assert held_star([star]) is None
-
-
-def test_a_basis_is_widened_only_if_it_cannot_hold_the_values():
-    basis = Context(GRID).basis(1)
-    assert able_to_hold(3 - 2 * GRID, basis) is basis
-    bent = np.array([0.0, 0.01, 0.05, 0.01, 0.0])
-    wide = able_to_hold(bent, basis)
-    assert wide.shape == (5, 3)
-    solution = np.linalg.lstsq(wide, bent, rcond=None)[0]
-    np.testing.assert_allclose(wide @ solution, bent, atol=1e-12)
-    assert np.abs(wide[:, 2]).max() == pytest.approx(1)
 
 
 # ---- laws of special effects ---------------------------------------------------------------

@@ -283,7 +283,7 @@ def context_of(data):
 
 def problem_of(edit, data):
     laws = {p.name: p.basis for p in edit.parameters if p.basis is not None}
-    return GapProblem(edit.chains, data, ties=edit.ties, laws=laws)
+    return GapProblem(edit.chains, data, ties=edit.ties, laws=laws, neutral=edit.neutral)
 
 
 def canonical(value):

@@ -120,7 +120,9 @@ class BinProblem(Problem):
 
     def costs(self, vector):
         """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
-        costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
+        # a trial may be where no light gets through; it is not taken then
+        with np.errstate(invalid="ignore", divide="ignore"):
+            costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
         for row, prior in self.priors:
             costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs

@@ -203,7 +203,8 @@ def _check_against(effect, chains, observations):
             raise _failed(effect, words)
     like = None if discrete else nominal
     try:
-        problem = GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
+        how = {"ties": edit.ties, "laws": edit.laws, "neutral": edit.neutral, "like": like}
+        problem = GapProblem(edit.chains, observations, **how)
     except AstropolcalError as error:
         raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
     if discrete:

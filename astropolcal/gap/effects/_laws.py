@@ -119,10 +119,13 @@ class Fringes(Effect):
             title=f"{title}, period 1/({thickness:.3g} um)",
         )
 
+    def is_told(self, n_wavelengths):
+        """Return whether a sine and a cosine can be distinguished from other laws."""
+        return n_wavelengths > 4
+
     def law(self, context, chains=()):
         """Return a sine and a cosine in the wavenumber."""
-        # fewer wavelengths than a sine, a cosine and what they must be told from
-        if len(context.wavelength) < 5:
+        if not self.is_told(len(context.wavelength)):
             return None
         # two reflections interfere with the phase of their difference of path
         phase = 2 * np.pi * self.thickness / context.wavelength
@@ -370,8 +373,8 @@ class StandardPolarization(Held):
             # that is fitted
             parameter.bounds = around(parameter, self.limit, (None, None))
             parameter.fixed, parameter.prior = False, None
-            # the law must hold the catalogue's values, from which the size counts
-            law = None if size == 1 else able_to_hold(held, context.basis(self.degree))
+            # of the error of the catalogue's values
+            law = None if size == 1 else context.basis(self.degree)
             name = f"{optic.name}.{key}"
             found.append(EffectParameter(name, self.scale, self.limit, law, np.array(held)))
         return fresh, found
@@ -381,13 +384,6 @@ def held_star(optics_of_chain):
     """Return the first star whose polarization is fixed."""
     stars = (o for o in optics_of_chain if isinstance(o, optics.PolarizedSource))
     return next((star for star in stars if is_held(star.q) and is_held(star.u)), None)
-
-
-def able_to_hold(values, basis):
-    """Return a basis that can represent the values as well."""
-    left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
-    size = np.abs(left).max()
-    return basis if size < 1e-12 else np.column_stack([basis, left / size])
 
 
 # ---- discrete alternatives -----------------------------------------------------------------------

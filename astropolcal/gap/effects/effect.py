@@ -141,6 +141,11 @@ class Edit:
         return {p.name: p.basis for p in self.parameters if p.basis is not None}
 
     @property
+    def neutral(self):
+        """Value of every parameter at which the effect is absent, canonical, by name."""
+        return {p.name: p.canonical_neutral for p in self.parameters}
+
+    @property
     def limits(self):
         """Largest physical size of every parameter, canonical, by name."""
         return {p.name: p.canonical_limit for p in self.parameters}
@@ -554,6 +559,10 @@ class Effect:
         if self.degree is NUMBER or self.degree is None or len(context.wavelength) == 1:
             return None
         return self.degree(context) if callable(self.degree) else context.basis(self.degree)
+
+    def is_told(self, n_wavelengths):
+        """Return whether so many wavelengths distinguish its law from any other."""
+        return n_wavelengths > 1 or not (self.degree is None or callable(self.degree))
 
     def free_of(self, optic):
         """Return the names of the parameters of its optic that the effect frees."""

@@ -27,6 +27,7 @@ _THART = "'t Hart et al. 2021, doi:10.1117/12.2594962"
 _PLATE = Where("in", "plate", True, in_front=True, said="half-wave plate")
 _DEROTATOR = Where("in", "derotator", True, said="derotator")
 _RELAY = Where("after", "relay", True, said="relay downstream of the derotator")
+_STATIC = Where("after", "turning", True, said=_RELAY.said)
 _POLARIZER = Where("after", "polarizer", True, said="calibration polarizer")
 _MIRROR = Where("after", "mirror", True, said="mirror upstream of the half-wave plate")
 _SPLITTER = Where("before", "splitter", True)
@@ -226,7 +227,7 @@ _RELAY_EFFECTS = [
     # beyond half a turn a retardance comes back with the other sign
     _effect(
         "static_retarder", "retarder that is static downstream of the derotator",
-        _RELAY, (*_RETARDANCE, "rotation"), optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
+        _STATIC, (*_RETARDANCE, "rotation"), optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
         _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength", _HARRINGTON_2019,
     ),
     _effect(
@@ -238,7 +239,7 @@ _RELAY_EFFECTS = [
     *(one.of(thickness) for thickness in (8, 4, 12) for one in (_FRINGES, _DRIFTING)),
     _effect(
         "static_diattenuator", "diattenuator that is static downstream of the derotator",
-        _RELAY, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.005, 0.3),
+        _STATIC, "diattenuation", optics.VectorDiattenuator(), _ANY_AXIS, _size(0.005, 0.3),
         "single differences of all sources, at all plate and derotator angles",
         "de Boer et al. 2020, doi:10.1051/0004-6361/201834989",
     ),

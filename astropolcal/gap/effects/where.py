@@ -13,7 +13,7 @@ from astropolcal.optics import COORDINATES
 __all__ = []
 
 #: Roles of which a chain may have several optics.
-SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
+SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror", "turning")
 # positions that are not those of a stage which carries a retarder
 _NO_STAGES = (None, "parallactic", "altitude", *COORDINATES)
 _RETARDERS = (
@@ -179,8 +179,11 @@ class Roles:
         self.altitude = next((o for o in sky if o.stage == "altitude"), None)
         self.star = next((o for o in stars if isinstance(o, optics.PolarizedSource)), None)
         self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
-        #: What static optics of the relay stand behind.
+        #: What static optics of the relay stand behind; others stand behind the plate, too.
         self.relay = self.derotator or self.plate
+        turning = [o for o in (self.derotator, self.plate) if o is not None]
+        self._kinds["turning"] = turning
+        self.turning = next((o for o in turning if chosen.get("turning") in (None, o.name)), None)
         #: The plate, where the model has nothing in front of it that could polarize.
         self.entrance = self.plate if self._is_entrance() else None
 
@@ -261,7 +264,9 @@ def adapted(effects, chains):
         if own_name and one.acts_on == "plate":
             words["half-wave plate"] = one.optic or plates[0].name
         if all(roles.derotator is None for roles in every):
-            words[_BEHIND] = _BEHIND_PLATE
+            words[_BEHIND] = f"downstream of the {plates[0].name}" if own_name else _BEHIND_PLATE
+        elif one.acts_on == "turning" and one.optic:
+            words[_BEHIND] = f"downstream of the {one.optic}" if own_name else _BEHIND_PLATE
         for old, new in words.items():
             if old in one.title + one.place:
                 title, place = (text.replace(old, new) for text in (one.title, one.place))

@@ -1,0 +1,142 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Runs of few wavelengths: a star with a wrong literature value, windows, bounds, dark frames."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from gap_setups import SETUPS
+
+from astropolcal import instruments, optics
+from astropolcal.chain import insert_optic, join
+from astropolcal.exceptions import AstropolcalWarning
+from astropolcal.gap import diagnose
+from astropolcal.gap.effects import EFFECTS
+from astropolcal.gap.frames import suspect_frames
+from astropolcal.gap.model import nominal_model
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+
+def answers(diagnosis):
+    """Return the shares of all that a single cause may be, by name."""
+    (cause,) = diagnosis.causes
+    assert cause.probability > 0.9
+    return {cause.name: cause.share} | {one.name: share for one, share in cause.aliases}
+
+
+def polarimeter(beams, n=3):
+    """Return nominal and true chain, wavelengths and frames of a plate between polarizers."""
+    last = optics.WollastonPrism(efficiency=np.full(n, 0.98), name="prism")
+    mirror = optics.DiattenuatorRetarder(
+        diattenuation=np.full(n, 0.02), retardance=np.full(n, 170) * u.deg, name="mirror"
+    )
+    plate = optics.LinearRetarder(
+        retardance=np.full(n, 90) * u.deg, mount="qwp", name="qwp",
+        fixed={"theta": False}, bounds={"theta": (-8, 8)},
+    )  # fmt: skip
+    lamp = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    last = last if beams == 2 else optics.LinearPolarizer(name="analyser")
+    nominal = join([lamp, mirror, plate, last])
+    truth = nominal.copy()
+    truth["qwp"].retardance = np.linspace(95, 84, n) * u.deg
+    angles = np.meshgrid([0, 45, 90, 135, 22.5], np.arange(0, 180, 22.5), indexing="ij")
+    frames = QTable(dict(zip(("calibrator", "qwp"), (a.ravel() * u.deg for a in angles))))  # noqa: B905
+    return nominal, truth, np.linspace(0.5, 0.7, n) * u.um, frames
+
+
+def irdis_lamp(bands, n=5):
+    """Return nominal and true chain, wavelengths and frames of a lamp in some filters."""
+    irdis = instruments.get("irdis")
+    chain = irdis.chain("polarized", wavelength=irdis.wavelength[bands])
+    truth, off = chain.copy(), np.linspace(-2, 2, len(bands)) * u.deg
+    truth["derotator"].retardance = np.atleast_1d(truth["derotator"].retardance.quantity) + off
+    truth["hwp"].theta = truth["hwp"].theta.quantity + 0.4 * u.deg
+    cycle = [0, 45, 22.5, 67.5, 11.25, 56.25, 33.75, 78.75] * u.deg
+    frames = half_wave_plate_cycles(cycle, np.linspace(0, 75, n) * u.deg)
+    return chain, truth, irdis.wavelength[bands], frames
+
+
+@pytest.mark.slow
+def test_wrong_literature_value_of_a_star_is_among_the_answers():
+    setup = SETUPS["cassegrain"]()
+    nominal = setup.nominal.copy()
+    # wrong by as much at all wavelengths, where the star itself is not the same
+    nominal["star"].q = setup.truth["star"].q.value + 0.004
+    nominal["star"].u = setup.truth["star"].u.value
+    nominal["star"].q.fixed = nominal["star"].u.fixed = True
+    diagnosis = diagnose(nominal, setup.observed(flux=3e6))
+    found = answers(diagnosis)
+    # at a constant flux a background of the sky does the same
+    assert min(found["standard_polarization"], found["sky_background"]) > 0.3
+
+
+@pytest.mark.slow
+def test_static_optic_of_any_axis_between_plate_and_derotator_has_a_name():
+    chain, truth, wavelength, frames = irdis_lamp([1, 2, 3])
+    kinds = {"static_retarder": {"retardance": 1.5 * u.deg}}
+    kinds["static_diattenuator"] = {"diattenuation": 0.01, "retardance": 0 * u.deg}
+    for name, size in kinds.items():
+        window = optics.DiattenuatorRetarder(theta=20 * u.deg, name="window", **size)
+        between = insert_optic(truth, window, after="hwp")
+        found = answers(diagnose(chain, simulate(between, wavelength, frames, flux=3e6, seed=1)))
+        assert found[f"{name}:hwp"] > 0.3, name
+
+
+def test_laws_that_wavelengths_do_not_tell_are_not_asked_for():
+    for name, least in [("fringes", 5), ("hwp_retardance_free", 2), ("dichroic_j_band", 2)]:
+        assert not EFFECTS[name].is_told(least - 1), name
+        assert EFFECTS[name].is_told(least), name
+    assert EFFECTS["static_retarder"].is_told(1)
+
+
+@pytest.mark.slow
+def test_what_a_bound_holds_makes_no_cause_unstable():
+    nominal, truth, wavelength, frames = polarimeter(beams=2)
+    nominal["qwp"].retardance.bounds = (89, 144)
+    found = diagnose(nominal, simulate(truth, wavelength, frames, flux=3e6, seed=1))
+    assert found.causes[0].cell.name == "in:qwp/retardance_h/constant"
+    assert found.causes[0].probability > 0.9
+
+
+def test_frames_behind_crossed_polarizers_do_not_warn():
+    nominal, truth, wavelength, frames = polarimeter(beams=1)
+    with pytest.warns(AstropolcalWarning, match="flux not positive"):
+        data = simulate(truth, wavelength, frames, flux=3e6, read_noise=10, seed=1)
+    # warnings are errors here
+    assert diagnose(nominal, data).verdict == "none"
+
+
+def test_noisy_frame_is_not_taken_for_a_restless_lamp():
+    setup = SETUPS["cassegrain"]()
+    table = setup.observed(flux=3e6).to_table()
+    here = table["frame"] == 20
+    for beam in ("flux_right", "flux_left"):
+        # brighter by 1 %, of which the table knows
+        table[beam][here] *= 1.01
+        table[f"{beam}_err"][here] *= 15
+    data = type(setup.observed()).from_table(table, name="night")
+    assert suspect_frames(nominal_model([setup.nominal], [data])) == []
+
+
+@pytest.mark.slow
+def test_data_that_a_cause_explains_are_not_said_to_be_off():
+    chain, truth, wavelength, frames = irdis_lamp([0, 1, 2, 3], 6)
+    turned = optics.LinearRetarder(
+        retardance=2 * u.deg, theta=45 * u.deg, mount="hwp", name="turned"
+    )
+    data = simulate(insert_optic(truth, turned, after="hwp"), wavelength, frames, flux=3e6, seed=1)
+    found = diagnose(chain, data)
+    assert found.frames == []
+    assert answers(found)["in:hwp/retardance_d/constant"] > 0.9
+
+
+@pytest.mark.slow
+def test_dim_frames_that_a_cause_explains_are_not_the_lamps():
+    chain, truth, wavelength, frames = irdis_lamp([2])
+    data = simulate(truth, wavelength, frames, flux=3e6, seed=1)
+    table, most = data.to_table(), max(data.flux_right.max(), data.flux_left.max())
+    for beam in ("flux_right", "flux_left"):
+        table[beam] *= 1 - 0.03 * table[beam].value / most
+    found = diagnose(chain, type(data).from_table(table, name="night"))
+    assert found.causes[0].name == "detector_nonlinearity"
+    assert found.frames == []
