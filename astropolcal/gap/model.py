@@ -406,7 +406,7 @@ def _lower(problem, vector, found):
 
 
 class _Glance(TRFLSQFitter):
-    """A fitter that gives up soon: what fits gets there, and what does not is no answer."""
+    """A fitter that gives up soon: what fits gets there, what does not gets nowhere."""
 
     def __call__(self, *arguments, maxiter, **settings):
         return super().__call__(*arguments, maxiter=min(maxiter, _EVALUATIONS), **settings)
@@ -515,8 +515,11 @@ def _fitting(chains, before, after, whole, order, misfit):
     """Return how many frames of a dataset the model fits, all if it is not clear which."""
 
     def share(n):
-        kept = [*before, whole.select(np.sort(order[:n])), *after]
-        return _tried_misfit(chains, kept) / misfit
+        # all of them may be masked
+        with suppress(ObservationError):
+            kept = [*before, whole.select(np.sort(order[:n])), *after]
+            return _tried_misfit(chains, kept) / misfit
+        return np.inf
 
     good, bad = len(order) // _LEAST_PART, len(order)
     if share(good) > _FITS:
