@@ -346,10 +346,13 @@ def diagnose(
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     if single and (right := not_off(selection.model, whole[1].observations, single)):
         say("looking for causes again: they explain data that were left out")
-        single = [fault for fault in single if fault not in right]
-        nominal, base = _without(*whole, single + wrong, say)
-        groups = groups and frame_groups(base.observations)
-        selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+        kept = [fault for fault in single if fault not in right]
+        again = _without(*whole, kept + wrong, say)
+        fewer = groups and frame_groups(again[1].observations)
+        chosen = select(again[1], smooth, fewer, say, cells=cells, changes=changes)
+        # unless one of them is off after all
+        if chosen.model.p_value > min(REMAINDER, selection.model.p_value):
+            (nominal, base), groups, selection, single = again, fewer, chosen, kept
     left = selection.model
     if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
         say("looking for causes again: they leave less than what was taken for noise")

@@ -303,7 +303,7 @@ def test_an_alternative_beside_which_much_is_left_is_not_sure():
     """Of the beams, exchanged in most of the run, an alternative explains no more than a part."""
     right = data.observed(flux=1e7)
     table = right.to_table()
-    late = np.arange(len(table)) > len(table) / 4
+    late = np.arange(len(table)) > len(table) / 5
     for key in ("", "_err"):
         one, other = table[f"flux_right{key}"].copy(), table[f"flux_left{key}"].copy()
         table[f"flux_right{key}"] = np.where(late, other, one)
