@@ -36,7 +36,7 @@ def _draw_chain(axes):
 def _draw_data(top, bottom, cal):
     drawn = DataGrid(cal, 0)
     (row,) = drawn.nearest_bins([1575] * u.nm)
-    angle, fine = drawn.derotator, np.linspace(42, 136, 200)
+    angle, fine = drawn.abscissa, np.linspace(42, 136, 200)
     for one, color, marker in zip(drawn.series(), COLORS, MARKERS, strict=False):
         look = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
         top.plot(angle[one.data], drawn.observed[row, one.data], **look)

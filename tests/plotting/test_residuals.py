@@ -109,7 +109,7 @@ def test_curve_goes_through_the_model_at_the_data(request):
         bins = np.array([0, 3])
         for series in grid.series():
             predicted = (grid.observed - grid.residual)[np.ix_(bins, series.data)]
-            curve = grid.curve(series, bins, grid.derotator[series.data])
+            curve = grid.curve(series, bins, grid.abscissa[series.data])
             known = np.isfinite(predicted)
             assert known.any(), name
             np.testing.assert_allclose(curve[known], predicted[known], atol=1e-12)
