@@ -422,8 +422,8 @@ def _how_large(content):
     if not (content["causes"] or content["where"] or content["frames"]):
         times = content["gap_before_percent"] / content["noise_floor_percent"]
         return (
-            f"{text} It is more than noise of the stated size {noise}, but nothing in it follows an "
-            "angle, the time, a wavelength or a beam: it may be noise that is "
+            f"{text} It is more than noise of the stated size {noise}, but nothing in it follows "
+            "an angle, the time, a wavelength or a beam: it may be noise that is "
             f"{times:.1f} times as large."
         )
     return f"{text} The gap is real {noise}."

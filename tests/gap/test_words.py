@@ -312,7 +312,10 @@ def test_every_verdict_has_its_sentence():
         ({"converged": False}, "The nominal fit did not converge"),
         ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),
         ({"gap_p_value": 0.0}, "The gap is real (p < 1e-6)."),
-        ({"causes": [], "where": []}, "it may be noise that is 4.4 times as large."),
+        (
+            {"verdict": "unexplained", "causes": [], "where": []},
+            "it may be noise that is 4.4 times as large.",
+        ),
     ):
         assert words in " ".join(content(**changes)["sentences"])
 
