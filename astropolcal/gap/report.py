@@ -25,7 +25,6 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
 from astropolcal.files import plain
 from astropolcal.gap import _words, runs
-from astropolcal.gap.effects._laws import Misread
 from astropolcal.gap.planning import plan
 from astropolcal.gap.problem import TOUCHES
 from astropolcal.gap.residuals import locate
@@ -106,7 +105,7 @@ def _worked_out(diagnosis):
     crossed, nominal, improved = bool(diagnosis.held_out), diagnosis.nominal, diagnosis.improved
     # a model with the wrong parity is not worth a fit, and so has no prediction
     exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
-    misread = any(isinstance(cause.effect, Misread) for cause in diagnosis.causes)
+    misread = any(getattr(cause.effect, "is_of_table", False) for cause in diagnosis.causes)
     same = improved is nominal
     before = accuracies(nominal, crossed and not exchanged)
     after = before if same else accuracies(improved, crossed)

@@ -23,7 +23,7 @@ examples:
 
 Several tables are used together. The effects are listed by --effects help.
 """
-_CORRECT = "correct the angles in the table, and calibrate with that"
+_CORRECT = "correct the table, and calibrate with that"
 _HINT = "--full adds each cause with its sizes, and where the gap lies"
 # what the figure with both channels of the data shows
 _SPECTRUM = (
@@ -101,7 +101,7 @@ def run(arguments):
     common.say(arguments, *lines)
     if arguments.save and not saved:
         raise AstropolcalError(
-            f"--save {arguments.save}: not written, as a calibration that misreads these angles "
+            f"--save {arguments.save}: not written, as a calibration that misreads a table "
             f"would misread those of science frames, too; {_CORRECT}"
         )
 

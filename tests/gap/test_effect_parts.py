@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import instruments, optics
-from astropolcal.chain import leaves
+from astropolcal.chain import leaves, system_mueller, with_beam
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import (
     EFFECTS,
@@ -444,3 +444,21 @@ def test_chains_without_the_place_are_left_alone():
     assert edit.chains[0] is chains[0]
     assert edit.chains[1]["k"].stage_sign == -1
     assert edit.parameters == []
+
+
+def test_beams_that_are_exchanged_in_a_part_of_a_run_are_a_mistake_of_its_table():
+    whole, names = get_effect("beams_swapped"), ["lamp", "lamp from frame 3"]
+    part = whole.in_run(names[1])
+    assert part.is_of_table
+    assert not whole.is_of_table
+    assert part.title.endswith('exchanged in "lamp from frame 3" only')
+    tables = [Observations.from_table(example_table(), name=name) for name in names]
+    chain = data.chain()
+    edited = part.edit([chain, chain], Context.of(GRID, tables)).chains
+    assert [len(leaves(one)) - len(leaves(chain)) for one in edited] == [0, 1]
+    places = {"hwp": np.array([20, 60]) * u.deg, "derotator": np.array([70, 80]) * u.deg}
+    right, left = (
+        system_mueller(with_beam(one, beam), data.WAVELENGTH, places)
+        for one, beam in zip(edited, ("right", "left"), strict=True)
+    )
+    np.testing.assert_allclose(right[..., 0, :], left[..., 0, :], atol=1e-12)

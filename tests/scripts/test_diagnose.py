@@ -124,7 +124,7 @@ def test_a_model_that_misreads_angles_is_not_saved(tmp_path, capsys):
     arguments = [tmp_path / "doubled.ecsv", "--derotator", "linear", "--effects", "hwp_doubled"]
     assert main(["diagnose", *map(str, [*arguments, *outputs])]) == 2
     printed = capsys.readouterr()
-    assert "Next        correct the angles in the table" in printed.out
+    assert "Next        correct the table" in printed.out
     assert "--save" not in printed.out
     assert "cal.asdf: not written" in printed.err
     assert not (tmp_path / "cal.asdf").exists()

@@ -414,9 +414,15 @@ class Alternative(Effect):
         """Return the alternative, and that which changes the chain the other way."""
         return [self] if self.back is None else [self, self.changed(change=self.back)]
 
+    @property
+    def is_of_table(self):
+        """Whether it is a mistake of a table, and no property of the instrument."""
+        return self.run is not None or isinstance(self, Misread)
+
     def in_run(self, name):
         """Return the same for the table of one of several datasets."""
-        title = f'{self.title} of "{name}" only'
+        where = "of" if self.title.endswith("table") else "in"
+        title = f'{self.title} {where} "{name}" only'
         return self.changed(run=name, name=f"{self.name}/dataset:{name}", title=title)
 
     def edge(self, observations):
