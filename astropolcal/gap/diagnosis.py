@@ -230,16 +230,6 @@ def _gap_of_fit(model):
     return 100 * float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
 
 
-def _excess(model):
-    """Return the mean square of the differences' residuals over the errors that tables state."""
-    gaps, channels = model.problem.differences(model.fit.coefficients), model.problem.channels
-    parts = [
-        (np.square(c.gap(g)) - (c.variance[c.told] if c.stated else 0.0))[c.valid]
-        for g, c in zip(gaps, channels, strict=True)
-    ]
-    return max(float(np.mean(np.concatenate(parts))), 1e-300)
-
-
 @in_one_thread
 def diagnose(
     calibration,
@@ -450,10 +440,7 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
-    # what improbable causes take up is not explained
-    sure = all(group.probability >= _LIKELY for group in selection.groups)
-    beside = improved if sure else base
-    causes = [_exchanged(nominal, base, beside, exchanged, total)] if exchanged else []
+    causes = [_exchanged(nominal, base, improved, exchanged, total)] if exchanged else []
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
         causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
@@ -469,12 +456,14 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
 
 
 def _exchanged(nominal, base, improved, exchanged, total):
-    """Return the cause that an alternative is, as sure as all causes explain the gap."""
+    """
+    Return the cause that an alternative is, as sure as all causes explain the gap.
+
+    It is no surer than it explains the double differences alone: others may be in its place.
+    """
     effect, *others = exchanged
     excess = improved.fit.chi2 - (improved.problem.n_data - improved.problem.size)
-    # noise that the residuals themselves told may hold much of what is left
-    left = max(excess / total, _excess(improved) / _excess(nominal))
-    sure = _SURE_SIGN * (1 - min(max(left, 0.0), 1.0))
+    sure = _SURE_SIGN * (1 - min(max(excess / total, effect.left, 0.0), 1.0))
     aliases = [(Candidate(other, None, 0.0, 1, 0.0), 1 / len(exchanged)) for other in others]
     share = (nominal.fit.chi2 - base.fit.chi2) / total
     return Cause(effect, None, float(sure), aliases, 1 / len(exchanged), 0.0, float(share))

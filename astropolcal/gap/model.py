@@ -590,9 +590,19 @@ def _may_be_wrong(calibration):
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
+def _left(best, given):
+    """Return the share of what exceeds the noise in double differences that a fit leaves."""
+    noise = np.mean(np.concatenate([np.square(d.sigma) for d in best.measurement.datasets]))
+    left, whole = (
+        max(_misfit(one) ** 2 - np.nan_to_num(noise, posinf=0.0), 1e-300) for one in (best, given)
+    )
+    return float(left / whole)
+
+
 def _with_alternative(edited, observations, given, best, found):
     """Return the nominal model, and the model of the alternative with its aliases."""
     least, effect = found[0]
+    effect = effect.changed(left=_left(best, given))
     model = nominal_model(edited, observations, best)
     # what fits badly need not converge to be left behind
     problem = GapProblem(given.chains, observations, like=model.problem)

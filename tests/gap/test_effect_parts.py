@@ -248,7 +248,7 @@ def test_words_name_the_plate_where_there_is_no_derotator():
     with_it = plate() | turned() | WOLLASTON
     same, between = adapted([get_effect("static_diattenuator")], [with_it])
     assert same is get_effect("static_diattenuator")
-    assert between.title == "diattenuator that is static downstream of the half-wave plate (hwp)"
+    assert between.title == "diattenuator that is static downstream of the half-wave plate"
     assert {cell.place for cell in between.cells([with_it])} == {"after:hwp"}
     # what says nothing of it stays itself
     assert adapted([get_effect("beam_gain")], [chain]) == [get_effect("beam_gain")]

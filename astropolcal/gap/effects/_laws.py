@@ -401,6 +401,8 @@ class Alternative(Effect):
     #: Name of the only dataset of several in which it is so, None for all; whether it may be so in
     #: one of them, or in a part of it.
     run, may_be_in_part = None, False
+    #: Share of the excess of the double differences that is left with it.
+    left = 0.0
 
     def __init__(self, name, title, words, role, change=None, shows=None, **settings):
         where = Where("in", role, True) if isinstance(role, str) else role

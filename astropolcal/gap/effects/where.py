@@ -267,6 +267,7 @@ def adapted(effects, chains):
             words[_BEHIND] = f"downstream of the {plates[0].name}" if own_name else _BEHIND_PLATE
         elif one.acts_on == "turning" and one.optic:
             words[_BEHIND] = f"downstream of the {one.optic}" if own_name else _BEHIND_PLATE
+            words[f" ({one.optic})"] = ""
         for old, new in words.items():
             if old in one.title + one.place:
                 title, place = (text.replace(old, new) for text in (one.title, one.place))
