@@ -272,7 +272,8 @@ def test_an_angle_in_no_row_does_not_hide_that_a_short_table_is_late():
     table = right.to_table()
     for shift, name in ((-1, "hwp_early"), (1, "hwp_late")):
         table["hwp"] = np.repeat(np.roll(right.position("hwp"), shift), right.n_bins) * u.rad
-        found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
+        wrong = Observations.from_table(table)
+        found = diagnose(data.chain(), wrong, **QUICK, **ROWS, cells=False)
         assert (found.verdict, names(found.causes[0])) == ("named", [name])
 
 
@@ -313,7 +314,8 @@ def test_an_alternative_beside_which_much_is_left_is_not_sure():
         one, other = table[f"flux_right{key}"].copy(), table[f"flux_left{key}"].copy()
         table[f"flux_right{key}"] = np.where(late, other, one)
         table[f"flux_left{key}"] = np.where(late, one, other)
-    found = diagnose(data.chain(), Observations.from_table(table), **QUICK, cells=False)
+    asked = {"effects": ["beams_swapped", "mirror_flip", "static_retarder", "hwp_late"]}
+    found = diagnose(data.chain(), Observations.from_table(table), **QUICK, **asked, cells=False)
     assert found.verdict == "unexplained"
     assert found.causes[0].effect.kind == "discrete"
     assert found.causes[0].probability < 0.9
