@@ -32,9 +32,9 @@ __all__ = ["correct"]
 #: The whole Mueller matrix, or instrumental polarization only.
 MODES = ("stokes", "ip")
 
-# what a result keeps of the solution and of the frames
 # share of V in Q or U, of most wavelengths, that is worth a word
 _LEAKS = 0.3
+# what a result keeps of the solution and of the frames
 _OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
 _OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
 # what a caller can do about frames that do not say enough
@@ -194,10 +194,7 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
-    unmeasured += _mirrored(calibration)
-    # a half-wave plate is there for linear polarization, of light that has hardly any V
-    unmeasured += _circular(solution) if "hwp" not in frames.positions else []
-    for words in doubts + unmeasured:
+    for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
     found = corrected_planes(frames.source, solution, by_variance, **division)
@@ -234,8 +231,11 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     return linear_systematic(model, solution, **how)
 
 
-def _circular(solution):
+def _circular(solution, frames):
     """Say what V does to Q and U where it is taken as zero and they depend on it."""
+    # a half-wave plate is there for linear polarization, of light that has hardly any V
+    if "hwp" in frames.positions:
+        return []
     leaks = np.abs(solution.leakage[:, 1:3][solution.determined[:, 1:3].all(axis=1)])
     if not np.median(leaks.max(axis=1)) > _LEAKS:
         return []

@@ -339,8 +339,9 @@ def correct(entry):
 def fails(name):
     """Return that a part of a run does not fit, and what may be the matter."""
     return (
-        f'The model does not fit "{name}", though it fits all other frames: look at what changed '
-        "there first, such as a frame that is missing or angles that are not those of the table."
+        f'The model does not fit "{name}": without it the double differences are off by a tenth '
+        "of that at most. Look at what changed there first, such as a frame that is missing or "
+        "angles that are not those of the table."
     )
 
 
@@ -422,8 +423,8 @@ def _how_large(content):
     if not (content["causes"] or content["where"] or content["frames"]):
         times = content["gap_before_percent"] / content["noise_floor_percent"]
         return (
-            f"{text} It is more than noise of the stated size {noise}, but nothing in it follows "
-            "an angle, the time, a wavelength or a beam: it may be noise that is "
+            f"{text} It is more than noise of the stated size {noise}, but no pattern in angle, "
+            "time, wavelength or beam is seen in it: it may be noise that is "
             f"{times:.1f} times as large."
         )
     return f"{text} The gap is real {noise}."

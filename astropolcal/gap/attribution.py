@@ -262,13 +262,10 @@ def _cells(probes, temper):
             found += _candidates(place, kind, same, by_law, temper)
     # where none of these laws is half as good as one that is free
     least = max([ENOUGH, *(_SHARPER * one.evidence for one in found)])
-    sharp = [
-        one
-        for cell in _sharpest(probes, temper, least)
-        for one in _of_cell(probes, cell, None, temper)
-    ]
-    better = {one.name: one for one in sharp if one.evidence > least}
-    found = [one for one in found if one.name not in better] + [*better.values()]
+    has_freer = len(probes.problem.wavelength) > laws[_DEGREES[-1]].shape[1]
+    for cell in _sharpest(probes, temper, least) if has_freer else ():
+        free = [o for o in _of_cell(probes, cell, None, temper) if o.evidence > least]
+        found = [o for o in found if not free or o.name != cell.name] + free
     return [one for one in found if one.name not in probes.own]
 
 
@@ -499,9 +496,8 @@ def _with_name(effect, model, values, share, temper, context=None):
 
 
 def false_discovery(p_values):
-    """Return p-values corrected for the number of looks (Benjamini & Yekutieli 2001)."""
-    p, ranks = np.array(p_values, dtype=float), np.arange(1, len(p_values) + 1)
-    order = np.argsort(p)[::-1]
-    more = p[order] * (len(p) / ranks[::-1]) * np.sum(1 / ranks)
-    p[order] = np.minimum(np.minimum.accumulate(more), 1.0)
-    return p.tolist()
+    """Return p-values corrected for the number of looks."""
+    # it takes long to import
+    from scipy.stats import false_discovery_control
+
+    return false_discovery_control(p_values, method="by").tolist() if len(p_values) else []

@@ -307,57 +307,59 @@ def diagnose(
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
-    groups = frame_groups(observations) if cross_validate else None
+    if cross_validate:
+        # too few frames are refused before anything is fitted
+        frame_groups(observations)
     say("fitting the nominal model")
     nominal, base, exchanged, where = starting_model(calibration, observations, library, say)
-    if len(base.observations) > len(observations):
-        # one of them in two parts
-        observations = base.observations
-        groups = groups and frame_groups(observations)
-    edges = unknown_angles(observations, exchanged[0]) if exchanged else []
+    edges = unknown_angles(base.observations, exchanged[0]) if exchanged else []
     say("looking for frames that are not what the table says")
     whole, single = (nominal, base), []
     while more := single_data(base, single):
         nominal, base = _without(nominal, base, more, say)
         single += more
-    frames = suspect_frames(base)
-    wrong = [fault for fault in frames if fault.what != "lamp"]
+    wrong = suspect_frames(base)
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
-    n = len(base.problem.wavelength)
-    fitting = (effect for effect in adapted(library, base.chains) if effect.is_told(n))
-    smooth = [effect for effect in fitting if effect.kind != "discrete"]
+    smooth = _continuous(library, base)
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
         wrong = []
+
+    def chosen(model):
+        groups = frame_groups(model.observations) if cross_validate else None
+        return select(model, smooth, groups, say, cells=cells, changes=changes)
+
     nominal, base = _without(nominal, base, wrong, say)
-    if single or wrong:
-        groups = groups and frame_groups(base.observations)
     say("looking for causes")
-    selection = select(base, smooth, groups, say, cells=cells, changes=changes)
-    if single and (right := not_off(selection.model, whole[1].observations, single)):
+    selection = chosen(base)
+    if right := not_off(selection.model, whole[1].observations, single):
         say("looking for causes again: they explain data that were left out")
         kept = [fault for fault in single if fault not in right]
-        again = _without(*whole, kept + wrong, say)
-        fewer = groups and frame_groups(again[1].observations)
-        chosen = select(again[1], smooth, fewer, say, cells=cells, changes=changes)
+        models = _without(*whole, kept + wrong, say)
+        again = chosen(models[1])
         # unless one of them is off after all
-        if chosen.model.p_value > min(REMAINDER, selection.model.p_value):
-            (nominal, base), groups, selection, single = again, fewer, chosen, kept
+        if again.model.p_value > min(REMAINDER, selection.model.p_value):
+            (nominal, base), selection, single = models, again, kept
     left = selection.model
     if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
         say("looking for causes again: they leave less than what was taken for noise")
         nominal = base = _with_noise_of(base, selection)
-        selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+        selection = chosen(base)
     # what dims a frame may be a cause of the gap, and then the lamp did not
     frames = edges + single + wrong
-    named = {fault.place for fault in frames}
-    frames += [fault for fault in lamp_faults(selection.model) if fault.place not in named]
+    frames += lamp_faults(selection.model, frames)
     found = _conclude(nominal, base, exchanged, selection, frames, started)
     found.settings |= {"changes": changes, "fails": where}
-    if nested and groups is not None:
-        found.nested = _nested(base, smooth, groups, say, cells)
+    if nested and cross_validate:
+        found.nested = _nested(base, smooth, say, cells)
         found.seconds = time.perf_counter() - started
     return found
+
+
+def _continuous(library, base):
+    """Return the effects that a model may lack, and which so many wavelengths can tell."""
+    found = (e for e in adapted(library, base.chains) if e.kind != "discrete")
+    return [e for e in found if e.is_told(len(base.problem.wavelength))]
 
 
 def _without(nominal, base, faults, say):
@@ -387,9 +389,9 @@ def _with_noise_of(base, selection):
     return Model(problem, problem.fit(base.fit.coefficients), base.added)
 
 
-def _nested(base, smooth, groups, say, cells):
+def _nested(base, smooth, say, cells):
     """Return the errors on frames of groups that took no part in the choice of the causes."""
-    labels, numbers = groups
+    labels, numbers = groups = frame_groups(base.observations)
     found = []
     for k, label in enumerate(labels):
         say(f"without {label}, {k + 1} of {len(labels)}")

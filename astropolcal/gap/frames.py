@@ -102,11 +102,11 @@ def suspect_frames(model):
     """
     Return the frames whose data are not what the table says, the most evident first.
 
-    Those of which only the lamp is off come last. There are none where no frame stands out, or so
-    many that the model is at fault and not the frames. Where an optic is missing from the model
-    everywhere, a small fault of one frame cannot be distinguished from it: look again once the
-    optic is in. A frame of a single beam is compared with the others of its group: what they cannot
-    tell, such as which of two it is, its words say.
+    Not those of which only the lamp is off, see `lamp_faults`. There are none where no frame stands
+    out, or so many that the model is at fault and not the frames. Where an optic is missing from
+    the model everywhere, a small fault of one frame cannot be distinguished from it: look again
+    once the optic is in. A frame of a single beam is compared with the others of its group: what
+    they cannot tell, such as which of two it is, its words say.
     """
     search = Search(model)
     accused, last = search.accused()
@@ -115,8 +115,7 @@ def suspect_frames(model):
         # where the fit does not find back from where they had bent it, others look bad, too
         found = [fault for fault in found if fault.place in search.worst]
         found = found if search.is_settled([fault.place for fault in found], last) else []
-    named = {fault.place for fault in found}
-    return found + [fault for fault in lamp_faults(model) if fault.place not in named]
+    return found
 
 
 def single_data(model, known=()):
@@ -184,6 +183,8 @@ def _single(residual, tangent, weight, least):
 
 def not_off(model, observations, faults):
     """Return those of single data that agree with a model fitted without them."""
+    if not faults:
+        return []
     known = {key: getattr(model.problem, key) for key in _KNOWN}
     problem = GapProblem(model.trains, observations, **known)
     problem.settle_noise()
@@ -396,9 +397,9 @@ def _exchanges(place, frames, trials):
 # ---- the lamp --------------------------------------------------------------------------------
 
 
-def lamp_faults(model):
-    """Return the frames of which the brightness is off the drift of the lamp."""
-    found = []
+def lamp_faults(model, others=()):
+    """Return the frames, without those of others, whose brightness is off the lamp's drift."""
+    found, named = [], {fault.place for fault in others}
     problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
     for i, (channel, gap) in enumerate(zip(problem.channels, gaps, strict=True)):
         if channel.groups is not None:
@@ -410,7 +411,7 @@ def lamp_faults(model):
             trial = Trial("lamp", 0.0, 0.0, size, float(abs(deviation[f]) / off))
             chance = float(1 - 2 * score.size * ndtr(-off))
             found.append(_fault(problem, (i, int(f)), trial, off**2, chance))
-    return sorted(found, key=_order)
+    return sorted((fault for fault in found if fault.place not in named), key=_order)
 
 
 def _off_the_drift(channel, gap):

@@ -15,7 +15,7 @@ from astropolcal import instruments, optics
 from astropolcal.chain import join
 from astropolcal.gap.challenge import make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
-from astropolcal.gap.frames import single_data, suspect_frames, without_frames
+from astropolcal.gap.frames import lamp_faults, single_data, suspect_frames, without_frames
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.report import to_dict
 from astropolcal.observations import Observations
@@ -53,8 +53,13 @@ def with_beam(frame, factor):
     return data.with_flux(observed(), np.where(np.arange(N) == frame, factor, 1.0))
 
 
+def all_faults(model):
+    faults = suspect_frames(model)
+    return faults + lamp_faults(model, faults)
+
+
 def found(observations):
-    return suspect_frames(data.fitted(observations))
+    return all_faults(data.fitted(observations))
 
 
 @cache
@@ -230,18 +235,18 @@ def test_lamp_is_named_and_not_masked():
 
 def test_fit_without_the_frames_is_down_to_the_noise():
     model = data.fitted(plate_off())
-    faults = suspect_frames(model)
+    faults = all_faults(model)
     (left,) = without_frames(model.observations, faults)
     assert np.flatnonzero(left.mask.all(axis=1)).tolist() == [18]
     again = data.fitted(left)
     assert model.p_value < 1e-6 < 1e-3 < again.p_value
-    assert suspect_frames(again) == []
+    assert all_faults(again) == []
 
 
 def test_model_is_left_as_it_was():
     model = data.fitted(plate_off())
     before = model.residual, model.fit.coefficients.copy()
-    suspect_frames(model)
+    all_faults(model)
     np.testing.assert_array_equal(model.residual, before[0])
     np.testing.assert_array_equal(model.fit.coefficients, before[1])
 
@@ -272,7 +277,7 @@ def test_single_wavelength_of_another_instrument():
 
 
 def found_of(chain, observations):
-    return harmful(suspect_frames(data.fitted(observations, [chain])))
+    return harmful(all_faults(data.fitted(observations, [chain])))
 
 
 @pytest.mark.long
@@ -292,7 +297,7 @@ def test_cases_of_another_simulator(shared_data):
         for case, named in expected.items():
             seen = [Observations.read(root / case / f"{s}polarized.ecsv") for s in ("", "un")]
             chains = instruments.get("charis").chains_for(seen, derotator="linear")
-            faults = harmful(suspect_frames(nominal_model(chains, seen)))
+            faults = harmful(all_faults(nominal_model(chains, seen)))
             assert {(fault.frame, fault.what) for fault in faults} == named, case
 
 
@@ -346,7 +351,7 @@ def single(turning, error=(), factor=1.0, at=(), seed=1):
 
 def found_of_single(turning, **options):
     chain = single_chain(turning)
-    return suspect_frames(nominal_model([chain], [single(turning, **options)]))
+    return all_faults(nominal_model([chain], [single(turning, **options)]))
 
 
 def test_frame_of_a_single_beam_is_named_with_what_its_design_can_tell():
@@ -388,6 +393,6 @@ def test_of_two_frames_neither_is_known_to_be_the_wrong_one():
         seen = Observations.from_table(table, name="single")
         # of the group of frame 20 there is no third one
         seen = seen.with_mask(np.arange(seen.n_frames) == 18, "lost")
-        (fault,) = suspect_frames(nominal_model([single_chain(False)], [seen]))
+        (fault,) = all_faults(nominal_model([single_chain(False)], [seen]))
         assert fault.frame == 19
         assert "frames 19 and 20 alone cannot tell which of them is wrong" in fault.words

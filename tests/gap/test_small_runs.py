@@ -12,7 +12,7 @@ from astropolcal.chain import insert_optic, join
 from astropolcal.exceptions import AstropolcalWarning
 from astropolcal.gap import diagnose
 from astropolcal.gap.effects import EFFECTS
-from astropolcal.gap.frames import suspect_frames
+from astropolcal.gap.frames import lamp_faults, suspect_frames
 from astropolcal.gap.model import nominal_model
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -115,7 +115,8 @@ def test_noisy_frame_is_not_taken_for_a_restless_lamp():
         table[beam][here] *= 1.01
         table[f"{beam}_err"][here] *= 15
     data = type(setup.observed()).from_table(table, name="night")
-    assert suspect_frames(nominal_model([setup.nominal], [data])) == []
+    model = nominal_model([setup.nominal], [data])
+    assert suspect_frames(model) + lamp_faults(model) == []
 
 
 @pytest.mark.slow

@@ -115,14 +115,12 @@ class BinProblem(Problem):
         # light pass is not better than another
         with np.errstate(divide="ignore", invalid="ignore"):
             predicted = self.measurement.predict(vector)
-        residual = (predicted - self.measurement.observed) * self.weights
-        return residual[self._data] * self._present
+            residual = (predicted - self.measurement.observed) * self.weights
+            return residual[self._data] * self._present
 
     def costs(self, vector):
         """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
-        # a trial may be where no light gets through; it is not taken then
-        with np.errstate(invalid="ignore", divide="ignore"):
-            costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
+        costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
         for row, prior in self.priors:
             costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs

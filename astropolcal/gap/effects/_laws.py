@@ -419,7 +419,7 @@ class Alternative(Effect):
     @property
     def is_of_table(self):
         """Whether it is a mistake of a table, and no property of the instrument."""
-        return self.run is not None or isinstance(self, Misread)
+        return self.run is not None
 
     def in_run(self, name):
         """Return the same for the table of one of several datasets."""
@@ -453,7 +453,7 @@ class Misread(Alternative):
     """Angles of stages that are not those of the table; asked for where no other alternative is."""
 
     reference = "the writing of tables; no paper is known"
-    may_be_in_part = True
+    may_be_in_part = is_of_table = True
 
     def __init__(self, name, title, words, role, shows, stages, what, rate):
         super().__init__(name, title, words, role, shows=shows)
