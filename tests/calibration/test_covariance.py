@@ -239,3 +239,17 @@ def test_a_prior_tells_no_more_than_its_width(make):
         # an exponential law is a bound, too
         key = "std_inward" if law is stats.expon else "std"
         assert float(known[key]) == pytest.approx(std, rel=0.05), law.name
+
+
+def test_widened_along_a_direction(make):
+    """The element is as long as its direction; one that is shorter adds nothing."""
+    cal = calibrate(make.chain(fixed=True), make.observe(make.truth(make.chain())))
+    before = cal.covariance
+    way = np.zeros(len(before))
+    way[:2] = 3 * before.stds[0], -before.stds[1]
+    wide = before.widened([(0, way), (0, way / 2)])
+    assert wide.stds[0] == pytest.approx(3 * before.stds[0])
+    np.testing.assert_allclose(wide.stds[2:], before.stds[2:])
+    np.testing.assert_allclose(np.diag(wide.factor.T @ wide.factor) ** 0.5, wide.stds)
+    assert np.linalg.eigvalsh(wide.matrix - before.matrix).min() > -1e-12
+    assert before.widened([(0, way / 9)]) == before

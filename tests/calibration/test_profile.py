@@ -4,11 +4,15 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 
+from astropolcal import optics
 from astropolcal.calibration import Calibration, calibrate, profile
 from astropolcal.calibration.uncertainty.refits import Profile
+from astropolcal.chain import join
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Normal
+from astropolcal.simulation import simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
 
@@ -203,3 +207,44 @@ def test_calibration_from_a_file_has_no_data(cal, tmp_path):
     cal.write(tmp_path / "cal.asdf")
     with pytest.raises(CalibrationFileError, match="holds no observations"):
         profile(Calibration.read(tmp_path / "cal.asdf"), "hwp.w_sio2")
+
+
+# --- errors where chi-square is no parabola --------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_error_is_as_long_as_the_valley():
+    """A rotator of unknown diattenuation: the plate and its retardance make up for 0.4 of it."""
+    there = {"wavelength": LAM}
+    truth = join(
+        [
+            optics.LinearPolarizer(name="polarizer"),
+            optics.LinearRetarder(
+                retardance=[176, 178, 179] * u.deg, mount="hwp", name="hwp", **there
+            ),
+            optics.DiattenuatorRetarder(
+                diattenuation=np.full(3, 0.016),
+                retardance=[140, 150, 160] * u.deg,
+                mount="rotator",
+                name="rotator",
+                **there,
+            ),
+            optics.WollastonPrism(name="wollaston"),
+        ]
+    )
+    start = truth.copy()
+    start["rotator"].diattenuation, start["rotator"].retardance = np.zeros(3), [170] * 3 * u.deg
+    plates, rotators = np.meshgrid(np.arange(5, 95, 11.25), [0, 30, 60, 90])
+    frames = QTable({"hwp": plates.ravel() * u.deg, "rotator": rotators.ravel() * u.deg})
+    for seed in range(6):
+        data = simulate(truth, LAM, frames, flux=3e5, seed=seed)
+        cal = calibrate(start, data, errors="white", cross_validate=False)
+        names = [f"rotator.diattenuation[{i}]" for i in range(3)]
+        stds = [cal.covariance.std(name) for name in names]
+        found = cal.chain["rotator"].diattenuation.value
+        assert np.all(np.abs(found - 0.016) < 3 * np.array(stds)), (seed, found, stds)
+        told = [one["words"] for one in cal.identifiability.near_null]
+        assert any(words.startswith("rotator.diattenuation") for words in told), seed
+    made = profile(cal, names[0], values=np.linspace(-0.6, 0.6, 17))
+    low, high = made.interval(rise=4)
+    assert stds[0] == pytest.approx(max(high - made.best, made.best - low) / 2, rel=0.2)

@@ -16,6 +16,7 @@ import platform
 import time
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version as installed
 
 import astropy.units as u
@@ -32,9 +33,11 @@ from astropolcal.calibration.fit.strategies import (
     two_step,
     undecided_signs,
     until_settled,
+    valleys,
 )
 from astropolcal.calibration.identifiability.analysis import complete
-from astropolcal.calibration.identifiability.sky import view_of_measurement
+from astropolcal.calibration.identifiability.linearized import curved_directions
+from astropolcal.calibration.identifiability.sky import consequences_along, view_of_measurement
 from astropolcal.calibration.noise.estimates import noise_as_given, rms
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
@@ -445,6 +448,9 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         scatter = Scatter(measurement, weighting, whitened)
         own = covariance_around(measurement, whitened, weighting, scatter)
         lacking = model_error(measurement, scatter, errors_of_signs)
+    if np.isfinite(weighting.level):
+        own, curved = _along_valleys(measurement, whitened, own, view)
+        finding.near_null += curved
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
@@ -479,6 +485,16 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     keep_sky_accuracy(calibration, view)
     stage("cross-validation")
     return calibration.cross_validate() if cross_validate else calibration
+
+
+def _along_valleys(measurement, whitened, covariance, view):
+    """Return the covariance with errors from how far chi-square stays low, and words on them."""
+    free, factors = measurement.free, measurement.free.factors()
+    stds = covariance.stds * factors
+    found = valleys(measurement, whitened, stds)
+    wide = covariance.widened([(i, direction / factors) for i, direction, _ in found])
+    sky_of = partial(consequences_along, view)
+    return wide, curved_directions(free, measurement.vector(), found, stds, sky_of)
 
 
 def _off_minimum(measurement, whitened, covariance):

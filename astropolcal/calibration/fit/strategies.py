@@ -55,6 +55,9 @@ _OTHER_SIGN = 0.2
 # a polish ends when no bin gains a thousandth in a step, or is about to
 _STILL_GAINING = 0.999
 _STUCK = 1.0
+# a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
+# many more are taken, until the end is known so well, and an error so many times too small grows
+_STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
 # so many other thicknesses to either side are tried; each step changes the data by so much (rms)
 _LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
 # starts whose sums of squares differ by less are the same
@@ -125,8 +128,11 @@ class BinProblem(Problem):
             costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs
 
-    def _step(self, vector, damping):
-        """Return the per-wavelength parameters after a damped step, within their bounds."""
+    def _step(self, vector, damping, kept=()):
+        """Return the per-wavelength parameters after a damped step, within their bounds.
+
+        Slots that are ``kept`` stay as they are.
+        """
         jacobian = self.measurement.jacobian(vector, self._own) * self.weights
         # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
@@ -143,6 +149,7 @@ class BinProblem(Problem):
         held = (
             ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
         ).T
+        held[:, list(kept)] = True
         # a parameter that leans against its bound must not slow down the others
         normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
         gradient = np.where(held, 0.0, gradient)
@@ -153,11 +160,12 @@ class BinProblem(Problem):
         step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
         return np.clip(here - step[..., 0].T, self._below, self._above)
 
-    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
+    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING, kept=()):
         """Improve the per-wavelength parameters by batched Levenberg-Marquardt.
 
-        Returns the vector, where no bin is worse than at the start, and the cost of each bin. It
-        ends when no bin falls below the share ``still_gaining`` of its cost in a step.
+        Slots that are ``kept`` stay as they are. Returns the vector, where no bin is worse than at
+        the start, and the cost of each bin. It ends when no bin falls below the share
+        ``still_gaining`` of its cost in a step.
         """
         vector = vector.copy()
         if not self.slots:
@@ -165,7 +173,7 @@ class BinProblem(Problem):
         costs, damping = self.costs(vector), np.full(self.n_bins, 1e-3)
         for _ in range(iterations):
             trial = vector.copy()
-            trial[self.elements] = self._step(vector, damping)
+            trial[self.elements] = self._step(vector, damping, kept)
             new = self.costs(trial)
             # each bin has its own damping, and takes or leaves its own step
             better = new < costs
@@ -176,6 +184,31 @@ class BinProblem(Problem):
             if not np.any(gaining | (~better & (damping < _STUCK))):
                 break
         return vector, costs
+
+    def walk(self, row, step, walking, unit):
+        """Return how far bins get along a slot, others following, (n_slots, n_bins).
+
+        That is where the root of chi-square's rise is two units, one for each bin; from twice
+        ``step`` on, each time half as far again, and then halving, of the bins that are
+        ``walking``.
+        """
+        places, costs = self.elements[row], self.costs(self.solution)
+        here, inside = self.solution[self.elements], self.solution.copy()
+        reached, beyond = np.zeros(self.n_bins), np.full(self.n_bins, np.inf)
+        for _ in range(_STRIDES):
+            times = np.where(np.isinf(beyond), np.maximum(1.5 * reached, 2), (reached + beyond) / 2)
+            trial = inside.copy()
+            trial[places[walking]] = (here[row] + times * step)[walking]
+            trial = np.clip(trial, self._low, self._high)
+            trial, new = self.polish(trial, kept=[row])
+            low = np.sqrt(2 * (new - costs).clip(0)) < 2 * unit
+            inside[self.elements[:, walking & low]] = trial[self.elements[:, walking & low]]
+            at_end = (trial[places] <= self._below[row]) | (trial[places] >= self._above[row])
+            reached, beyond = np.where(low, times, reached), np.where(low, beyond, times)
+            walking = walking & ~(low & at_end) & (reached < _NEAR * beyond)
+            if not walking.any():
+                break
+        return inside[self.elements] - here
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""
@@ -291,6 +324,49 @@ def undecided_signs(measurement, view):
             chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
             errors = np.maximum(errors, chance * mean_errors(view, other))
     return found, errors
+
+
+def valleys(measurement, whitened, stds):
+    """
+    Return how far parameters of a wavelength may go where chi-square is not a parabola.
+
+    Each is an element of the flat vector, a direction, (n_free,) in canonical units, and by how
+    much the element may fall and rise. The direction is as long as a standard error: half the way
+    at which chi-square has risen by four, common parameters held and all others of the wavelength
+    refitted, to the side where it is longer. Where scatter makes the stated error, ``stds``, larger
+    than that of white noise, chi-square has to rise by as much more.
+    """
+    problem, vector = BinProblem(measurement, measurement.weighting), measurement.vector()
+    level, scale, found = measurement.weighting.level, whitened.scale, []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = stds / (level * np.sqrt(np.diag(whitened.covariance())))
+    known, half = whitened.given_others(np.isin(np.arange(vector.size), problem.elements))
+    errors, costs, null = np.linalg.norm(half, axis=0), problem.costs(vector), whitened.null()
+    for row, places in enumerate(problem.elements):
+        live = known[places] & (times[places] > 0) & (errors[places] > 0)
+        unit = np.where(live, level * times[places], np.inf)
+        size = np.where(live, errors[places], np.inf)
+        # the way of each bin is its own: all are gone at once
+        way = half.T @ (half[:, places] @ np.where(live, level * times[places] / size, 0.0))
+        ends = []
+        for sign in (1, -1):
+            there = np.clip(vector + 2 * sign * way, *measurement.free.bounds())
+            root = np.sqrt(2 * (problem.costs(there) - costs).clip(0)) / unit
+            bent = live & ~((_STRAIGHT < root) & (root < 4 / _STRAIGHT))
+            far = 2 * sign * way[problem.elements]
+            if bent.any():
+                step = sign * np.where(live, level * times[places] * errors[places], 0.0)
+                far = np.where(bent, problem.walk(row, step, bent, unit), far)
+            ends.append(far)
+        for i in np.flatnonzero(live):
+            far = max((end[:, i] for end in ends), key=lambda end: abs(end[row]))
+            if abs(far[row]) > 2 * _MATTERS * stds[places[i]]:
+                direction = np.zeros(vector.size)
+                direction[problem.elements[:, i]] = far / 2
+                # what is open stays open
+                direction -= null.T @ (null @ (direction / scale)) * scale
+                found.append((places[i], direction, sorted(end[row, i] for end in ends)))
+    return found
 
 
 def other_laws(problem, vector, origin):

@@ -86,6 +86,7 @@ class Identifiability:
         parameter is uncertain by more than 5 deg, 0.05 mm or 5 %, or the singular value is more
         than 1e4 times below the largest. ``words``, the ``parameters`` with their change at one
         standard error, and what that is on ``sky`` for the worst six. Priors count as data here.
+        Of a calibration also parameters whose errors are far larger than slopes tell.
     branches : list of dict
         Of each of ``mirrors`` the ``words``, and what it does on ``sky``, or None.
 

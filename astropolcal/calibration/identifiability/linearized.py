@@ -147,6 +147,17 @@ class Whitened:
         """Return rows of derivatives along the determined directions, each one error long."""
         return rows[:, self.live] @ self.errors.half.T
 
+    def given_others(self, which):
+        """Return which elements are determined, and their `half`, if all but ``which`` are known.
+
+        Both are of all elements, (n_free,) and (rank, n_free), in canonical units.
+        """
+        columns = np.flatnonzero(which & ~self.held)
+        found = decompose(np.concatenate([self._square, self.prior_rows])[:, columns])
+        known, half = np.zeros(which.size, dtype=bool), np.zeros((found.rank, which.size))
+        known[columns], half[:, columns] = found.determined, found.half * self.scale[columns]
+        return known, half
+
     def factor(self):
         """Return `errors.half` over all columns, zero for what is held, in steps."""
         return self._spread(self.errors.half)
@@ -183,6 +194,8 @@ LARGE = defaultdict(lambda: np.inf, {" deg": 5.0, " um": 50.0, "": 0.05})
 _CONDITION = 1e4
 # what of a near-null direction is worth a word, as a share of what moves most
 _PART = 0.1
+# an error that is so many times as large as slopes tell is worth a word
+_TOLD = 2.0
 # the sky is worked out for so many near-null directions, the worst
 _ON_SKY = 6
 # open directions that differ in their wavelength only and are told one by one
@@ -327,6 +340,33 @@ def near_null_directions(free, whitened, level, sky_of):
         _near_null(free, errors[i], times_large[i], condition[i], sky)
         for i, sky in zip(worst, skies, strict=True)
     ]
+
+
+def curved_directions(free, vector, valleys, stds, sky_of):
+    """Say which errors are far larger than the slopes tell, by parameter.
+
+    ``valleys`` has elements, directions and how far these may fall and rise, ``stds`` the errors
+    from the slopes, in canonical units.
+    """
+    found = []
+    far = [one for one in valleys if abs(one[1][one[0]]) > _TOLD * stds[one[0]]]
+    for slot in free.slots:
+        own = [one for one in far if slot.start <= one[0] < slot.start + slot.size]
+        if not own:
+            continue
+        worst, _, limits = max(own, key=lambda one: one[2][1] - one[2][0])
+        size, unit = step_of(slot.unit)[1:]
+        low, high = (vector[worst] + np.array(limits)) / free.steps[worst] * size
+        others = f" (and at {len(own) - 1} more wavelengths)" if len(own) > 1 else ""
+        words = (
+            f"{free.names[worst]} is anywhere from {low:.3g} to {high:.3g}{unit}{others}: other "
+            "parameters of its wavelength make up for it, farther than their slopes tell"
+        )
+        change = np.sum([direction for _, direction, _ in own], axis=0)
+        entry = {"words": words, "parameters": plain(_moved(free, change / free.steps))}
+        sky = sky_of([change])[0]
+        found.append(entry if sky is None else entry | {"sky": sky})
+    return found
 
 
 def _near_null(free, error, times_large, condition, sky):

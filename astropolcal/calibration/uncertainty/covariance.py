@@ -157,6 +157,29 @@ class Covariance:
         stds = self.stds
         return self.matrix / np.outer(stds, stds)
 
+    def widened(self, directions):
+        """Return the covariance where elements move farther along directions, one error long.
+
+        ``directions`` has the element and the direction, (n,), of each. What another has widened
+        enough before stays.
+        """
+        variances, rows = np.diag(self.matrix).copy(), []
+        for i, direction in sorted(directions, key=lambda one: -abs(one[1][one[0]])):
+            lacking = direction[i] ** 2 - variances[i]
+            if lacking > 0:
+                rows.append(direction * np.sqrt(lacking) / abs(direction[i]))
+                variances += rows[-1] ** 2
+        if not rows:
+            return self
+        steps = np.array([declared_step(unit) for unit in self.units])
+        _, sizes, right = np.linalg.svd(
+            np.vstack([self.factor, *rows]) / steps, full_matrices=False
+        )
+        factor, matrix = sizes[:, None] * right * steps, np.full(self.matrix.shape, np.nan)
+        known = np.ix_(*(np.flatnonzero(np.isfinite(variances)),) * 2)
+        matrix[known] = (factor.T @ factor)[known]
+        return Covariance(self.names, self.units, matrix, factor=factor, null=self.null)
+
     def propagate(self, slopes):
         """
         Return the covariance of quantities that depend on the parameters.
