@@ -437,20 +437,21 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     if covariance is not None and not measurement.free.priors:
         # by the data of all runs, too
         finding.identifiable |= np.isfinite(covariance.stds)
-    signs, errors_of_signs = undecided_signs(measurement, view)
-    finding.branches += signs
-    finding.mirrors = [branch["words"] for branch in finding.branches]
-    # the error of the model at a new setting
-    lacking = scatter = None
+    scatter = None
     if settings["errors"] == "white":
         own = white_covariance(measurement, whitened, weighting)
     else:
         scatter = Scatter(measurement, weighting, whitened)
         own = covariance_around(measurement, whitened, weighting, scatter)
-        lacking = model_error(measurement, scatter, errors_of_signs)
     if np.isfinite(weighting.level):
         own, curved = _along_valleys(measurement, whitened, own, view)
         finding.near_null += curved
+    stds = own.stds * measurement.free.factors()
+    signs, errors_of_signs = undecided_signs(measurement, view, stds)
+    finding.branches += signs
+    finding.mirrors = [branch["words"] for branch in finding.branches]
+    # the error of the model at a new setting
+    lacking = scatter and model_error(measurement, scatter, errors_of_signs)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),

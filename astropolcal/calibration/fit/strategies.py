@@ -14,6 +14,7 @@ from the polarized source to the unpolarized one and to the star.
 
 import warnings
 from functools import partial
+from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
@@ -47,9 +48,14 @@ __all__ = []
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4
 _CLEARLY_BETTER = 0.99
-# a phase so far off its neighbours (radian) is given the other sign if that is four times as near;
-# the bin may be so many times worse before all are fitted again
-_STICKS_OUT, _FAR_WORSE = 1.0, 30.0
+# phases of which the sign hangs on the hand of an optic, and those of an elliptical retarder
+_LINEAR, _ELLIPTICAL = "retardance", ("horizontal", "diagonal", "circular")
+# what else has a sign that data may not tell
+_SIGNED = ".diattenuation"
+# how the logarithm of sums of squares, and the square of the way from the start, count beside that
+# of a bend (radian); one may be so many times worse before all are fitted again; equal but for
+# rounding
+_DEAR, _PULL, _FAR_WORSE, _SAME, _OUTSIDE = 1.5, 0.02, 30.0, 1e-9, 1e3
 # phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
 _OTHER_SIGN = 0.2
 # a polish ends when no bin gains a thousandth in a step, or is about to
@@ -72,8 +78,6 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 _HOPELESS, _GLANCE = 100.0, 15
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
 _UNDECIDED = 9.0
-# below this the sign of the start is as good
-_EQUAL = 2.0
 # of data without noise, residuals below this are rounding
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -223,6 +227,62 @@ class BinProblem(Problem):
                 found.setdefault(optic, (row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
         return list(found.values())
 
+    def phases(self):
+        """Return the elements of phases that change their sign with the hand, (n_phases, n_bins).
+
+        With them whether a turn changes nothing.
+        """
+        keys = [slot.name.split(".")[1] for slot in self.slots]
+        rows = [row for row, key in enumerate(keys) if key in (_LINEAR, *_ELLIPTICAL[:2])]
+        return self.elements[rows], np.array([keys[row] == _LINEAR for row in rows], dtype=bool)
+
+    def branches(self, vector):
+        """Return vectors that may fit as well: this one, of the other hand, and of other signs."""
+        places, _ = self.phases()
+        found, optics = [vector], {}
+        for row, slot in enumerate(self.slots):
+            optic, key = slot.name.split(".")
+            optics.setdefault(optic, {})[key] = row
+        for own in (places, *(self.elements[[row]] for row, *_ in self.main_retardances())):
+            other = vector.copy()
+            other[own] *= -1
+            found.append(np.clip(self.turned(other, own, vector[own]), self._low, self._high))
+        for rows in optics.values():
+            if set(_ELLIPTICAL) <= set(rows):
+                own = self.elements[[rows[key] for key in _ELLIPTICAL]]
+                for one in found[:2]:
+                    # turning by d about an axis is turning by d - 360 deg about it
+                    other, length = one.copy(), np.linalg.norm(one[own], axis=0)
+                    other[own] *= 1 - 2 * np.pi / np.where(length > 0, length, np.inf)
+                    found.append(np.clip(other, self._low, self._high))
+        costs = self.costs(vector)
+        same = [np.allclose(self.costs(one), costs, rtol=_SAME, atol=0) for one in found]
+        return [one if k else self.polish(one)[0] for one, k in zip(found, same, strict=True)]
+
+    def in_line(self, vectors, towards):
+        """Return the vector of each bin's own, with whole turns that bring its phases in line.
+
+        ``vectors`` has one for each bin, (n_bins, n_free); the first is turned ``towards`` another.
+        """
+        vector, (places, turns) = vectors[0].copy(), self.phases()
+        for i, own in enumerate(vectors):
+            vector[self.elements[:, i]] = own[self.elements[:, i]]
+        columns = places[turns].T
+        for before, there in zip((None, *columns), columns, strict=False):
+            near = towards[there] if before is None else vector[before]
+            vector = self.turned(vector, there, near)
+        return vector
+
+    def turned(self, vector, elements, towards):
+        """Return a vector with whole turns that bring elements near others, within their bounds."""
+        options = vector[elements] + 2 * np.pi * np.arange(-2, 3).reshape(-1, *[1] * elements.ndim)
+        inside = (self._low[elements] <= options) & (options <= self._high[elements])
+        # within the bounds first
+        way = np.abs(options - towards) + np.where(inside, 0.0, _OUTSIDE)
+        turned = vector.copy()
+        turned[elements] = np.take_along_axis(options, np.argmin(way, axis=0)[None], axis=0)[0]
+        return turned
+
     def valleys(self, vector, row, low, high):
         """Return the best values of one slot from a scan over its bounds, (n_valleys, n_bins)."""
         grid = np.arange(low, high + _SCAN_STEP / 2, _SCAN_STEP).clip(low, high)
@@ -265,15 +325,6 @@ def search_branches(problem, vector, origin=None):
     return best, moved
 
 
-def _turned(beside, phases, low, high, least):
-    """Return phases with the other sign where those beside them say so, NaN elsewhere."""
-    found, off = np.full(len(phases), np.nan), np.abs(phases - beside)
-    for other in -phases + 2 * np.pi * np.array([[-1], [0], [1]]):
-        good = (off > least) & (np.abs(other - beside) < off / 4)
-        found = np.where(good & (low <= other) & (other <= high), other, found)
-    return found
-
-
 def _between(wavelength, phases):
     """Return phases between the two beside each, NaN at the ends of the spectrum."""
     found, lam = np.full(len(phases), np.nan), wavelength
@@ -282,38 +333,49 @@ def _between(wavelength, phases):
     return found
 
 
-def undecided_signs(measurement, view):
+def undecided_signs(measurement, view, stds):
     """
-    Return, as mirror solutions are, phases per wavelength whose sign the data do not tell.
+    Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
 
-    That is where the other sign, other phases of the wavelength refitted, is less than three
-    standard deviations worse, or better. What fits exactly as well is a mirror solution anyway.
+    These are phases, and diattenuations, of which the other sign, all else of the wavelength
+    refitted, is less than three standard deviations worse, or better. Phases that fit exactly as
+    well are a mirror solution anyway; what is zero within three of its ``stds`` has no sign.
     With them the mean squares of the errors of q and u that the other signs would be on sky, times
     their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
     zero where the phases beside tell the sign.
     """
     problem = BinProblem(measurement, measurement.weighting)
     vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))
-    costs, count = problem.polish(vector)[1], problem._present.sum(axis=1)
-    for row, low, high in problem.main_retardances():
+    costs, total = problem.polish(vector)[1], np.sum(problem.residuals(vector) ** 2)
+    # no more degrees of freedom than are left
+    whole = max(measurement.n_data - measurement.free.size, 1)
+    count = problem._present.sum(axis=1) * min(whole / measurement.n_data, 1.0)
+    phases = {row for row, *_ in problem.main_retardances()}
+    signed = [row for row, slot in enumerate(problem.slots) if slot.name.endswith(_SIGNED)]
+    for row in (*phases, *signed):
         slot, places = problem.slots[row], problem.elements[row]
-        turns = -vector[places] + 2 * np.pi * np.array([[1], [-1], [0]])
         trial = vector.copy()
-        for other in turns:
-            inside = (low <= other) & (other <= high)
-            trial[places[inside]] = other[inside]
-        trial, new = problem.polish(trial)
-        moved = np.abs(np.remainder(trial[places] - vector[places] + np.pi, 2 * np.pi) - np.pi)
+        trial[places] *= -1
+        if row in phases:
+            trial = problem.turned(trial, places, np.zeros(places.shape))
+        trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()))
+        moved = np.abs(trial[places] - vector[places])
+        if row in phases:
+            moved = np.abs(np.remainder(moved + np.pi, 2 * np.pi) - np.pi)
+        # what is less than its error is no sign
+        least = _OTHER_SIGN if row in phases else 3 * np.nan_to_num(stds[places], posinf=np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = new / costs
-            lost = count * np.log(ratio)
+            # against the noise of the bin, and that of all
+            lost = np.minimum(count * np.log(ratio), whole * np.log1p(2 * (new - costs) / total))
             # which may as well fit a little better
-            close = (np.abs(ratio - 1) > _ROUNDED) & (lost < _UNDECIDED)
-        close &= (moved > _OTHER_SIGN) & (costs > 0)
+            close = (np.abs(ratio - 1) > _ROUNDED) | (row not in phases)
+            close &= (lost < _UNDECIDED) & (moved > least) & (costs > 0)
         for i in np.flatnonzero(close):
             nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
+            shown = f"{value:.4g} {slot.unit or ''}".strip()
             words = (
-                f"{slot.name} at {nm:.1f} nm: with the other sign, {value:.4g} {slot.unit}, the "
+                f"{slot.name} at {nm:.1f} nm: with the other sign, {shown}, the "
                 f"sum of squares is {ratio[i]:.2f} times as large: the data do not tell the sign"
             )
             found.append({"words": words, "sky": None})
@@ -575,43 +637,68 @@ def _descend(measurement, weighting, fitter, search, options, origin, is_searche
 
 def _smoothed(measurement, weighting, fitter, outcome, origin):
     """
-    Fit again with single wavelengths in the branch of their neighbours, if nearly as good.
+    Fit again with wavelengths in the branches that make their phases smooth, if nearly as good.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
-    well. Any error of the model then decides between them; their neighbours tell which is true.
-    Where these say nothing, and the data hardly anything, the start does.
+    well, and without circular polarization both signs of all together fit exactly so. Any error of
+    the model then decides between them; the other wavelengths tell which is true. Where these say
+    nothing, and the data hardly anything, the start does.
     """
     problem, found = BinProblem(*few_frames(measurement, weighting)), measurement.vector()
-    start, lam = found.copy(), measurement.wavelength
-    told, moved = np.zeros((2, problem.n_bins), dtype=bool)
-    for row, low, high in problem.main_retardances():
-        where = problem.elements[row]
-        phases = found[where]
-        beside = _between(lam, phases)
-        turned = _turned(beside, phases, low, high, _STICKS_OUT)
-        told |= np.isfinite(turned)
-        by_start = _turned(origin[where], phases, low, high, _OTHER_SIGN)
-        # unless those beside it tell that the sign is right
-        by_start[4 * np.abs(phases - beside) < np.abs(by_start - beside)] = np.nan
-        turned = np.where(np.isfinite(turned), turned, by_start)
-        start[where] = np.where(np.isfinite(turned), turned, phases)
-        moved |= np.isfinite(turned)
-    equal = np.exp(_EQUAL / problem._present.sum(axis=1).clip(1))
-    worth, far = np.where(told, [[_WORTH], [_FAR_WORSE]], equal)
-    if moved.any():
-        before, (start, costs) = problem.costs(found), problem.polish(start)
-        refused = moved & (costs >= far * before)
-        moved &= ~refused & (told | (np.convolve(refused, np.ones(3))[1:-1] == 0))
-    if not moved.any():
+    if not problem.main_retardances():
         return outcome, weighting
-    best = found.copy()
-    best[problem.elements[:, moved]] = start[problem.elements[:, moved]]
-    measurement.stand_at(best)
-    again = run(measurement, weighting, fitter)
-    if np.all(problem.costs(measurement.vector())[moved] < (worth * before)[moved]):
-        return again
-    measurement.stand_at(found)
+    branches = problem.branches(found)
+    # of data without noise residuals are rounding
+    rounding = 0.5 * np.sum((_ROUNDED * problem.weights[problem._data] * problem._present) ** 2, 1)
+    costs = np.array([problem.costs(branch) for branch in branches]) + rounding
+    # of a bin without data all are the same
+    ratio = np.where(costs[0] > 0, costs / np.where(costs[0] > 0, costs[0], 1.0), 1.0)
+    equal = np.abs(ratio - 1) < _SAME
+    for allowed in (ratio < _FAR_WORSE, equal):
+        chosen = _least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
+        measurement.stand_at(problem.in_line(np.array(branches)[chosen], origin))
+        moved = ~equal[chosen, np.arange(problem.n_bins)]
+        if not moved.any():
+            break
+        again = run(measurement, weighting, fitter)
+        if np.all(problem.costs(measurement.vector())[moved] < (_WORTH * costs[0])[moved]):
+            return again
     return outcome, weighting
+
+
+def _least_bent(problem, branches, ratio, origin):
+    """
+    Return the branch of each bin, (n_bins,), with which phases bend least over the wavelengths.
+
+    ``ratio`` has the sums of squares of branches over those of the first, (n_branches, n_bins). The
+    least sum of all is found by dynamic programming over pairs of neighbours.
+    """
+    places, turns = problem.phases()
+    # (n_bins, n_branches, n_phases)
+    phases = np.transpose([branch[places] for branch in branches], (2, 0, 1))
+    away = _PULL * np.sum(_shortest(phases - origin[places].T[:, None], turns) ** 2, axis=-1)
+    alone = _DEAR * np.log(ratio.T) + away
+    if problem.n_bins == 1:
+        return np.argmin(alone, axis=1)
+    # from each branch of a bin to each of the next
+    ways = [_shortest(after - one[:, None], turns) for one, after in pairwise(phases)]
+    gaps, before = np.diff(problem.measurement.wavelength), []
+    # least cost of each pair of branches of the last two bins
+    least = alone[0][:, None] + alone[1] + _PULL * np.sum(ways[0] ** 2, axis=-1)
+    for i in range(1, len(ways)):
+        bends = ways[i] - ways[i - 1][:, :, None] * (gaps[i] / gaps[i - 1])
+        costs = least[:, :, None] + np.sum(bends**2, axis=-1)
+        before.append(np.argmin(costs, axis=0))
+        least = np.min(costs, axis=0) + alone[i + 1]
+    path = list(np.unravel_index(np.argmin(least), least.shape))
+    for back in reversed(before):
+        path.insert(0, back[path[0], path[1]])
+    return np.array(path)
+
+
+def _shortest(ways, turns):
+    """Return ways between phases, (..., n_phases), less whole turns where these change nothing."""
+    return ways - np.where(turns, 2 * np.pi * np.rint(ways / (2 * np.pi)), 0.0)
 
 
 def few_frames(measurement, weighting):

@@ -44,7 +44,13 @@ from astropolcal.calibration.identifiability.sky import (
 from astropolcal.calibration.system import split_chain
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.optics import EllipticalRetarder, LinearRetarder, MuellerElement, Rotator
+from astropolcal.optics import (
+    DiattenuatorRetarder,
+    EllipticalRetarder,
+    LinearRetarder,
+    MuellerElement,
+    Rotator,
+)
 
 __all__ = ["examine"]
 
@@ -369,9 +375,10 @@ def mirror_branches(measurement, vector, view):
     # the free retarders by name, with the slots of their retardances
     retarders, branches = {}, []
     for leaf in (leaf for chain in measurement.chains for leaf in leaves(chain)):
-        if isinstance(leaf, (LinearRetarder, EllipticalRetarder)):
+        if isinstance(leaf, (LinearRetarder, EllipticalRetarder, DiattenuatorRetarder)):
             # with one component held the others cannot go to the mirror solution
-            slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
+            keys = [key for key in leaf.own_names if key != "diattenuation"]
+            slots = [measurement.free.by_name.get(f"{leaf.name}.{key}") for key in keys]
             if None not in slots:
                 retarders[leaf.name] = slots
     turns = "a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic"
