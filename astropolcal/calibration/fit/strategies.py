@@ -52,10 +52,12 @@ _CLEARLY_BETTER = 0.99
 _LINEAR, _ELLIPTICAL = "retardance", ("horizontal", "diagonal", "circular")
 # what else has a sign that data may not tell
 _SIGNED = ".diattenuation"
-# how the logarithm of sums of squares, and the square of the way from the start, count beside that
-# of a bend (radian); one may be so many times worse before all are fitted again; equal but for
-# rounding
-_DEAR, _PULL, _FAR_WORSE, _SAME, _OUTSIDE = 1.5, 0.02, 30.0, 1e-9, 1e3
+# how the logarithm of sums of squares, and the square of the way from the start, count beside a
+# corner, the square of a bend over that of the ways (radian) and a little
+_DEAR, _PULL, _SMOOTH = 1.5, 0.1, 0.1
+# a branch may be so many times worse before all are fitted again, of more wavelengths than these;
+# equal but for rounding; what is outside the bounds comes last
+_FAR_WORSE, _COARSE, _SAME, _OUTSIDE = 30.0, 4, 1e-9, 1e3
 # phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
 _OTHER_SIGN = 0.2
 # a polish ends when no bin gains a thousandth in a step, or is about to
@@ -654,7 +656,8 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     # of a bin without data all are the same
     ratio = np.where(costs[0] > 0, costs / np.where(costs[0] > 0, costs[0], 1.0), 1.0)
     equal = np.abs(ratio - 1) < _SAME
-    for allowed in (ratio < _FAR_WORSE, equal):
+    told = ratio < (_FAR_WORSE if problem.n_bins > _COARSE else 1.0)
+    for allowed in (told | equal, equal):
         chosen = _least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
         measurement.stand_at(problem.in_line(np.array(branches)[chosen], origin))
         moved = ~equal[chosen, np.arange(problem.n_bins)]
@@ -683,11 +686,14 @@ def _least_bent(problem, branches, ratio, origin):
     # from each branch of a bin to each of the next
     ways = [_shortest(after - one[:, None], turns) for one, after in pairwise(phases)]
     gaps, before = np.diff(problem.measurement.wavelength), []
+    # few wavelengths are no measure of what is smooth
+    corner = float(problem.n_bins > _COARSE)
     # least cost of each pair of branches of the last two bins
-    least = alone[0][:, None] + alone[1] + _PULL * np.sum(ways[0] ** 2, axis=-1)
+    least = alone[0][:, None] + alone[1]
     for i in range(1, len(ways)):
-        bends = ways[i] - ways[i - 1][:, :, None] * (gaps[i] / gaps[i - 1])
-        costs = least[:, :, None] + np.sum(bends**2, axis=-1)
+        straight = ways[i - 1][:, :, None] * (gaps[i] / gaps[i - 1])
+        size = _SMOOTH + ways[i] ** 2 + straight**2
+        costs = least[:, :, None] + corner * np.sum((ways[i] - straight) ** 2 / size, axis=-1)
         before.append(np.argmin(costs, axis=0))
         least = np.min(costs, axis=0) + alone[i + 1]
     path = list(np.unravel_index(np.argmin(least), least.shape))
