@@ -29,6 +29,9 @@ __all__ = ["Covariance"]
 _ASYMMETRY = 1e-6
 # directions that no residual pulls keep this share of the largest error, so that they stay known
 _LEAST = 1e-6
+# probability of a normal deviate below this many standard deviations; errors that are too small by
+# less than this factor, as with 25 degrees of freedom, are no matter
+_NORMAL, _NO_MATTER = (0.975, 1.96), 1.05
 # a robust loss makes no direction softer than this
 _STIFF = 0.05
 
@@ -405,7 +408,7 @@ def sandwich(measurement, whitened, weighting, middle, slack=None):
         back = (axes / np.maximum(stiff, _STIFF)) @ axes.T
         middle = back @ middle @ back
     variances, vectors = np.linalg.eigh(middle)
-    stds = np.sqrt(variances.clip(0))
+    stds = np.sqrt(variances.clip(0)) * _of_few(measurement, whitened, weighting)
     # with fewer groups than directions a sum of outer products is singular
     stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
     rows = (stds[:, None] * vectors.T) @ whitened.factor()
@@ -420,6 +423,20 @@ def sandwich(measurement, whitened, weighting, middle, slack=None):
     determined = factor[:, columns]
     matrix[np.ix_(columns, columns)] = determined.T @ determined
     return Covariance(free.names, free.units, matrix, factor=factor, null=null)
+
+
+def _of_few(measurement, whitened, weighting):
+    """Return by how much errors grow where few degrees of freedom tell the noise.
+
+    Then two of them hold the truth in 95 of 100 cases, by the quantiles of Student's t.
+    """
+    # a calibration is read where there is no scipy
+    from scipy.special import stdtrit
+
+    freedom = measurement.n_data - whitened.n_taken
+    if not weighting.from_residuals or freedom <= 0:
+        return 1.0
+    return max(1.0, stdtrit(freedom, _NORMAL[0]) / _NORMAL[1] / _NO_MATTER)
 
 
 # ---- errors at a bound, and next to one ----
