@@ -80,6 +80,8 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 _HOPELESS, _GLANCE = 100.0, 15
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
 _UNDECIDED = 9.0
+# so far an axis is turned for another start (radian)
+_TURNS = np.deg2rad([45.0, 22.5, -22.5])
 # of data without noise, residuals below this are rounding
 _ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -467,6 +469,23 @@ def other_laws(problem, vector, origin):
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
 
 
+def other_axes(problem, vector):
+    """Return starts with other orientations of what may be turned far.
+
+    Without diattenuation an axis changes no datum, so that a fit may end where both are wrong.
+    """
+    free, found = problem.measurement.free, []
+    low, high = free.bounds()
+    for slot in (slot for slot in free.slots if slot.name.endswith(".theta")):
+        for turn in _TURNS if high[slot.start] - low[slot.start] > np.pi / 2 else ():
+            start = vector.copy()
+            # an axis that is turned by half a turn is the same
+            start[slot.slice] = (start[slot.slice] - low[slot.slice] + turn) % np.pi
+            start[slot.slice] += low[slot.slice]
+            found.append(np.clip(start, low, high))
+    return found
+
+
 # ---- fits in place --------------------------------------------------------------
 
 
@@ -547,32 +566,34 @@ def outside_bounds(measurement):
 
 
 def joint(measurement, weighting, fitter, search, options=None):
-    """Fit everything; where the residuals stand out, from other values of its laws, too.
+    """Fit everything, from other axes, too, and where residuals stand out from other laws.
 
     With ``options`` of the measurement what only stars see is fitted by itself first.
     """
     origin = measurement.vector()
     how = fitter, search, options, origin
     best = _descend(measurement, weighting, *how)
-    if not search or not stands_out(measurement):
+    if not search:
         return best
     found, problem = measurement.vector(), BinProblem(*few_frames(measurement, weighting))
     least = np.sum(problem.residuals(found) ** 2)
-    for promised, start in other_laws(problem, found, origin)[:_STARTS]:
-        if promised > _HOPELESS * least:
-            break
+    starts = [(start, _CLEARLY_BETTER) for start in other_axes(problem, found)]
+    if stands_out(measurement):
+        laws = other_laws(problem, found, origin)[:_STARTS]
+        starts += [(start, _BETTER) for told, start in laws if told <= _HOPELESS * least]
+    for start, better in starts:
         # most starts lead to the minimum that is known, or crawl towards one that is no better:
         # a few steps of everything tell
         start = problem.fit(start, evaluations=_GLANCE)[0]
         start, moved = search_branches(problem, start, origin)
         if moved.any():
             start = problem.fit(start, evaluations=_GLANCE)[0]
-        if np.sum(problem.residuals(start) ** 2) >= _BETTER * least:
+        if np.sum(problem.residuals(start) ** 2) >= better * least:
             continue
         measurement.stand_at(start)
         outcome = _descend(measurement, weighting, *how, is_searched=True)
         left = np.sum(problem.residuals(measurement.vector()) ** 2)
-        if left < _BETTER * least:
+        if left < better * least:
             best, found, least = outcome, measurement.vector(), left
             if not stands_out(measurement):
                 break
