@@ -482,6 +482,8 @@ def test_as_many_parameters_as_data_are_refused_in_one_line():
     chain, star = roman_star(2)
     with pytest.raises(FitError, match="8 free parameters and 8 data leave none for the noise"):
         calibrate(chain, star, instrument="roman")
+    known = calibrate(chain, star, instrument="roman", weights="errors")
+    assert "no degree of freedom left for s_res" in known.summary()
 
 
 def test_a_table_without_noise_is_fitted_exactly():
