@@ -23,7 +23,7 @@ from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.pointings import angle_or_zero, axes_apart, frame_names
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
 from astropolcal.units import angle_to_rad
-from astropolcal.words import counted
+from astropolcal.words import counted, listed
 
 __all__ = []
 
@@ -650,10 +650,9 @@ def _masked(observations, frames, reason):
         return observations
     result = observations.with_mask(np.asarray(new), reason)
     names = np.array(frame_names(observations.frames))[new]
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
     warnings.warn(
         f"{observations.name}: {len(names)} of {counted(observations.n_frames, 'frame')} masked, "
-        f"{reason}: frame {', '.join(names[:_MOST_NAMED])}{more}",
+        f"{reason}: frame {listed(names, most=_MOST_NAMED)}",
         AstropolcalWarning,
         stacklevel=3,
     )

@@ -25,7 +25,7 @@ from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock, frame_names
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import angle_to_rad
-from astropolcal.words import check_choice, counted
+from astropolcal.words import check_choice, counted, listed
 
 __all__ = ["OBSERVABLES", "Observable"]
 
@@ -548,12 +548,10 @@ def pair_frames(
             break
         width *= 4
     if left.size:
-        left = sorted(left.tolist())
-        shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in left[:_MAX_NAMED]]
-        more = f" and {len(left) - _MAX_NAMED} more" if len(left) > _MAX_NAMED else ""
+        shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in sorted(left.tolist())]
         warnings.warn(
             f"{name}: {len(left)} of {n_frames} frames left out, their partner 45 deg of half-wave "
-            f"plate away is missing or used: frame {', '.join(shown)}{more}",
+            f"plate away is missing or used: frame {listed(shown, most=_MAX_NAMED)}",
             AstropolcalWarning,
             stacklevel=3,
         )
