@@ -86,7 +86,9 @@ def build_grid(table, label):
 
     ``label`` is the file or name for messages. Cells that are masked give one warning per reason.
     """
+    height = None
     if isinstance(table, Table) and len(table):
+        height = len(table)
         table = beams_as_frames(check_table(table, label, ()), label)
     there = set(getattr(table, "colnames", ()))
     single = "flux" in there and not there & {*BEAMS}
@@ -116,7 +118,7 @@ def build_grid(table, label):
         frames[name].info.format = None
 
     flux_unit, values = _measured(table, label, ("flux",) if single else BEAMS)
-    code, reasons = mask_rows(table, values, label)
+    code, reasons = mask_rows(table, values, label, height)
     # -1: no row has spoken for this cell yet
     reason = np.full(shape, -1)
     reason[frame_index, bin_index] = code
@@ -346,12 +348,13 @@ def _measured(table, label, beams):
 _HUGE = 1e100
 
 
-def mask_rows(table, values, label):
+def mask_rows(table, values, label, height=None):
     """
     Judge the rows by fluxes and errors, each (N,).
 
     Return codes (0 usable, else 1 + index of the reason) and reasons. What the column
-    ``mask_reason`` declares is respected, the rest is warned of.
+    ``mask_reason`` declares is respected, the rest is warned of, by the row of a table of that
+    ``height`` with beams in columns.
     """
     code, reasons = np.zeros(len(table), dtype=int), []
     # what the file declares was warned of when it was made
@@ -379,7 +382,9 @@ def mask_rows(table, values, label):
             if bad.any():
                 row = int(np.argmax(bad))
                 shown = ", ".join(f"{name} = {values[name][row]:g}" for name in names)
-                first = f"row {row + 1}: {shown}; allowed are finite numbers above zero"
+                of = f" (beam {table['beam'][row]})" if "beam" in table.colnames else ""
+                place = row % (height or len(table)) + 1
+                first = f"row {place}{of}: {shown}; allowed are finite numbers above zero"
                 _mask_cells(code, bad, reason, reasons, label, first)
     return code, reasons
 
