@@ -273,7 +273,7 @@ def understood(path, error, words, *, reads=True):
     except Exception as problem:
         if isinstance(problem, PermissionError) or getattr(problem, "errno", None) in _BAD_NAMES:
             reason = getattr(problem, "strerror", None) or one_line(problem)
-            raise error(f"{path}: cannot be read: {reason}") from problem
+            raise error(f"{path}: {'cannot be read' if reads else words}: {reason}") from problem
         raise error(f"{path}: {words}: {one_line(problem)}") from problem
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from astropolcal import instruments
 from astropolcal.observations import Observations
+from astropolcal.optics import COORDINATES
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -16,6 +17,11 @@ META = {
     "yjh50_dichroic": "in",
 }
 _CRITICAL = [0, 45, 22.5, 67.5] * u.deg
+
+
+def in_radian(positions):
+    """Positions of an instrument with their unit, as users give them."""
+    return {k: v if k in COORDINATES else v * u.rad for k, v in positions.items()}
 
 
 def track(n_cycles, parallactic=(-40, 40), altitude=(55, 68)):

@@ -387,6 +387,17 @@ def test_beams_in_columns_are_frames_of_one_group():
     assert found.frames["beam"].tolist() == ["a", "b", "c"] * 2
     assert found.brightness_groups.tolist() == [0, 0, 0, 1, 1, 1]
     assert found.flux_right[:, 0].tolist() == [10, 11, 12, 20, 21, 22]
+    # messages name the frames of the user's table
+    assert found.frames["frame"].tolist() == [7] * 3 + [9] * 3
+    tall = Observations.from_table(found.to_table()[::-1])
+    assert tall.content_hash == found.content_hash
+    wide["turn"], wide["flux_b"][1] = [0, np.nan] * u.deg, -1 * u.adu
+    splitter = join([optics.StateAnalyser(mount=f"beam={name}", name=name) for name in "abc"])
+    plate = optics.LinearRetarder(mount="turn", name="plate")
+    with pytest.warns(AstropolcalWarning, match=r"first: row 2 \(beam b\): flux = -1"):
+        lost = Observations.from_table(wide)
+    with pytest.raises(ObservationError, match=r"frame 9 \(beam a\): turn is not known"):
+        Measurement(plate | splitter, lost)
     assert not found.flux_left.any()
     assert found.variance_right[3, 0] == 4
     alone = wide["frame", "bin", "wavelength", "flux_a", "flux_a_err"]
@@ -482,6 +493,8 @@ def test_as_many_parameters_as_data_are_refused_in_one_line():
     chain, star = roman_star(2)
     with pytest.raises(FitError, match="8 free parameters and 8 data leave none for the noise"):
         calibrate(chain, star, instrument="roman")
+    known = calibrate(chain, star, instrument="roman", weights="errors")
+    assert "no degree of freedom left for s_res" in known.summary()
 
 
 def test_a_table_without_noise_is_fitted_exactly():

@@ -12,6 +12,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.time import Time
+from star_data import in_radian
 
 from astropolcal import optics
 from astropolcal.calibration import calibrate
@@ -477,7 +478,7 @@ def test_q_and_u_are_corrected():
             rows = measurement_rows(sky, positions, IRDIS_.wavelength)
             right, left = np.einsum("bwfs,swx->bfwx", rows, light)
             frames = ScienceFrames.from_arrays(
-                right, left, IRDIS_.wavelength, positions, hwp=table["hwp"]
+                right, left, IRDIS_.wavelength, in_radian(positions), hwp=table["hwp"]
             )
             done = correct(sky, frames, observable=observable)
             np.testing.assert_allclose(done.q, light[1] / 1000, atol=1e-9)
@@ -490,7 +491,7 @@ def test_correction_with_the_other_coating_leaves_their_difference():
     true, wrong = (IRDIS_.on_sky(IRDIS_.published(), coating=c) for c in COATINGS)
     positions = frame_positions(IRDIS_, table, true)
     right, left = np.moveaxis(measurement_rows(true, positions, IRDIS_.wavelength)[..., 0], 1, 2)
-    frames = ScienceFrames.from_arrays(right, left, IRDIS_.wavelength, positions)
+    frames = ScienceFrames.from_arrays(right, left, IRDIS_.wavelength, in_radian(positions))
     left_over = np.hypot(*(getattr(correct(wrong, frames), key) for key in "qu"))
     change = true["ut"].diattenuation.value - wrong["ut"].diattenuation.value
     assert np.all(left_over > 0.2 * change)
@@ -516,7 +517,7 @@ def test_calibrated_internal_source_corrects_a_star():
         rows = measurement_rows(sky, positions, IRDIS_.wavelength)
         right, left = np.moveaxis(rows @ [1000, 30, -20, 0], 1, 2)
         science = ScienceFrames.from_arrays(
-            right, left, IRDIS_.wavelength, positions, hwp=star["hwp"], date=date
+            right, left, IRDIS_.wavelength, in_radian(positions), hwp=star["hwp"], date=date
         )
         no_date = pytest.warns(AstropolcalWarning, match="neither date nor coating")
         with nullcontext() if date else no_date:

@@ -5,6 +5,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from star_data import in_radian
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate
@@ -209,7 +210,7 @@ def test_star_is_corrected_with_both_states(seen):
     for observable in ["intensity", "single", "double"]:
         sky, night, positions = seen
         frames = ScienceFrames.from_arrays(
-            night.flux_right, night.flux_left, FIELDS, positions, hwp=night.frames["hwp"]
+            night.flux_right, night.flux_left, FIELDS, in_radian(positions), hwp=night.frames["hwp"]
         )
         found = correct(sky, frames, observable=observable)
         np.testing.assert_allclose(found.q, 0.02, atol=1e-9)
@@ -219,7 +220,7 @@ def test_star_is_corrected_with_both_states(seen):
 def test_double_differences_of_science_frames_are_of_one_state(seen):
     _, night, positions = seen
     frames = ScienceFrames.from_arrays(
-        night.flux_right, night.flux_left, FIELDS, positions, hwp=night.frames["hwp"]
+        night.flux_right, night.flux_left, FIELDS, in_radian(positions), hwp=night.frames["hwp"]
     )
     state = np.asarray(positions["flc_state"])
     assert np.all(state[frames.pairs[:, 0]] == state[frames.pairs[:, 1]])
@@ -230,7 +231,7 @@ def test_states_exchanged_would_be_seen(seen):
     """The test above must be able to fail: with A taken for B nothing is right."""
     sky, night, positions = seen
     wrong = positions | {"flc_state": 1 - positions["flc_state"]}
-    frames = ScienceFrames.from_arrays(night.flux_right, night.flux_left, FIELDS, wrong)
+    frames = ScienceFrames.from_arrays(night.flux_right, night.flux_left, FIELDS, in_radian(wrong))
     assert np.abs(correct(sky, frames).q - 0.02).max() > 0.01
 
 

@@ -18,7 +18,7 @@ from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import FLUXES
 from astropolcal.pipeline.headers import describe
-from astropolcal.units import wavelengths_of
+from astropolcal.units import angle_to_rad, wavelengths_of
 
 __all__ = ["ScienceFrames"]
 
@@ -216,7 +216,7 @@ class ScienceFrames:
         names : sequence of str, optional
             What to call the frames.
         wavelength, positions
-            As the attributes.
+            As the attributes, but angles with their unit.
         hwp : `~astropy.units.Quantity`, optional
             Commanded angles of the half-wave plate, by which frames are paired.
         position_angle : `~astropy.units.Quantity`, optional
@@ -235,6 +235,9 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
+        for name, value in (positions or {}).items():
+            if name not in COORDINATES and np.asarray(value).dtype.kind in "iuf":
+                angle_to_rad(value, name)
         if left is None:
             given = right, variance_right, positions, settings, names
             right, variance_right, positions, settings, names = _single(*given)

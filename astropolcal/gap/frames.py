@@ -21,6 +21,7 @@ from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Tria
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
+from astropolcal.observations.pointings import frame_names
 from astropolcal.words import listed
 
 __all__ = []
@@ -203,7 +204,7 @@ def unknown_angles(observations, effect):
     for i, one in enumerate(observations):
         for f in np.flatnonzero(effect.edge(one)):
             number = int(one.frames["frame"][f])
-            words = f"frame {number}: its angle is in no row of the table"
+            words = f"frame {frame_names(one.frames)[f]}: its angle is in no row of the table"
             given = {"probability": 1.0, "words": words, "place": (i, int(f))}
             found.append(FrameFault(one.name, number, "unknown", **given))
     return found
@@ -311,14 +312,15 @@ def _of_design(problem, fault, rivals, probability):
     if len(rivals) > 1:
         kinds = [_fault(problem, fault.place, trial, 0.0, 0.0) for trial in rivals.values()]
         each = (kind.words.partition(": ")[2] for kind in reversed(kinds))
+        name = fault.words.partition(": ")[0]
         fault = _fault(problem, fault.place, Trial("unknown", 0, 0), fault.evidence, probability)
-        fault.words = f"frame {fault.frame}: {', or '.join(each)}; its design cannot tell"
+        fault.words = f"{name}: {', or '.join(each)}; its design cannot tell"
     if channel.groups is None:
         return fault
     mates = channel.valid.any(axis=0) & (channel.groups == channel.groups[f])
     if mates.sum() == 2:
-        numbers = problem.datasets[i].observations.frames["frame"]
-        one, other = (int(numbers[k]) for k in np.flatnonzero(mates))
+        names = frame_names(problem.datasets[i].observations.frames)
+        one, other = (names[k] for k in np.flatnonzero(mates))
         fault.words += f"; or it is the other of the group: frames {one} and {other} alone"
         fault.words += " cannot tell which of them is wrong"
     return fault
@@ -338,7 +340,7 @@ def _fault(problem, place, trial, evidence, probability):
             told = float(observations.position(stage)[f])
         others = np.rad2deg(told + others - stood)
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
-    numbers = observations.frames["frame"]
+    numbers, names = observations.frames["frame"], frame_names(observations.frames)
     told_of = {"evidence": evidence, "probability": probability, "place": place, "bin": trial.bin}
     fault = FrameFault(observations.name, int(numbers[f]), trial.what, **told_of)
     if np.isfinite(value):
@@ -346,17 +348,18 @@ def _fault(problem, place, trial, evidence, probability):
     if trial.partner is not None:
         fault.with_, fault.partner_place = int(numbers[trial.partner]), (i, trial.partner)
     nm = None if trial.bin is None else observations.wavelength[trial.bin].to_value("nm")
-    fault.words = f"frame {fault.frame}: {_words(fault, told, trial.beam, others, nm)}"
+    fault.words = f"frame {names[f]}: {_words(fault, told, trial.beam, others, nm, names)}"
     fault.error = float(np.abs(others - value).max()) if others.size else fault.error
     return fault
 
 
-def _words(fault, told, beam, others, nm):
+def _words(fault, told, beam, others, nm, names):
     """Return what is wrong with a frame, beside the angle (degree) that its table states."""
     if not fault.what.endswith(" angle"):
         off = None if fault.value is None else f"{100 * abs(fault.value - 1):.2g} %"
+        other = names[fault.partner_place[1]] if fault.partner_place else ""
         return {
-            "exchanged": f"its data are those of frame {fault.with_}, and the other way round",
+            "exchanged": f"its data are those of frame {other}, and the other way round",
             "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
             "brightness": f"its brightness is off that of its group by {off}",
             "one wavelength": f"its data at {nm or 0:.0f} nm do not fit those at others",

@@ -25,6 +25,7 @@ from astropolcal.gap.effects._laws import Misread
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
+from astropolcal.observations.pointings import frame_names
 from astropolcal.observations.reading import common_wavelengths
 from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
@@ -503,9 +504,9 @@ def _parts(chains, observations, misfit, say):
             others = few[:i], few[i + 1 :]
             good = _fitting(few_chains, *others, few[i], order, misfit)
             if good < len(order):
-                number = int(whole.frames["frame"][order[good]])
+                name = frame_names(whole.frames)[order[good]]
                 parts = [whole.select(np.sort(part)) for part in (order[:good], order[good:])]
-                parts[1].name = f"{whole.name} {words} frame {number}"
+                parts[1].name = f"{whole.name} {words} frame {name}"
                 split = [*observations[:i], *parts, *observations[i + 1 :]]
                 return [*chains[: i + 1], *chains[i:]], split, parts[1].name
     return chains, observations, ""

@@ -23,6 +23,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import false_discovery
 from astropolcal.gap.problem import law_basis
 from astropolcal.observations.grid import SAME_ANGLE, derotator_runs
+from astropolcal.observations.pointings import frame_names
 
 __all__ = []
 
@@ -435,7 +436,8 @@ def places(model):
         if not 2 < count <= _MOST_BLOCKS:
             edges = np.linspace(0, n, min(_MOST_BLOCKS, n // 2) + 1).astype(int)
         label = labels([np.searchsorted(edges, np.arange(n), "right") - 1])
-        yield "time", label, [(a, b - 1) for a, b in pairwise(edges)], "frames"
+        names = frame_names(observations[0].frames)
+        yield "time", label, [(names[a], names[b - 1]) for a, b in pairwise(edges)], "frames"
 
 
 def most_uneven(data, axis, label, names, template):

@@ -17,6 +17,7 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.observations import Observations
+from astropolcal.observations.pointings import frame_names
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator, splits
@@ -264,7 +265,7 @@ def _positions(chain, observations, positions):
     for stage, angle in found.items():
         lost = used & ~np.isfinite(angle).reshape(-1, observations.n_frames).all(axis=0)
         if lost.any():
-            frame = observations.frames["frame"][np.argmax(lost)]
+            frame = frame_names(observations.frames)[np.argmax(lost)]
             raise ObservationError(
                 f"{observations.name}, frame {frame}: {stage} is not known; a finite number is "
                 "needed"

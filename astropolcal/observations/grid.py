@@ -20,10 +20,10 @@ import numpy as np
 from astropy.table import QTable, Table, vstack
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import angle_or_zero, axes_apart
+from astropolcal.observations.pointings import angle_or_zero, axes_apart, frame_names
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
 from astropolcal.units import angle_to_rad
-from astropolcal.words import counted
+from astropolcal.words import counted, listed
 
 __all__ = []
 
@@ -86,7 +86,9 @@ def build_grid(table, label):
 
     ``label`` is the file or name for messages. Cells that are masked give one warning per reason.
     """
+    height = None
     if isinstance(table, Table) and len(table):
+        height = len(table)
         table = beams_as_frames(check_table(table, label, ()), label)
     there = set(getattr(table, "colnames", ()))
     single = "flux" in there and not there & {*BEAMS}
@@ -96,14 +98,16 @@ def build_grid(table, label):
     wavelength, angles = _positions(table, label)
 
     # first: row in which a frame appears first, for its own columns and for messages
-    frame_numbers, first, frame_index = np.unique(frame, return_index=True, return_inverse=True)
+    _, first, frame_index = np.unique(
+        _each_beam(table, frame) if single else frame, return_index=True, return_inverse=True
+    )
     bin_numbers, bin_index = np.unique(bins, return_inverse=True)
-    shape = (len(frame_numbers), len(bin_numbers))
+    shape = (len(first), len(bin_numbers))
     _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
     unit = table["wavelength"].unit
     by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
     # the columns that belong to frames, after checking that they do
-    frames = QTable({"frame": frame_numbers})
+    frames = QTable({"frame": frame[first]})
     for name in table.colnames:
         if name == "frame" or name in CELL_COLUMNS:
             continue
@@ -114,11 +118,11 @@ def build_grid(table, label):
         frames[name].info.format = None
 
     flux_unit, values = _measured(table, label, ("flux",) if single else BEAMS)
-    code, reasons = mask_rows(table, values, label)
+    code, reasons = mask_rows(table, values, label, height)
     # -1: no row has spoken for this cell yet
     reason = np.full(shape, -1)
     reason[frame_index, bin_index] = code
-    mask_missing(reason, reasons, frame_numbers, bin_numbers, label)
+    mask_missing(reason, reasons, frame_names(frames), bin_numbers, label)
     if reason.all():
         raise ObservationError(
             f"{label}: all {reason.size} cells are masked ({', '.join(reasons)}), "
@@ -144,11 +148,19 @@ def build_grid(table, label):
     )
 
 
+def _each_beam(table, frame):
+    """Return a number for each beam of each frame, in the order of the frames."""
+    if "beam" not in table.colnames:
+        return frame
+    beams, number = np.unique(np.asarray(table["beam"], dtype=str), return_inverse=True)
+    return frame * len(beams) + number
+
+
 def warn_of_copies(grid, label):
     """Warn of frames with the same fluxes and errors to the last digit, which noise never makes."""
     cells = np.stack([grid.flux_right, grid.flux_left, *grid.errors.values()], axis=1)
     seen, copies = {}, []
-    for number, cell in zip(np.asarray(grid.frames["frame"]).tolist(), cells, strict=True):
+    for number, cell in zip(frame_names(grid.frames), cells, strict=True):
         if np.isfinite(cell).any() and (first := seen.setdefault(cell.tobytes(), number)) != number:
             copies.append((number, first))
     if copies and grid.errors:
@@ -165,8 +177,8 @@ def beams_as_frames(table, label):
     """
     Return a table with columns ``flux_NAME`` of other beams as one of a single ``flux``.
 
-    Each beam of a frame becomes a frame with its name in the column ``beam``; those of an exposure
-    have its number in ``group``, as they share the brightness of the source.
+    Each beam becomes a frame of the same number, with its name in the column ``beam``; that number
+    is in ``group`` too, as they share the brightness of the source.
     """
     if {"flux", *BEAMS} & set(table.colnames):
         return table
@@ -183,16 +195,15 @@ def beams_as_frames(table, label):
         raise ObservationError(
             f"{label}: columns beam and {', '.join(beams)}; one of both tells the beam"
         )
-    frame, count = _integers(table, "frame", label), len(beams)
+    frame = _integers(table, "frame", label)
     parts = []
-    for number, name in enumerate(beams):
+    for name in beams:
         part = table.copy()
         part.remove_columns([one for one in named if one in beams or one in errors])
         part["flux"] = table[name]
         if not lacking:
             part["flux_err"] = table[f"{name}_err"]
-        if count > 1:
-            part["frame"] = frame * count + number
+        if len(beams) > 1:
             part["beam"] = name.removeprefix("flux_")
             part["group"] = part["group"] if "group" in part.colnames else frame
         parts.append(part)
@@ -337,12 +348,13 @@ def _measured(table, label, beams):
 _HUGE = 1e100
 
 
-def mask_rows(table, values, label):
+def mask_rows(table, values, label, height=None):
     """
     Judge the rows by fluxes and errors, each (N,).
 
     Return codes (0 usable, else 1 + index of the reason) and reasons. What the column
-    ``mask_reason`` declares is respected, the rest is warned of.
+    ``mask_reason`` declares is respected, the rest is warned of, by the row of a table of that
+    ``height`` with beams in columns.
     """
     code, reasons = np.zeros(len(table), dtype=int), []
     # what the file declares was warned of when it was made
@@ -370,7 +382,9 @@ def mask_rows(table, values, label):
             if bad.any():
                 row = int(np.argmax(bad))
                 shown = ", ".join(f"{name} = {values[name][row]:g}" for name in names)
-                first = f"row {row + 1}: {shown}; allowed are finite numbers above zero"
+                of = f" (beam {table['beam'][row]})" if "beam" in table.colnames else ""
+                place = row % (height or len(table)) + 1
+                first = f"row {place}{of}: {shown}; allowed are finite numbers above zero"
                 _mask_cells(code, bad, reason, reasons, label, first)
     return code, reasons
 
@@ -640,12 +654,10 @@ def _masked(observations, frames, reason):
     if not new.any():
         return observations
     result = observations.with_mask(np.asarray(new), reason)
-    numbers = np.asarray(observations.frames["frame"])[new].tolist()
-    more = f" and {len(numbers) - _MOST_NAMED} more" if len(numbers) > _MOST_NAMED else ""
+    names = np.array(frame_names(observations.frames))[new]
     warnings.warn(
-        f"{observations.name}: {len(numbers)} of {counted(observations.n_frames, 'frame')} masked, "
-        f"{reason}: "
-        f"frame {', '.join(map(str, numbers[:_MOST_NAMED]))}{more}",
+        f"{observations.name}: {len(names)} of {counted(observations.n_frames, 'frame')} masked, "
+        f"{reason}: frame {listed(names, most=_MOST_NAMED)}",
         AstropolcalWarning,
         stacklevel=3,
     )

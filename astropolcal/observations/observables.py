@@ -22,10 +22,10 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock
+from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock, frame_names
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import angle_to_rad
-from astropolcal.words import check_choice, counted
+from astropolcal.words import check_choice, counted, listed
 
 __all__ = ["OBSERVABLES", "Observable"]
 
@@ -548,12 +548,10 @@ def pair_frames(
             break
         width *= 4
     if left.size:
-        left = sorted(left.tolist())
-        shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in left[:_MAX_NAMED]]
-        more = f" and {len(left) - _MAX_NAMED} more" if len(left) > _MAX_NAMED else ""
+        shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in sorted(left.tolist())]
         warnings.warn(
             f"{name}: {len(left)} of {n_frames} frames left out, their partner 45 deg of half-wave "
-            f"plate away is missing or used: frame {', '.join(shown)}{more}",
+            f"plate away is missing or used: frame {listed(shown, most=_MAX_NAMED)}",
             AstropolcalWarning,
             stacklevel=3,
         )
@@ -687,7 +685,7 @@ def frame_groups(observations, kind, rows, label, **limits):
     frames, time = observations.frames, clock(observations.frames)
     exposure = _exposures(frames, observations.flux_unit, label)
     angles = observations.position("hwp") * u.rad, angle_or_zero(observations, "derotator") * u.rad
-    labels, rows, limits = np.asarray(frames["frame"]), np.asarray(rows), limits | {"name": label}
+    labels, rows, limits = np.array(frame_names(frames)), np.asarray(rows), limits | {"name": label}
     if kind == "hwp":
         # the plate cancels what is static: both frames must be in one state
         state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
@@ -721,9 +719,9 @@ def warn_of_exposures(observations, groups, label):
     exposure = _exposures(frames, observations.flux_unit, label)
     uneven = [] if exposure is None else [g for g in groups if _uneven(exposure[g])]
     if uneven:
-        numbers, each = frames["frame"], frames["exposure_time"]
+        names, each = frame_names(frames), frames["exposure_time"]
         ends = np.sort(uneven[0][[exposure[uneven[0]].argmin(), exposure[uneven[0]].argmax()]])
-        shown = " and ".join(f"{numbers[i]} ({each[i]:g})" for i in ends)
+        shown = " and ".join(f"{names[i]} ({each[i]:g})" for i in ends)
         warnings.warn(
             f"{label}: exposures differ in {len(uneven)} of {counted(len(groups), 'group')} of "
             f"frames whose light is taken to be the same, such as {shown}",

@@ -240,7 +240,7 @@ def sky_angles(observations, location=None):
     if low.any():
         frame = int(np.argmax(low))
         raise ObservationError(
-            f"{observations.name}, frame {observations.frames['frame'][frame]}: altitude = "
+            f"{observations.name}, frame {frame_names(observations.frames)[frame]}: altitude = "
             f"{np.rad2deg(altitude[frame]):.4g} deg; a star is above 0 deg"
         )
     return altitude, parallactic
@@ -550,6 +550,14 @@ def clock(frames):
     return times if np.all(np.isfinite(times)) else None
 
 
+def frame_names(frames):
+    """Return what messages call the frames of a table: their number, and the beam where needed."""
+    numbers = [str(number) for number in frames["frame"]]
+    if len(set(numbers)) == len(numbers):
+        return numbers
+    return [f"{one} (beam {beam})" for one, beam in zip(numbers, frames["beam"], strict=True)]
+
+
 def modulator_states(frames, label):
     """Return 0 or 1 for the states A and B of a modulator in each frame, (F,)."""
     if "flc_state" not in frames.colnames:
@@ -560,7 +568,7 @@ def modulator_states(frames, label):
     found = [_STATES.get(str(value).strip().upper()) for value in frames["flc_state"]]
     if None in found:
         i = found.index(None)
-        frame = frames["frame"][i] if "frame" in frames.colnames else i
+        frame = frame_names(frames)[i] if "frame" in frames.colnames else i
         raise ObservationError(
             f"{label}: flc_state = {str(frames['flc_state'][i])!r} in frame {frame}; allowed are A "
             "and B, or 0 and 1"

@@ -152,8 +152,7 @@ def note(axes, text, **look):
 
 def degrees(angle):
     """Return an angle in degree as short text: ``11.25°``."""
-    text = f"{angle:.2f}".rstrip("0").rstrip(".")
-    return f"{'0' if text == '-0' else text}°"
+    return f"{round(angle, 2):zg}°"
 
 
 def rms(values, axis=None):

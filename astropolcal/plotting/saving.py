@@ -15,6 +15,7 @@ from astropolcal.exceptions import (
     ChainError,
     ObservationError,
 )
+from astropolcal.files import understood
 from astropolcal.plotting._style import save
 from astropolcal.plotting.accuracy import plot_accuracy, plot_star_check, plot_target_accuracy
 from astropolcal.plotting.identifiability import plot_correlations, plot_identifiability
@@ -86,11 +87,8 @@ def save_all(calibration, folder):
     ['double_differences.png', 'residuals.png', 'identifiability.png']
     """
     folder = Path(folder)
-    try:
+    with understood(folder, AstropolcalError, "cannot be created", reads=False):
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise AstropolcalError(f"{folder}: cannot be created: {reason}") from error
     paths = []
     stage("drawing")
     for name, draw in steps(list(_figures(calibration)), "figures"):

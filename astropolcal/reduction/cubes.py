@@ -17,11 +17,9 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.stats import gaussian_fwhm_to_sigma
 from astropy.table import QTable
 from astropy.time import Time
 from scipy import ndimage
-from scipy.special import erf
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import (
@@ -30,7 +28,7 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
-from astropolcal.files import atomic_path, check_new
+from astropolcal.files import atomic_path, check_new, understood
 from astropolcal.instruments.layout import TEXTS, unit_of
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import offline, tracked
@@ -565,11 +563,8 @@ def file_names(directory, layout, files, n_frames):
         if os.path.exists(path):
             check_new(path, files.overwrite, ObservationError)
     folder = directory / "raw" if raw else directory
-    try:
+    with understood(folder, ObservationError, "cannot be made", reads=False):
         folder.mkdir(exist_ok=True, parents=True)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ObservationError(f"{folder}: cannot be made: {reason}") from error
     return names
 
 
@@ -761,13 +756,10 @@ def _by_width(profile, box, place, fwhm, beta):
 
 def gaussian(box, place, fwhm, _beta):
     """Return the exact integral over every pixel of a Gaussian of unit sum."""
-    # erf(x / (sqrt 2 sigma)) / 2 is the integral of a unit Gaussian from 0 to x
-    scale = np.sqrt(2) * fwhm * gaussian_fwhm_to_sigma
-    parts = []
-    for along, middle in zip(box, (place[1], place[0]), strict=True):
-        edges = np.arange(along.start, along.stop + 1) - 0.5
-        parts.append(0.5 * np.diff(erf((edges - middle) / scale)))
-    return np.outer(*parts)
+    from photutils.psf import CircularGaussianPRF
+
+    rows, columns = np.ogrid[box]
+    return CircularGaussianPRF(flux=1, x_0=place[0], y_0=place[1], fwhm=fwhm)(columns, rows)
 
 
 def moffat(box, place, fwhm, beta):

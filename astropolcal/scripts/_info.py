@@ -10,12 +10,13 @@ from astropy import units as u
 from astropy.io import fits
 
 from astropolcal import instruments
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import AstropolcalError, InstrumentError, ObservationError
 from astropolcal.files import one_line, plain
 from astropolcal.observations import OBSERVABLES, Observations
 from astropolcal.observations.observables import default_observable
 from astropolcal.observations.reading import read_ecsv
 from astropolcal.optics import OPTICS
+from astropolcal.pipeline.headers import recognized
 from astropolcal.scripts import _common as common
 from astropolcal.version import version
 from astropolcal.words import counted
@@ -324,13 +325,11 @@ def _describe_frame(path, header, hdus):
 
 def _instrument(header, shapes):
     """Return the instrument that a header names, or else the only one with such cubes."""
-    layouts = {name: instruments.get(name).files for name in instruments.names()}
-    layouts = {name: layout for name, layout in layouts.items() if layout is not None}
-    for name, layout in layouts.items():
-        if header.get(layout.keywords.get("instrument", "INSTRUME")) in layout.identities:
-            return name
+    known = [one for one in map(instruments.get, instruments.names()) if one.files is not None]
+    with suppress(InstrumentError):
+        return recognized(header, known).name
     # an extracted cube may lack the keywords of its raw frame
-    alike = [name for name, layout in layouts.items() if _cube_shapes(layout) & shapes]
+    alike = [one.name for one in known if _cube_shapes(one.files) & shapes]
     return alike[0] if len(alike) == 1 else None
 
 

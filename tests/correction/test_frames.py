@@ -57,8 +57,11 @@ def test_pairs_by_the_angles_of_the_plate():
 
 
 def test_frames_of_two_derotator_angles_are_no_pair():
-    """Up to 2 deg apart they are; positions without a unit are in radian."""
-    near = {"hwp": HWP, "derotator": np.deg2rad([60, 61.9, 80, 81])}
+    """Up to 2 deg apart they are; angles without a unit are refused."""
+    near = {"hwp": HWP, "derotator": [60, 61.9, 80, 81]}
+    with pytest.raises(ParameterError, match=r"derotator = .* needs a unit such as rad"):
+        arrays(positions=near, hwp=HWP)
+    near["derotator"] *= u.deg
     assert arrays(positions=near, hwp=HWP).pairs.tolist() == [[0, 1], [2, 3]]
     far = {"hwp": HWP, "derotator": [60, 62.1, 80, 81] * u.deg}
     assert arrays(positions=far, hwp=HWP).pairs.tolist() == [[2, 3]]

@@ -89,8 +89,12 @@ def test_a_datum_without_error_gets_the_usual_one():
 
 
 def test_no_error_and_no_scatter_is_an_error():
-    with pytest.raises(FitError, match="no errors in the table, and the residuals tell no noise"):
-        estimates.frame_noise(channel(np.nan), np.zeros((2, W, F)), ANGLES)
+    exact, few = channel(np.nan), channel(np.nan)
+    few.variance, few.valid = few.variance[:, :4], few.valid[:4]
+    for seen, residual in ((exact, np.zeros((2, W, F))), (few, draws(0.02)[:, :4])):
+        wanted = f"{residual.shape[1]} wavelengths without errors .*flux_right_err and .* least 5 w"
+        with pytest.raises(FitError, match=wanted):
+            estimates.frame_noise(seen, residual, ANGLES)
 
 
 def test_what_optics_do_is_no_noise():

@@ -149,7 +149,8 @@ def test_every_row_has_its_label():
     label, names, _ = found["beam"]
     assert label.reshape(shape)[:, 0, 0].tolist() == [0, 1]
     label, names, template = found["time"]
-    assert names == [(0, 7), (8, 15), (16, 23), (24, 31)]
+    # as messages name the frames
+    assert names == [("0", "7"), ("8", "15"), ("16", "23"), ("24", "31")]
     assert "dataset" not in found
     assert all(len(one) == model.problem.n_rows for one, *_ in found.values())
 
@@ -178,6 +179,7 @@ def test_frames_of_one_angle_each_are_divided_evenly():
     model = data.fitted(data.observed(table=table))
     _, names, template = looks(model)["time"]
     assert template == "frames"
+    names = [tuple(map(int, ends)) for ends in names]
     assert names[0][0] == 0
     assert names[-1][1] == 31
     sizes = [last - first + 1 for first, last in names]

@@ -593,7 +593,12 @@ def frame_noise(channel, residual, angles, bins=None):
         stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & valid
         if not stated.any():
             if not rough > 0:
-                raise FitError("no errors in the table, and the residuals tell no noise")
+                raise FitError(
+                    f"{len(valid)} wavelengths without errors in the table tell no noise; give the "
+                    "errors of the fluxes (flux_right_err and flux_left_err, flux_err or "
+                    f"flux_NAME_err), or at least {_FEWEST_ROUGH} wavelengths with noise in the "
+                    "residuals"
+                )
             # nothing states which data are noisier: mean squares around each wavelength, without
             # what is far off
             level, half = np.zeros(len(valid)), _FEWEST_ROUGH // 2

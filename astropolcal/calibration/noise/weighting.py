@@ -19,6 +19,7 @@ from astropolcal.calibration.identifiability.linearized import Whitened, triangl
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength, rms
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
+from astropolcal.observations.pointings import frame_names
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]
@@ -131,7 +132,7 @@ def outlying_data(calibration, limit=_FAR):
         bright = brightness(part.observations)
         for i in np.flatnonzero(np.abs(off) > limit * spread):
             frames = part.frames[groups[i]]
-            numbers = ", ".join(map(str, part.observations.frames["frame"][frames]))
+            numbers = ", ".join(np.array(frame_names(part.observations.frames))[frames])
             percent, times = 100 * np.median(residuals[members[i]]), np.abs(off[i]) / spread[i]
             found = map(float, (percent, times, bright[frames].min()))
             rows.append((part.observations.name, numbers, *found))

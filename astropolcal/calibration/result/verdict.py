@@ -475,7 +475,8 @@ def _fit(calibration):
     s_res, s_cv = (_worst(calibration, key) for key in ("s_res", "s_cv"))
     left_out = f", s_cv {s_cv:.2g} %" if np.isfinite(s_cv) else ""
     datasets = "worst dataset, " if len(calibration.datasets) > 1 else ""
-    yield f"Residuals   s_res {s_res:.2g} %{left_out} ({datasets}median wavelength)"
+    told = f"s_res {s_res:.2g} %" if np.isfinite(s_res) else "no degree of freedom left for s_res"
+    yield f"Residuals   {told}{left_out} ({datasets}median wavelength)"
     told = [
         f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
         f"({p_words(test['p_value'])})"
