@@ -223,9 +223,9 @@ def deep_copied(optic, memo):
 def _copied_parameter(parameter, model, memo):
     new = parameter.__class__.__new__(parameter.__class__)
     for key, value in parameter.__dict__.items():
-        # a prior does not change, and the copy of a distribution takes longer than all else
-        shared = model if key == "_model" else value if key == "_prior" else None
-        new.__dict__[key] = _copied(value, memo) if shared is None else shared
+        # a frozen distribution of scipy does not change, and its copy takes longer than all else
+        kept = key == "_prior" and hasattr(value, "dist")
+        new.__dict__[key] = model if key == "_model" else value if kept else _copied(value, memo)
     return new
 
 

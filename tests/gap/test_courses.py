@@ -48,13 +48,16 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
         assert one.freedom == rank + basis.shape[1] - 1, one.words
 
 
+LONG = {"marks": pytest.mark.long}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("course", "place", "kind"),
     [
         ("swings", "in:derotator", "retardance_h"),
-        pytest.param("both stages", "after:hwp", "diattenuation_d", marks=pytest.mark.long),
-        pytest.param("third harmonic", "after:derotator", "diattenuation_h", marks=pytest.mark.long),
+        pytest.param("both stages", "after:hwp", "diattenuation_d", **LONG),
+        pytest.param("third harmonic", "after:derotator", "diattenuation_h", **LONG),
     ],
 )
 def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named(course, place, kind):
