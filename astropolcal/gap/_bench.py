@@ -166,6 +166,7 @@ class Bench:
             named = {"name": source, "meta": meta | {"source": source}}
             self.clean.append(simulate(chain, wavelength, frames, **light, **named))
         self.optics = [self.split(chain) for chain in self.chains]
+        self._last = {}
         every = (leaf for chain in self.chains for leaf in leaves(chain))
         self._known = {leaf.name: leaf.canonical_values() for leaf in every}
         ideal = self.expose()
@@ -192,22 +193,35 @@ class Bench:
 
     def _matrices(self, dataset, positions=None, values=None, optics=None):
         """Yield name, angle (F, W or 1) and matrices (beams, F, W, 4, 4) of each optic."""
-        for pair in self.optics[dataset] if optics is None else optics:
-            found = []
-            for beam, leaf in enumerate(pair):
-                where = None
-                if leaf.stage:
-                    where = (positions or {}).get(leaf.stage)
-                    where = self.clean[dataset].position(leaf.stage) if where is None else where
-                    # what differs between the beams is (2, W, F)
-                    where = where[beam].T if where.ndim == 3 else where[:, None]
-                    where = where * (1 if leaf.stage in COORDINATES else u.rad)
-                given = None if values is None else values.get(leaf.name)
-                found.append(leaf._resolve(self.micron * u.um, where, given))
-            both = np.array([leaf._oriented(*one) for leaf, one in zip(pair, found, strict=True)])
-            # frames, wavelengths, or both may be missing
-            missing = (1,) * (5 - both.ndim)
-            yield pair[0].name, found[0][1], both.reshape(2, *missing, *both.shape[1:])
+        if positions or optics is not None:
+            for pair in self.optics[dataset] if optics is None else optics:
+                given = None if values is None else values.get(pair[0].name)
+                yield self._resolved(dataset, positions, given, pair)
+            return
+        for i, pair in enumerate(self.optics[dataset]):
+            given = (values or self._known)[pair[0].name]
+            # of a derivative or a cell most optics are as they were
+            last, done = self._last.get((dataset, i), (None, None))
+            if last is None or not all(map(np.array_equal, last, given)):
+                done = self._resolved(dataset, None, given, pair)
+                self._last[dataset, i] = [np.copy(value) for value in given], done
+            yield done
+
+    def _resolved(self, dataset, positions, given, pair):
+        found = []
+        for beam, leaf in enumerate(pair):
+            where = None
+            if leaf.stage:
+                where = (positions or {}).get(leaf.stage)
+                where = self.clean[dataset].position(leaf.stage) if where is None else where
+                # what differs between the beams is (2, W, F)
+                where = where[beam].T if where.ndim == 3 else where[:, None]
+                where = where * (1 if leaf.stage in COORDINATES else u.rad)
+            found.append(leaf._resolve(self.micron * u.um, where, given))
+        both = np.array([leaf._oriented(*one) for leaf, one in zip(pair, found, strict=True)])
+        # frames, wavelengths, or both may be missing
+        missing = (1,) * (5 - both.ndim)
+        return pair[0].name, found[0][1], both.reshape(2, *missing, *both.shape[1:])
 
     def path(self, dataset, positions=None, values=None, kicks=(), optics=None, skip=None):
         """Return the fluxes (2, F, W) of a dataset; kicks are places with a Mueller matrix each."""

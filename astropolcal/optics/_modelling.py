@@ -23,7 +23,7 @@ from astropolcal.units import check_range, length_to_um, to_unit
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
 # what a copy of an optic may share with it
-_SHARED = (str, bool, int, float, type(None), u.UnitBase)
+_SHARED = {str, bool, int, float, np.float64, type(None), slice}
 
 
 class Setting:
@@ -215,19 +215,34 @@ def deep_copied(optic, memo):
     for key, value in optic.__dict__.items():
         if isinstance(value, Parameter):
             new.__dict__[key] = memo[id(value)] = _copied_parameter(value, new, memo)
-        elif isinstance(value, _SHARED):
-            new.__dict__[key] = value
         else:
-            new.__dict__[key] = deepcopy(value, memo)
+            new.__dict__[key] = _copied(value, memo)
     return new
 
 
 def _copied_parameter(parameter, model, memo):
     new = parameter.__class__.__new__(parameter.__class__)
     for key, value in parameter.__dict__.items():
-        plain = value is None or isinstance(value, _SHARED)
-        new.__dict__[key] = value if plain else model if key == "_model" else deepcopy(value, memo)
+        # a frozen distribution of scipy does not change, and its copy takes longer than all else
+        kept = key == "_prior" and hasattr(value, "dist")
+        new.__dict__[key] = model if key == "_model" else value if kept else _copied(value, memo)
     return new
+
+
+def _copied(value, memo):
+    """Return a deep copy, without a detour for what most optics hold."""
+    kind = type(value)
+    if kind in _SHARED or isinstance(value, u.UnitBase):
+        return value
+    if kind is np.ndarray and value.dtype == float:
+        return value.copy()
+    if kind is dict or kind is defaultdict:
+        new = copy(value)
+        new.update((key, _copied(one, memo)) for key, one in value.items())
+        return new
+    if kind is tuple:
+        return tuple(_copied(one, memo) for one in value)
+    return deepcopy(value, memo)
 
 
 def with_own_scalars(model, labels):

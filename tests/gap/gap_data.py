@@ -17,19 +17,19 @@ WAVELENGTH = [1170, 1300, 1450, 1620, 1800, 2000, 2200] * u.nm
 DEROTATOR = [45, 70, 95, 120] * u.deg
 
 
-def chain():
-    return instruments.get("charis").chain(wavelength=WAVELENGTH, derotator="linear")
+def chain(wavelength=WAVELENGTH):
+    return instruments.get("charis").chain(wavelength=wavelength, derotator="linear")
 
 
 def frames():
     return half_wave_plate_cycles(derotator=DEROTATOR)
 
 
-def observed(true=None, *, seed=1, flux=1e6, table=None, **options):
-    true = chain() if true is None else true
+def observed(true=None, *, seed=1, flux=1e6, table=None, wavelength=WAVELENGTH, **options):
+    true = chain(wavelength) if true is None else true
     table = frames() if table is None else table
     options = {"name": "lamp"} | options
-    return simulate(true, WAVELENGTH, table, flux=flux, seed=seed, **options)
+    return simulate(true, wavelength, table, flux=flux, seed=seed, **options)
 
 
 def with_effect(name, **values):

@@ -34,6 +34,7 @@ def plate_chain(retardance=180.0, free=False):
     return polarizer | plate | prism
 
 
+@pytest.mark.slow
 def test_half_a_wave_hides_nothing():
     for true, free in [(176.0, False), (176.0, True), (184.0, True)]:
         data = simulate(plate_chain(true), WAVELENGTH, TURN, flux=1e6, seed=1, name="turn")

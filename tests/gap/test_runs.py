@@ -2,7 +2,6 @@
 """Several runs of the same kind of source in one diagnosis, and what changed between them."""
 
 import json
-from functools import cache
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -52,23 +51,13 @@ GAIN = ("detector", "gain", "constant", 0.01)
 BEHIND = ("after:derotator", "retardance_d", "constant", 0.05)
 
 
-@cache
-def changed():
-    """A gain in both runs, and a retarder behind the derotator in the second."""
-    return diagnose(data.chain(), pair([GAIN], [GAIN, BEHIND]), changes=True)
-
-
-@cache
-def changed_content():
-    return to_dict(changed())
-
-
 # ---- what changed ------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_a_change_is_found_with_its_run_cell_and_size():
-    content = changed_content()
+    found = diagnose(data.chain(), pair([GAIN], [GAIN, BEHIND]), changes=True)
+    content = to_dict(found)
     first, *others = content["changes"]
     assert not others
     assert {key: first["cell"][key] for key in ("place", "kind")} == {
@@ -85,8 +74,20 @@ def test_a_change_is_found_with_its_run_cell_and_size():
     assert first["brought_by"] == []
     told = "the retardance at 45 deg to the axes downstream of the derotator changed by 2."
     assert first["words"].startswith(f'Between "{JULY}" and "{OCTOBER}" {told}')
+    # the opposite change of the other run is the same one
+    assert first["words"].endswith("(probability 97 %).")
     assert first["words"] in content["sentences"]
+    assert "2.9" in summary(found) or "2.8" in summary(found)
     json.dumps(content)
+    # before the cause that both share, for which each run by itself asks
+    assert found.causes[0].cell.run in (JULY, OCTOBER)
+    assert {"beam_gain", "detector/gain/constant"} & {cause.name for cause in found.causes[1:]}
+    assert all(cause.cell.run is None for cause in found.causes[1:])
+    shared = next(c for c in content["causes"] if "gain" in c["name"])
+    assert set(shared["evidence_by_dataset"]) == {JULY, OCTOBER}
+    assert min(shared["evidence_by_dataset"].values()) > 20
+    own = next(c for c in content["causes"] if "retardance" in c["name"])
+    assert own["evidence_by_dataset"] == {}
 
 
 @pytest.mark.slow
@@ -95,9 +96,6 @@ def test_a_change_that_others_look_like_is_not_told_as_sure():
     content = to_dict(diagnose(data.chain(), pair([], [turned]), changes=True))
     (change,) = content["changes"]
     assert change["words"].endswith("(probability 99 % of this or what looks the same).")
-    # the opposite change of the other run is the same one
-    (change,) = changed_content()["changes"]
-    assert change["words"].endswith("(probability 97 %).")
 
 
 def test_which_of_three_runs_changed_is_not_told_as_sure_where_two_may_have():
@@ -111,22 +109,7 @@ def test_which_of_three_runs_changed_is_not_told_as_sure_where_two_may_have():
         assert change["words"].endswith(end)
 
 
-def test_changes_come_first_and_the_shared_cause_after():
-    first, *others = changed().causes
-    assert first.cell.run in (JULY, OCTOBER)
-    assert {"beam_gain", "detector/gain/constant"} & {cause.name for cause in others}
-    assert all(cause.cell.run is None for cause in others)
-    assert "2.9" in summary(changed()) or "2.8" in summary(changed())
-
-
-def test_each_run_by_itself_asks_for_the_shared_cause():
-    shared = next(c for c in changed_content()["causes"] if "gain" in c["name"])
-    assert set(shared["evidence_by_dataset"]) == {JULY, OCTOBER}
-    assert min(shared["evidence_by_dataset"].values()) > 20
-    own = next(c for c in changed_content()["causes"] if "retardance" in c["name"])
-    assert own["evidence_by_dataset"] == {}
-
-
+@pytest.mark.slow
 def test_what_both_runs_lack_is_no_change():
     found = diagnose(data.chain(), pair([GAIN], [GAIN]))
     assert [cause.name for cause in found.causes] == ["beam_gain"]
@@ -344,9 +327,9 @@ def test_words_of_a_change_that_is_doubtful():
 
 
 def test_a_single_run_has_no_changes():
-    content = to_dict(diagnose(data.chain(), data.observed()))
-    assert content["changes"] == []
-    assert changes(diagnose(data.chain(), data.observed()), [{}]) == []
+    found = diagnose(data.chain(), data.observed())
+    assert to_dict(found)["changes"] == []
+    assert changes(found, [{}]) == []
 
 
 # ---- bad input ---------------------------------------------------------------------------------

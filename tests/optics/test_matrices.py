@@ -106,6 +106,8 @@ def test_copy_shares_nothing_that_can_change():
     for how in [copy.deepcopy, lambda optic: optic.copy()]:
         plate = bound_optic()
         twin = how(plate)
+        twin.retardance[0] = 9.0
+        np.testing.assert_array_equal(plate.retardance.value, [1, 2])
         twin.retardance = [7, 8] * u.deg
         twin.retardance.bounds, twin.retardance.fixed = (-1, 1), False
         twin.retardance.prior["mean"].append(3)
