@@ -196,7 +196,7 @@ def _since(earlier, fitted):
         words += f"moved by less than {_MOVED:.0f} "
     words += "standard errors"
     if most or moved("") > _MOVED:
-        words += ", which is no gap; --fix holds them where they were"
+        words += "; that leaves no gap: --fix holds them where they were"
     return [f"{'Since then':<12}{words}"]
 
 
