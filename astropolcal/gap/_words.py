@@ -554,13 +554,12 @@ def exposure(entry, causes):
     known = [f"cause {ranks[name]}" for name in entry["separates"] if name in ranks]
     aliases = (name for name in entry["separates"] if name in among and name not in ranks)
     others = list(dict.fromkeys(f"cause {among[name]}" for name in aliases))
-    if not known and not others:
+    if entry["exposure"] is None or not (known or others):
         return entry["words"]
     for_what = f"tells {listed(known)} " if known else f"tells apart what {listed(others)} may be "
     for_what += "from what it may be " * bool(known and others)
-    take, gain = entry["words"].partition(": ")[0], entry["gain"]
-    gain = f"{gain:.0f}" if gain >= 10 else f"{gain:.1f}"
-    return f"{take}: {for_what}({gain} standard deviations)"
+    gain = f"{entry['gain']:.0f}" if entry["gain"] >= 10 else f"{entry['gain']:.1f}"
+    return f"{entry['exposure']}: {for_what}({gain} standard deviations)"
 
 
 def _numbered(title, texts, before=0):

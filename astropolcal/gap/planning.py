@@ -328,24 +328,26 @@ def _telling_apart(forecast, group, foreseen):
             few = listed([titles[names[j]] for j in other], most=2)
             same = [titles[names[j]] for j in range(1, len(names)) if j not in other]
             few += f", not from {listed(same, most=2)}," if same else ""
-            words = (
-                f"Take {exposure.words}: tells {first} from {few} at {_sigmas(gain)} "
+            purpose = (
+                f"tells {first} from {few} at {_sigmas(gain)} "
                 f"standard deviations; if one of these is the cause, its share should rise from "
                 f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
             )
             told = [names[0], *(names[j] for j in other)]
-            return _line(words, "cause", told, float(gain), now, after)
+            return _line(exposure.words, purpose, "cause", told, float(gain), now, after)
     few = listed([titles[name] for name in names[1:]], most=2)
     words = (
         f"No exposure that was tried tells {first} from {few}: other angles and orders, polarizer "
         "and lamp do to both the same"
     )
-    return _line(words, "cause", list(names), 0.0, now, now)
+    return _line(None, words, "cause", list(names), 0.0, now, now)
 
 
-def _line(words, question, separates, gain, now=None, after=None):
+def _line(exposure, purpose, question, separates, gain, now=None, after=None):
     """Return an entry of the plan; of causes, also how probable the true one is expected to be."""
-    found = {"question": question, "separates": separates, "gain": gain}
+    take = exposure and f"Take {exposure}"
+    found = {"question": question, "separates": separates, "gain": gain, "exposure": take}
+    words = f"{take}: {purpose}" if take else purpose
     return found | {"probability_now": now, "probability_after": after, "words": words}
 
 
@@ -362,11 +364,12 @@ def _repetitions(diagnosis):
     # the scatter of repetitions has a variance that is known to this share
     gain = np.log(max(excess, 1.0)) / np.sqrt(2 / n + 2 / (n * (_REPEATS - 1)))
     name = model.observations[worst].name
-    words = (
-        f"Take the run of {name} {_REPEATS} times: tells structure that no cause explains from "
-        f"noise larger than stated, at {_sigmas(gain)} standard deviations"
+    purpose = (
+        "tells structure that no cause explains from noise larger than stated, at "
+        f"{_sigmas(gain)} standard deviations"
     )
-    found = _line(words, "structure", [], float(gain), 0.5, float(ndtr(gain)))
+    take = f"the run of {name} {_REPEATS} times"
+    found = _line(take, purpose, "structure", [], float(gain), 0.5, float(ndtr(gain)))
     return [found] if gain > LEAST_GAIN else []
 
 
@@ -377,24 +380,21 @@ def _fixing(forecast, directions, foreseen):
     if max(worth, default=0.0) <= LEAST_GAIN:
         return []
     (exposure, names, gain, count), n_open = found[int(np.argmax(worth))], directions[2].shape[1]
-    words = (
-        f"Take {exposure.words}: fixes {count} of {n_open} open directions of the parameters, the "
-        f"clearest that of {' with '.join(names)}, at {_sigmas(gain)} standard deviations"
+    purpose = (
+        f"fixes {count} of {n_open} open directions of the parameters, the clearest that of "
+        f"{' with '.join(names)}, at {_sigmas(gain)} standard deviations"
     )
-    return [_line(words, "parameters", names, gain)]
+    return [_line(exposure.words, purpose, "parameters", names, gain)]
 
 
 def _merged(lines):
     """Return the lines, with one exposure that answers several questions named once."""
     found = {}
     for line in lines:
-        exposure, _, purpose = line["words"].partition(": ")
-        if line["gain"] and exposure in found:
-            old = found[exposure]
-            old["words"] += f"; {purpose}"
+        old = found.setdefault(line["exposure"] or line["words"], dict(line))
+        if old["words"] != line["words"]:
+            old["words"] += f"; {line['words'].removeprefix(line['exposure'] + ': ')}"
             old["separates"] = list(dict.fromkeys(old["separates"] + line["separates"]))
-        else:
-            found[exposure if line["gain"] else line["words"]] = dict(line)
     return list(found.values())
 
 

@@ -51,6 +51,8 @@ _WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 _PROMISING = 0.8
 # but this, where the freedom of the best costs more (log evidence): two simple ones may do better
 _HALF, _DEAR = 0.5, 30.0
+# and this of a name with one number, where no derivative explains the gap down to noise
+_FAR_PROMISE = 0.3
 # the evidence ranks sets of at most so many causes, if these leave more than noise
 _BY_EVIDENCE = 2
 # names are asked for beside so many causes
@@ -478,7 +480,10 @@ def _extensions(task, states, known, most, least):
         if state.outline not in known:
             known[state.outline] = _scanned(state.model, names, task.cells)
     instead = partial(_in_place, replace(task, library=names))
-    fitted = sorted(_fitted(_grown(states, known, most)[:most], instead), key=preference)
+    fitted = _fitted(_grown(states, known, most)[:most], instead)
+    if not k:
+        fitted += _far(states[0], known[states[0].outline], fitted, instead)
+    fitted = sorted(fitted, key=preference)
     return fitted if fitted and fitted[0].evidence >= least else []
 
 
@@ -507,6 +512,22 @@ def _fitted(grown, instead):
             found.append(one)
             most = max(most, one.evidence)
     return found
+
+
+def _far(state, found, fitted, instead):
+    """
+    Return sets of one name with one number each, fitted in full, where no derivative suffices.
+
+    An angle that is far off does more, and other things, than its derivative promises.
+    """
+    if found.temper < _STRUCTURED:
+        return []
+    known = {one for grown in fitted for one in grown.outline}
+    least = _FAR_PROMISE * found.best.evidence
+    simple = [o for o in found.candidates if o.is_named and o.rank == 1 and o.evidence > least]
+    new = (one for one in simple[: _FITTED[0]] if one.name not in known)
+    grown = [_extended(state.evidence + one.evidence, state, (one,), instead) for one in new]
+    return [one for one in grown if one is not None]
 
 
 def _grown(states, known, most):

@@ -25,6 +25,8 @@ Several tables are used together. The effects are listed by --effects help.
 """
 _CORRECT = "correct the table, and calibrate with that"
 _HINT = "--full adds each cause with its sizes, and where the gap lies"
+# parameters that differ by fewer standard errors did not move
+_MOVED = 5.0
 # what the figure with both channels of the data shows
 _SPECTRUM = (
     "Gap of the fit at each wavelength before and after, with the noise. The verdict and the "
@@ -78,7 +80,7 @@ def run(arguments):
         for name in effects:
             get_effect(name)
     options = {"effects": effects, "changes": arguments.changes, "nested": arguments.nested}
-    nominal, datasets, instrument = _nominal(arguments)
+    nominal, datasets, instrument, earlier = _nominal(arguments)
     diagnosis = diagnose(nominal, datasets, **options, progress=stage)
     stage("what to observe next")
     # once: page, JSON and summary say the same
@@ -91,7 +93,12 @@ def run(arguments):
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
     told = [_CORRECT] if content["misread"] and content["causes"][0]["probability"] >= 0.5 else told
     saved = not content["misread"] and arguments.save
-    ends = common.wrapped(f"{'Next':<12}{told[0]}", indent=12).split("\n")
+    fitted = diagnosis.nominal.calibration
+    # a fit that lacks something shows a change of the parameters that need be none
+    is_known = None not in (earlier, fitted) and content["verdict"] == "none"
+    since = _since(earlier, fitted) if is_known else []
+    ends = [*since, f"{'Next':<12}{told[0]}"]
+    ends = [line for end in ends for line in common.wrapped(end, indent=12).split("\n")]
     ends += common.written_lines([arguments.json, arguments.report, saved])
     if arguments.full:
         # its end is what stays on the screen
@@ -123,7 +130,7 @@ def _nominal(arguments):
         return _of_calibration(known, files, datasets, edits, arguments)
     instrument = common.instrument_of(arguments, datasets)
     chains = instrument.chains_for(datasets, **common.stated_model(arguments))
-    return common.edit_chains(chains, **edits), datasets, instrument.name
+    return common.edit_chains(chains, **edits), datasets, instrument.name, None
 
 
 def _of_calibration(path, files, datasets, edits, arguments):
@@ -140,9 +147,57 @@ def _of_calibration(path, files, datasets, edits, arguments):
     # the very tables of the calibration: its fit need not be repeated
     hashes = [dataset.content_hash for dataset in datasets]
     if hashes == [r.content_hash for r in calibration.datasets] and not any(edits.values()):
-        return calibration.with_observations(datasets), datasets, calibration.instrument
+        return calibration.with_observations(datasets), datasets, calibration.instrument, None
     chains = [calibration.chains[i].copy() for i in records]
-    return common.edit_chains(chains, **edits), datasets, calibration.instrument
+    return common.edit_chains(chains, **edits), datasets, calibration.instrument, calibration
+
+
+def _since(earlier, fitted):
+    """Return lines on how far parameters that are free moved from those of a calibration."""
+    import numpy as np
+
+    from astropolcal.measurement import parameter_table
+    from astropolcal.words import listed
+
+    known = [one.covariance for one in (earlier, fitted)]
+    names = [n for n, error in zip(known[0].names, known[0].stds, strict=True) if error > 0]
+    errors = dict(zip(known[1].names, known[1].stds, strict=True))
+    # what is open has no error to compare with
+    names = [name for name in names if errors.get(name, 0.0) > 0]
+    if not names:
+        return []
+    number = [int(name.partition("[")[2].rstrip("]") or 0) for name in names]
+    values, matrix = [], 0.0
+    for one in (earlier, fitted):
+        table, rows = parameter_table(one.chains), [one.covariance.names.index(n) for n in names]
+        plain = (table[name.partition("[")[0]][0] for name in names)
+        values.append([np.ravel(p.value)[i] for p, i in zip(plain, number, strict=True)])
+        matrix = matrix + one.covariance.matrix[np.ix_(rows, rows)]
+    scale = np.sqrt(np.diag(matrix))
+    off, matrix = np.subtract(*values) / scale, matrix / np.outer(scale, scale)
+
+    def moved(start):
+        """Return how far parameters moved together, in standard deviations beyond chance."""
+        mine = np.flatnonzero([name.startswith(start) for name in names])
+        chi2 = off[mine] @ np.linalg.pinv(matrix[np.ix_(mine, mine)], hermitian=True) @ off[mine]
+        return float(np.sqrt(max(chi2 - mine.size, 0.0)))
+
+    # two thicknesses of one plate may move by little each, and its retardance by much
+    optics = {name.partition(".")[0]: moved(f"{name.partition('.')[0]}.") for name in names}
+    most = sorted((name for name in optics if optics[name] > _MOVED), key=lambda n: -optics[n])
+    words = "the parameters were fitted to these data again, and "
+    if most:
+        words += (
+            f"{listed([f'those of {name} moved by {optics[name]:.0f}' for name in most], most=3)} "
+        )
+    elif moved("") > _MOVED:
+        words += f"moved together by {moved(''):.0f} "
+    else:
+        words += f"moved by less than {_MOVED:.0f} "
+    words += "standard errors"
+    if most or moved("") > _MOVED:
+        words += "; that leaves no gap: --fix holds them where they were"
+    return [f"{'Since then':<12}{words}"]
 
 
 def _record(calibration, path, file, dataset):

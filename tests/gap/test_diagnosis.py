@@ -216,11 +216,14 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
 @pytest.mark.slow
 def test_a_misread_angle_is_found_where_the_star_is_hardly_polarized():
     setup = SETUPS["irdis star"]()
-    table = setup.observed(flux=1e6).to_table()
-    table["derotator"] /= 2
-    found = diagnose(setup.nominal, Observations.from_table(table, name="night"), **QUICK)
-    assert found.verdict == "named"
-    assert names(found.causes[0]) == ["derotator_halved"]
+    # the plate follows the parallactic angle, and is where the table says that it is not
+    cases = {"derotator_halved": ("derotator", 0.5), "parallactic_sign": ("parallactic", -1)}
+    for name, (column, factor) in cases.items():
+        table = setup.observed(flux=1e6).to_table()
+        table[column] *= factor
+        found = diagnose(setup.nominal, Observations.from_table(table, name="night"), **QUICK)
+        assert found.verdict == "named"
+        assert names(found.causes[0]) == [name]
 
 
 @pytest.mark.slow

@@ -197,6 +197,7 @@ CASES = {
     "mirror_flip": Case(),
     "mirror_flip_before_plate": Case(),
     "mirror_misalignment": Case((4.0,)),
+    "parallactic_offset": Case((2.0,), sky=True),
     "parallactic_sign": Case(sky=True),
     "persistence": Case((0.3,)),
     "polarizer_angle_bound": Case(_ONE_SIGN, _bounded("calibration_polarizer", "theta", -5, 0)),
@@ -450,8 +451,8 @@ def _with_value(problem, parameter, size):
 #: Effects that are nearest to their cells, and no more.
 NEAREST = {
     "derotator_motion", "hwp_transmission", "hwp_transmission_once", "m3_diattenuation",
-    "m3_recoating", "m3_retardance", "sky_background", "sky_motion", "source_linear",
-    "polarizer_misalignment", "polarizer_angle_bound", "mirror_misalignment",
+    "m3_recoating", "m3_retardance", "parallactic_offset", "sky_background", "sky_motion",
+    "source_linear", "polarizer_misalignment", "polarizer_angle_bound", "mirror_misalignment",
 }  # fmt: skip
 
 

@@ -41,7 +41,11 @@ SECTIONS = [
     "What was tried",
     "Model and data",
 ]
-NEXT = {"words": "Take 8 frames: tells a from b at 9 standard deviations", "separates": ["a", "b"]}
+NEXT = {
+    "exposure": "Take 8 frames",
+    "words": "Take 8 frames: tells a from b at 9 standard deviations",
+    "separates": ["a", "b"],
+}
 
 
 @pytest.fixture(scope="module")

@@ -201,12 +201,13 @@ def test_structure_without_a_cause_wants_the_run_again(model):
 
 def test_the_run_to_take_again_is_that_with_most_structure_in_its_data():
     """Masked frames make it no smaller."""
-    sizes = {"less": 0.01, "more": 0.015}
+    sizes = {"less": 0.01, "run: more": 0.015}
     runs = [observed(with_effect("beam_gain", imbalance=size), name=n) for n, size in sizes.items()]
     half = np.tile((np.arange(32) % 2 == 0)[:, None], len(WAVELENGTH))
     model = fitted([runs[0], runs[1].with_mask(half, "clouds")])
     (found,) = plan(SimpleNamespace(improved=model, causes=[], remainder_p_value=1e-20))
-    assert found["words"].startswith("Take the run of more 3 times")
+    assert found["exposure"] == "Take the run of run: more 3 times"
+    assert found["words"].startswith(f"{found['exposure']}: tells structure")
 
 
 def test_what_frees_a_parameter_counts_from_where_it_was_held():

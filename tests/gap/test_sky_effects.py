@@ -41,6 +41,7 @@ NEW = (
     "m3_diattenuation",
     "m3_recoating",
     "m3_retardance",
+    "parallactic_offset",
     "sky_background",
     "sky_motion",
     "standard_polarization",

@@ -346,7 +346,8 @@ def test_the_summary_comes_first_and_lines_fit():
     alias = [named("b")]
     many = [entry(named(f"{'x' * 40}{i}"), rank=i + 1, aliases=alias) for i in range(6)]
     take = {
-        "words": f"Take {'this ' * 30}: tells",
+        "exposure": f"Take run: 2, {'this ' * 27}",
+        "words": f"Take run: 2, {'this ' * 27}: tells",
         "separates": [many[0]["name"], "b"],
         "gain": 5.0,
     }
@@ -356,12 +357,14 @@ def test_the_summary_comes_first_and_lines_fit():
         assert max(map(len, lines)) <= 80
         summary = "\n".join(lines[:24])
         assert all(f"{share:>3}" in summary for share in ("97 %", "2.00 %", "1.10 %"))
-        assert "tells cause 1 from what it may be (5.0 standard" in " ".join(
-            " ".join(lines).split()
-        )
+        told = " ".join(" ".join(lines).split())
+        assert "this : tells cause 1 from what it may be (5.0 standard" in told
         assert all(name in summary for name in written)
         assert lines[lines.index("Cause 1: " + _words.title(causes[0]) + " (97 %)") - 1] == ""
     assert "p = 1e-09" not in "\n".join(lines)
+    # what no exposure tells is said as it is
+    none = take | {"exposure": None, "words": "No exposure tells a from b", "gain": 0.0}
+    assert _words.exposure(none, many) == none["words"]
 
 
 def test_of_where_the_gap_lies_five_lines_are_told():

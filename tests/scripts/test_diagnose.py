@@ -142,6 +142,42 @@ def test_model_of_a_calibration(folder, cal, tmp_path):
 
 
 @pytest.mark.slow
+def test_of_another_night_it_says_which_optics_moved(tmp_path, capsys):
+    """The fit takes the change up, so that it is no gap."""
+    frames = half_wave_plate_cycles(derotator=[45, 62.5, 80, 100] * u.deg)
+    meta = CHARIS.published_meta() | {
+        "yjh50_dichroic": "out", "nasmyth_beam_switcher": "not installed", "source": "polarized",
+    }  # fmt: skip
+    chain = CHARIS.chain("polarized", wavelength=WAVELENGTH, derotator="linear")
+
+    def night(seed):
+        return simulate(chain, WAVELENGTH, frames, flux=1e6, seed=seed, meta=meta)
+
+    known, table = tmp_path / "cal.asdf", tmp_path / "later.ecsv"
+    nominal = CHARIS.chain("polarized", wavelength=WAVELENGTH, derotator="linear")
+    calibrate(nominal, night(1), instrument="charis", cross_validate=False).write(known)
+    # one layer of the plate alone: its retardance changes by a degree
+    cases = {
+        "": ("theta", 0 * u.deg),
+        "derotator": ("theta", 0.5 * u.deg),
+        "hwp": ("w_sio2", 1 * u.um),
+    }
+    for optic, (key, change) in cases.items():
+        was = getattr(chain[optic or "hwp"], key).quantity
+        setattr(chain[optic or "hwp"], key, was + change)
+        night(2).write(table, overwrite=True)
+        setattr(chain[optic or "hwp"], key, was)
+        assert main(["diagnose", str(known), str(table), *FEW]) == 0
+        told = " ".join(capsys.readouterr().out.split())
+        assert told.startswith("The model agrees with the measurements")
+        moved = told.partition("fitted to these data again, and ")[2]
+        expected = (
+            f"those of {optic} moved by " if optic else "moved by less than 5 standard errors"
+        )
+        assert moved.startswith(expected)
+
+
+@pytest.mark.slow
 def test_edits_of_the_model(folder, tmp_path):
     table = folder / "polarized.ecsv"
     elliptical = run(tmp_path, table, *FEW)

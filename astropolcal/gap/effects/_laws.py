@@ -254,6 +254,29 @@ def retardance_slopes(retarder):
     return slopes if np.abs(slopes).max() > _FLAT else None
 
 
+class OfSky(Effect):
+    """An error of the parallactic angle, from which that of a plate that follows the sky came."""
+
+    def edit(self, chains, context):
+        """Return the chains with sky and plate turned; see `Effect.edit`."""
+        edit, turned = super().edit(chains, context), []
+        # before the sky is known, the plate may follow it as most do
+        laws = context.tracking or (TRACKING,) * len(chains)
+        for i, (chain, (rate, _)) in enumerate(zip(edit.chains, laws, strict=True)):
+            roles = self.roles(chain)
+            sky = next((one for one in roles.leaves if one.name == self.label), None)
+            if sky is not None and roles.plate is not None and rate:
+                rate *= roles.parallactic.stage_sign
+                for side, sign in {"before": rate, "after": -rate}.items():
+                    one = sky.copy()
+                    one.name = f"{self.label}_{side}_{i}"
+                    chain = insert_optic(chain, one, **{side: roles.plate.name})
+                    for key in self.free_of(one):
+                        edit.ties[f"{one.name}.{key}"] = Tie(f"{sky.name}.{key}", factor=sign)
+            turned.append(chain)
+        return Edit(turned, edit.parameters, edit.ties)
+
+
 class Recoating(Effect):
     """
     A mirror that changes from one dataset to the next, as when it is recoated or washed.
@@ -503,6 +526,16 @@ def other_sign(chain, optic, **_):
     """Return a chain with the sign of the stage of an optic turned."""
     optic.mount = optic.stage if optic.stage_sign < 0 else f"-{optic.stage}"
     return chain
+
+
+def other_sign_in_table(*factors):
+    """Return what turns the sign of an angle on sky, from which that of the plate came, too."""
+
+    def change(chain, optic, *, roles, **how):
+        chain = other_sign(chain, optic)
+        return chain if roles.plate is None else following(*factors)(chain, roles.plate, **how)
+
+    return change
 
 
 def exchanged(chain, optic, *, label, **_):
