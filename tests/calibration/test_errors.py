@@ -5,10 +5,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from scipy import stats
 from scipy.optimize import curve_fit
 
 from astropolcal import Observations, optics
 from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty import standard_errors
 from astropolcal.exceptions import CalibrationFileError, FitError
 from astropolcal.simulation import simulate
@@ -147,3 +149,21 @@ def test_half_a_wave_hides_no_error():
     assert abs(values["hwp.retardance"]["value"] - 180) < 0.05 * there
     assert values["hwp.retardance"]["std"] > there
     assert values["hwp.retardance"]["status"] == "badly determined"
+
+
+def test_two_errors_from_few_degrees_of_freedom_are_95_percent_of_students_t():
+    """With three of them one in seven would be beyond two errors of a noise that is known."""
+    source = optics.Diattenuator(diattenuation=0.2, theta=10 * u.deg, name="source")
+    prism = optics.WollastonPrism(name="wollaston")
+    source.diattenuation.fixed = prism.efficiency.fixed = True
+    chain = source | optics.LinearRetarder(retardance=150 * u.deg, mount="hwp", name="hwp") | prism
+    for count, freedom in ((8, 3), (80, 39)):
+        frames = QTable({"hwp": np.arange(3, 93, 90 / count) * u.deg})
+        data = simulate(chain, [1.5] * u.um, frames, flux=1e5, seed=1)
+        for weights, expected in ((None, stats.t.ppf(0.975, freedom) / 1.96), ("errors", 1)):
+            cal = calibrate(chain, data, weights=weights, errors="white", cross_validate=False)
+            problem = problem_of(cal)
+            plain = problem.weighting.level * np.sqrt(problem.around().covariance()[0, 0])
+            # five percent are no matter
+            times = np.deg2rad(cal.covariance.stds[0]) / plain
+            assert times == pytest.approx(max(1, expected / 1.05)), (count, weights)

@@ -4,13 +4,14 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from scipy.optimize import brentq, least_squares
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import Weighting
-from astropolcal.chain import insert_optic
+from astropolcal.chain import insert_optic, join
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -408,3 +409,82 @@ def test_a_sign_that_no_datum_tells_stays_that_of_the_start_and_is_named():
         (claim,) = target_accuracies(cal, [(22 * u.percent, None)])
         assert 0.15 * u.percent < claim["s_Q"][0] < 0.4 * u.percent
         assert "signs that nothing tells at 2 wavelengths" in claim.meta["words"]
+
+
+# --- the hand, signs and axes of a polarimeter of no known instrument ------------------------
+
+
+def bench(wavelength, *between, plate=180.0):
+    """A lamp behind a polarizer, a plate, what is between, and a prism of known efficiency."""
+    there = {"wavelength": wavelength}
+    retardance = np.broadcast_to(plate, wavelength.shape) * u.deg
+    prism = optics.WollastonPrism(name="wollaston", fixed={"efficiency": True})
+    plate = optics.LinearRetarder(retardance=retardance, mount="hwp", name="hwp", **there)
+    return join([optics.LinearPolarizer(name="polarizer"), plate, *between, prism])
+
+
+def turning(**stages):
+    """Frames in which the plate and other stages stand at all of their angles."""
+    grid = np.meshgrid(np.arange(8) * 11.25 + 5, *stages.values())
+    columns = zip(("hwp", *stages), grid, strict=True)
+    return QTable({stage: angle.ravel() * u.deg for stage, angle in columns})
+
+
+def test_all_wavelengths_have_one_hand():
+    """Both signs of all retardances give the same data at each wavelength by itself."""
+    wavelength = np.linspace(1, 2.3, 8) * u.um
+    for rotator, plate in (((120, 205), (176, 184)), ((-160, -210), (186, 171))):
+        made = []
+        for kind in (np.linspace, lambda low, high, n: np.full(n, np.round(low + high, -1) / 2)):
+            retardance = kind(*rotator, 8) * u.deg
+            turns = optics.LinearRetarder(
+                retardance=retardance, wavelength=wavelength, mount="rotator", name="rotator"
+            )
+            made.append(bench(wavelength, turns, plate=kind(*plate, 8)))
+        data = simulate(made[0], wavelength, turning(rotator=[0, 30, 60]), flux=3e5, seed=1)
+        cal = calibrate(made[1], data, weights="errors", cross_validate=False)
+        for name in ("hwp", "rotator"):
+            off = (cal.chain[name].retardance - made[0][name].retardance).value
+            stds = [cal.covariance.std(f"{name}.retardance[{i}]").value for i in range(8)]
+            assert np.all(np.abs(off) < 4 * np.array(stds)), (rotator, name, off)
+        assert any("hwp, rotator: all retardances" in one for one in cal.identifiability.mirrors)
+
+
+def test_a_sign_of_a_diattenuation_that_no_datum_tells_is_named():
+    """Double differences see its square only, single ones itself."""
+    wavelength = [1.2, 1.6, 2.2] * u.um
+    given = {"diattenuation": np.full(3, 0.06), "theta": 22.5 * u.deg, "wavelength": wavelength}
+    chain = bench(wavelength, optics.Diattenuator(name="mirror", **given), plate=170)
+    data = simulate(chain, wavelength, turning(), flux=1e6, seed=2)
+    for observable, named in (("double", 3), ("single", 0)):
+        how = {
+            "observable": f"normalized_{observable}_difference",
+            "weights": "errors",
+            "cross_validate": False,
+        }
+        cal = calibrate(chain, data, weights="errors", **how)
+        words = [one for one in cal.identifiability.mirrors if "mirror.diattenuation" in one]
+        assert len(words) == named, words
+        assert all("the data do not tell the sign" in one for one in words)
+
+
+def test_an_axis_is_found_from_far():
+    """Without diattenuation the start feels nothing of the axis."""
+    for retardance, axis in ((-37, -45), (90, 45), (170, 60)):
+        made = []
+        for diattenuation, theta in ((0.07, axis), (0, 0)):
+            given = {
+                "retardance": retardance * u.deg,
+                "fixed": {"theta": False, "retardance": True},
+            }
+            made.append(
+                optics.DiattenuatorRetarder(
+                    diattenuation=diattenuation, theta=theta * u.deg, name="optic", **given
+                )
+            )
+        truth, start = (bench([1.5] * u.um, optic, plate=170) for optic in made)
+        for chain in (truth, start):
+            chain["hwp"].retardance.fixed, chain["polarizer"].mount = True, "lamp"
+        data = simulate(truth, [1.5] * u.um, turning(lamp=[0, 20, 50, 70]), flux=1e6, seed=1)
+        cal = calibrate(start, data, weights="errors", cross_validate=False)
+        assert cal.fit["lack_of_fit"][0]["times_noise"] < 1.2, (retardance, axis)

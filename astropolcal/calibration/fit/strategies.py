@@ -469,16 +469,19 @@ def other_laws(problem, vector, origin):
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
 
 
-def other_axes(problem, vector):
-    """Return starts with other orientations of what may be turned far.
+def other_axes(problem, vector, origin):
+    """Return starts with other orientations of what may be turned far, and all else of it at home.
 
     Without diattenuation an axis changes no datum, so that a fit may end where both are wrong.
     """
     free, found = problem.measurement.free, []
     low, high = free.bounds()
     for slot in (slot for slot in free.slots if slot.name.endswith(".theta")):
+        optic = f"{slot.name.partition('.')[0]}."
         for turn in _TURNS if high[slot.start] - low[slot.start] > np.pi / 2 else ():
             start = vector.copy()
+            for own in (one for one in free.slots if one.name.startswith(optic)):
+                start[own.slice] = origin[own.slice]
             # an axis that is turned by half a turn is the same
             start[slot.slice] = (start[slot.slice] - low[slot.slice] + turn) % np.pi
             start[slot.slice] += low[slot.slice]
@@ -577,7 +580,7 @@ def joint(measurement, weighting, fitter, search, options=None):
         return best
     found, problem = measurement.vector(), BinProblem(*few_frames(measurement, weighting))
     least = np.sum(problem.residuals(found) ** 2)
-    starts = [(start, _CLEARLY_BETTER) for start in other_axes(problem, found)]
+    starts = [(start, _CLEARLY_BETTER) for start in other_axes(problem, found, origin)]
     if stands_out(measurement):
         laws = other_laws(problem, found, origin)[:_STARTS]
         starts += [(start, _BETTER) for told, start in laws if told <= _HOPELESS * least]
