@@ -462,7 +462,7 @@ def test_a_sign_of_a_diattenuation_that_no_datum_tells_is_named():
             "weights": "errors",
             "cross_validate": False,
         }
-        cal = calibrate(chain, data, weights="errors", **how)
+        cal = calibrate(chain, data, **how)
         words = [one for one in cal.identifiability.mirrors if "mirror.diattenuation" in one]
         assert len(words) == named, words
         assert all("the data do not tell the sign" in one for one in words)

@@ -26,6 +26,7 @@ from astropy.modeling.fitting import TRFLSQFitter
 
 from astropolcal.calibration.fit.strategies import (
     BinProblem,
+    bent_valleys,
     joint,
     known_noises,
     outside_bounds,
@@ -33,7 +34,6 @@ from astropolcal.calibration.fit.strategies import (
     two_step,
     undecided_signs,
     until_settled,
-    valleys,
 )
 from astropolcal.calibration.identifiability.analysis import complete
 from astropolcal.calibration.identifiability.linearized import curved_directions
@@ -492,7 +492,7 @@ def _along_valleys(measurement, whitened, covariance, view):
     """Return the covariance with errors from how far chi-square stays low, and words on them."""
     free, factors = measurement.free, measurement.free.factors()
     stds = covariance.stds * factors
-    found = valleys(measurement, whitened, stds)
+    found = bent_valleys(measurement, whitened, stds)
     wide = covariance.widened([(i, direction / factors) for i, direction, _ in found])
     sky_of = partial(consequences_along, view)
     return wide, curved_directions(free, measurement.vector(), found, stds, sky_of)

@@ -367,7 +367,7 @@ def undecided_signs(measurement, view, stds):
         if row in phases:
             moved = np.abs(np.remainder(moved + np.pi, 2 * np.pi) - np.pi)
         # what is less than its error is no sign
-        least = _OTHER_SIGN if row in phases else 3 * np.nan_to_num(stds[places], posinf=np.inf)
+        least = _OTHER_SIGN if row in phases else 3 * np.nan_to_num(stds[places], nan=np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = new / costs
             # against the noise of the bin, and that of all
@@ -392,7 +392,7 @@ def undecided_signs(measurement, view, stds):
     return found, errors
 
 
-def valleys(measurement, whitened, stds):
+def bent_valleys(measurement, whitened, stds):
     """
     Return how far parameters of a wavelength may go where chi-square is not a parabola.
 
