@@ -133,8 +133,8 @@ _KINDS = {
 _PATTERNS = {
     "time": " that drifts through the run",
     "time2": " that bends through the run",
-    "step": " that changes at frame {0}",
-    "frame": " in frame {0} alone",
+    "step": " that changes at the {0} frame of the table",
+    "frame": " in the {0} frame of the table alone",
     "harmonic": " that changes {1} in a turn of the {0}",
     "direction": " that depends on the direction of the last move of the {0}",
     "state": " where {0}",
@@ -168,9 +168,17 @@ def _place_words(place):
 def _when(dependence):
     text, run = split_run(dependence)
     kind, where, count, *_ = (*text.split(":"), "", "")
+    if kind in ("step", "frame"):
+        # a table may number its frames in any way
+        where = _ordinal(int(where) + 1)
     where = _own_name(where).replace("=", " is ")
     words = _PATTERNS.get(kind, "").format(where, _TIMES.get(count, f"{count} times"))
     return words + (f' in "{run}" only' if run is not None else "")
+
+
+def _ordinal(number):
+    ends = {1: "st", 2: "nd", 3: "rd"}
+    return f"{number}{'th' if number // 10 % 10 == 1 else ends.get(number % 10, 'th')}"
 
 
 def alike(cells):

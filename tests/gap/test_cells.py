@@ -141,6 +141,9 @@ def test_every_cell_has_a_name_and_words_of_its_own():
     extra += ["dataset:July", "time/dataset:July", "time/dataset:October"]
     cells += [Cell("in:hwp", "rotation", dependence) for dependence in extra]
     assert len({cell.title for cell in cells}) == len(cells)
+    # whatever numbers its frames have
+    step = Cell("in:hwp", "diattenuation_h", "step:11")
+    assert step.title.endswith("that changes at the 12th frame of the table")
     for cell in cells:
         again = Cell(**json.loads(json.dumps(cell.to_dict())))
         assert (again, again.name) == (cell, cell.name)
