@@ -470,15 +470,17 @@ def other_laws(problem, vector, origin):
 
 
 def other_axes(problem, vector, origin):
-    """Return starts with other orientations of what may be turned far, and all else of it at home.
+    """Return starts with other orientations of diattenuators, and all else of these at home.
 
-    Without diattenuation an axis changes no datum, so that a fit may end where both are wrong.
+    Without diattenuation its axis changes no datum, so that a fit may end where both are wrong.
     """
     free, found = problem.measurement.free, []
     low, high = free.bounds()
     for slot in (slot for slot in free.slots if slot.name.endswith(".theta")):
         optic = f"{slot.name.partition('.')[0]}."
-        for turn in _TURNS if high[slot.start] - low[slot.start] > np.pi / 2 else ():
+        may_turn = high[slot.start] - low[slot.start] > np.pi / 2
+        may_turn &= f"{optic}diattenuation" in free.by_name
+        for turn in _TURNS if may_turn else ():
             start = vector.copy()
             for own in (one for one in free.slots if one.name.startswith(optic)):
                 start[own.slice] = origin[own.slice]
