@@ -154,48 +154,21 @@ def _of_calibration(path, files, datasets, edits, arguments):
 
 def _since(earlier, fitted):
     """Return lines on how far parameters that are free moved from those of a calibration."""
-    import numpy as np
-
-    from astropolcal.measurement import parameter_table
+    from astropolcal.calibration.result.comparison import moved
     from astropolcal.words import listed
 
-    known = [one.covariance for one in (earlier, fitted)]
-    names = [n for n, error in zip(known[0].names, known[0].stds, strict=True) if error > 0]
-    errors = dict(zip(known[1].names, known[1].stds, strict=True))
-    # what is open has no error to compare with
-    names = [name for name in names if errors.get(name, 0.0) > 0]
-    if not names:
+    optics = moved(earlier, fitted)
+    if not optics:
         return []
-    number = [int(name.partition("[")[2].rstrip("]") or 0) for name in names]
-    values, matrix = [], 0.0
-    for one in (earlier, fitted):
-        table, rows = parameter_table(one.chains), [one.covariance.names.index(n) for n in names]
-        plain = (table[name.partition("[")[0]][0] for name in names)
-        values.append([np.ravel(p.value)[i] for p, i in zip(plain, number, strict=True)])
-        matrix = matrix + one.covariance.matrix[np.ix_(rows, rows)]
-    scale = np.sqrt(np.diag(matrix))
-    off, matrix = np.subtract(*values) / scale, matrix / np.outer(scale, scale)
-
-    def moved(start):
-        """Return how far parameters moved together, in standard deviations beyond chance."""
-        mine = np.flatnonzero([name.startswith(start) for name in names])
-        chi2 = off[mine] @ np.linalg.pinv(matrix[np.ix_(mine, mine)], hermitian=True) @ off[mine]
-        return float(np.sqrt(max(chi2 - mine.size, 0.0)))
-
-    # two thicknesses of one plate may move by little each, and its retardance by much
-    optics = {name.partition(".")[0]: moved(f"{name.partition('.')[0]}.") for name in names}
+    together = optics.pop("") > _MOVED
     most = sorted((name for name in optics if optics[name] > _MOVED), key=lambda n: -optics[n])
     words = "the parameters were fitted to these data again, and "
     if most:
-        words += (
-            f"{listed([f'those of {name} moved by {optics[name]:.0f}' for name in most], most=3)} "
-        )
-    elif moved("") > _MOVED:
-        words += f"moved together by {moved(''):.0f} "
+        words += listed([f"those of {name} moved by {optics[name]:.0f}" for name in most], most=3)
     else:
-        words += f"moved by less than {_MOVED:.0f} "
-    words += "standard errors"
-    if most or moved("") > _MOVED:
+        words += f"moved {'together by more' if together else 'by less'} than {_MOVED:.0f}"
+    words += " standard errors"
+    if most or together:
         words += "; that leaves no gap: --fix holds them where they were"
     return [f"{'Since then':<12}{words}"]
 
