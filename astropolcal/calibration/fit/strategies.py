@@ -80,6 +80,8 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 _HOPELESS, _GLANCE = 100.0, 15
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
 _UNDECIDED = 9.0
+# below this the sign of the start is as good
+_AS_GOOD = 2.0
 # so far an axis is turned for another start (radian)
 _TURNS = np.deg2rad([45.0, 22.5, -22.5])
 # of data without noise, residuals below this are rounding
@@ -238,7 +240,9 @@ class BinProblem(Problem):
         """
         keys = [slot.name.split(".")[1] for slot in self.slots]
         rows = [row for row, key in enumerate(keys) if key in (_LINEAR, *_ELLIPTICAL[:2])]
-        return self.elements[rows], np.array([keys[row] == _LINEAR for row in rows], dtype=bool)
+        known = [row for row, _ in self.priors]
+        turns = [keys[row] == _LINEAR and row not in known for row in rows]
+        return self.elements[rows], np.array(turns, dtype=bool)
 
     def branches(self, vector):
         """Return vectors that may fit as well: this one, of the other hand, and of other signs."""
@@ -259,9 +263,7 @@ class BinProblem(Problem):
                     other, length = one.copy(), np.linalg.norm(one[own], axis=0)
                     other[own] *= 1 - 2 * np.pi / np.where(length > 0, length, np.inf)
                     found.append(np.clip(other, self._low, self._high))
-        costs = self.costs(vector)
-        same = [np.allclose(self.costs(one), costs, rtol=_SAME, atol=0) for one in found]
-        return [one if k else self.polish(one)[0] for one, k in zip(found, same, strict=True)]
+        return found
 
     def in_line(self, vectors, towards):
         """Return the vector of each bin's own, with whole turns that bring its phases in line.
@@ -676,13 +678,23 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     if not problem.main_retardances():
         return outcome, weighting
     branches = problem.branches(found)
+    # most often nothing would be smoother, even if all branches fitted alike
+    if not _least_bent(problem, branches, np.ones((len(branches), problem.n_bins)), origin).any():
+        measurement.stand_at(problem.in_line([found] * problem.n_bins, origin))
+        return outcome, weighting
+    before = problem.costs(found)
+    for k, branch in enumerate(branches):
+        if not np.allclose(problem.costs(branch), before, rtol=_SAME, atol=0):
+            branches[k] = problem.polish(branch)[0]
     # of data without noise residuals are rounding
     rounding = 0.5 * np.sum((_ROUNDED * problem.weights[problem._data] * problem._present) ** 2, 1)
     costs = np.array([problem.costs(branch) for branch in branches]) + rounding
     # of a bin without data all are the same
     ratio = np.where(costs[0] > 0, costs / np.where(costs[0] > 0, costs[0], 1.0), 1.0)
     equal = np.abs(ratio - 1) < _SAME
-    told = ratio < (_FAR_WORSE if problem.n_bins > _COARSE else 1.0)
+    # beside few wavelengths only what is as good
+    good = np.exp(_AS_GOOD / problem._present.sum(axis=1).clip(1))
+    told = ratio < (_FAR_WORSE if problem.n_bins > _COARSE else good)
     for allowed in (told | equal, equal):
         chosen = _least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
         measurement.stand_at(problem.in_line(np.array(branches)[chosen], origin))
