@@ -48,28 +48,22 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
         assert one.freedom == rank + basis.shape[1] - 1, one.words
 
 
-LONG = {"marks": pytest.mark.long}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("course", "place", "kind"),
-    [
+def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
+    for course, place, kind in (
+        ("both stages", "after:hwp", "diattenuation_d"),
         ("swings", "in:derotator", "retardance_h"),
-        pytest.param("both stages", "after:hwp", "diattenuation_d", **LONG),
-        pytest.param("third harmonic", "after:derotator", "diattenuation_h", **LONG),
-    ],
-)
-def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named(course, place, kind):
-    fault = {"what": "course", "course": course, "place": place, "kind": kind}
-    diagnosis, content, score = answered(3, kind="mechanism", snr=20, fault=fault)
-    assert score == "right"
-    assert max((cause.probability for cause in diagnosis.causes), default=0) < 0.5
-    where = [(one.place, one.kind) for one in diagnosis.courses]
-    assert (place, kind) in where, where
-    assert content["verdict"] == "unexplained"
-    assert content["where"][0]["share"] > 0.9
-    assert any("course through the run" in line for line in content["sentences"])
+        ("third harmonic", "after:derotator", "diattenuation_h"),
+    ):
+        fault = {"what": "course", "course": course, "place": place, "kind": kind}
+        diagnosis, content, score = answered(3, kind="mechanism", snr=20, fault=fault)
+        assert score == "right", course
+        assert max((cause.probability for cause in diagnosis.causes), default=0) < 0.5, course
+        where = [(one.place, one.kind) for one in diagnosis.courses]
+        assert (place, kind) in where, (course, where)
+        assert content["verdict"] == "unexplained"
+        assert content["where"][0]["share"] > 0.9, course
+        assert any("course through the run" in line for line in content["sentences"]), course
 
 
 @pytest.mark.slow
