@@ -12,7 +12,8 @@ import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 
 from astropolcal.calibration import Calibration, calibrate
-from astropolcal.calibration.fit.strategies import BinProblem, few_frames, search_branches
+from astropolcal.calibration.fit.branches import BinProblem, search_branches
+from astropolcal.calibration.fit.strategies import few_frames
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.calibration.system import at_wavelengths

@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from timing import fastest, in_new_process, interleaved
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration.fit.strategies import BinProblem, search_branches
+from astropolcal.calibration.fit.branches import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement

@@ -17,7 +17,7 @@ from astropy.modeling.fitting import (
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import Calibration, calibrate, calibrate_runs
-from astropolcal.calibration.fit.strategies import search_branches
+from astropolcal.calibration.fit.branches import search_branches
 from astropolcal.calibration.result.summary import to_dict
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.exceptions import (

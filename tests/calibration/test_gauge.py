@@ -7,8 +7,8 @@ import pytest
 from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
 
 from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal.calibration.fit.branches import BinProblem
 from astropolcal.calibration.fit.calibrate import describe_gauge, hold_silent
-from astropolcal.calibration.fit.strategies import BinProblem
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate

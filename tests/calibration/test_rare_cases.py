@@ -11,8 +11,8 @@ from astropy.table import QTable
 
 from astropolcal import calibrate, instruments, optics
 from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.fit.branches import BinProblem
 from astropolcal.calibration.fit.calibrate import open_parameters, settled
-from astropolcal.calibration.fit.strategies import BinProblem
 from astropolcal.calibration.noise import noise_from_null_channel, noise_from_replicates
 from astropolcal.calibration.noise.weighting import Weighting, outlying_data, robust_weighting
 from astropolcal.calibration.posterior import LogPosterior, Posterior

@@ -9,7 +9,7 @@ from scipy.optimize import brentq, least_squares
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate, target_accuracies
-from astropolcal.calibration.fit.strategies import BinProblem, search_branches
+from astropolcal.calibration.fit.branches import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import Weighting
 from astropolcal.chain import insert_optic, join
 from astropolcal.measurement import Measurement, Normal

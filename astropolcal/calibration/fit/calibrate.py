@@ -24,15 +24,13 @@ import numpy as np
 from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 
+from astropolcal.calibration.fit.branches import BinProblem, bent_valleys, undecided_signs
 from astropolcal.calibration.fit.strategies import (
-    BinProblem,
-    bent_valleys,
     joint,
     known_noises,
     outside_bounds,
     sequential,
     two_step,
-    undecided_signs,
     until_settled,
 )
 from astropolcal.calibration.identifiability.analysis import complete

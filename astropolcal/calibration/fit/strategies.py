@@ -1,11 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Fits in place: their starts, the way to the minimum, and fits in steps.
-
-Starts: with the global parameters held, the bins of a calibration are independent of each other. So
-all are searched at once: a coarse scan along the main retardance of each optic finds the valleys,
-and a Levenberg-Marquardt step that is batched over the bins polishes the best few. The result is a
-start for the joint fit, and later a check whether a bin sits in the wrong valley.
+Fits in place: the way to the minimum, and fits in steps.
 
 Steps, each of which holds what the steps before have found. Two-step: the polarized internal source
 as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
@@ -14,14 +9,22 @@ from the polarized source to the unpolarized one and to the star.
 
 import warnings
 from functools import partial
-from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
-from astropolcal.calibration.identifiability.sky import mean_errors, seen_with
+from astropolcal.calibration.fit.branches import (
+    CLEARLY_BETTER,
+    COARSE,
+    ROUNDED,
+    BinProblem,
+    least_bent,
+    other_axes,
+    other_laws,
+    search_branches,
+)
 from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
@@ -41,35 +44,12 @@ from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.parameters import are_outside, ties_among
-from astropolcal.progress import stage, steps
+from astropolcal.progress import stage
 
 __all__ = []
 
-_SCAN_STEP = np.deg2rad(15.0)
-_N_VALLEYS = 4
-_CLEARLY_BETTER = 0.99
-# phases of which the sign hangs on the hand of an optic, and those of an elliptical retarder
-_LINEAR, _ELLIPTICAL = "retardance", ("horizontal", "diagonal", "circular")
-# what else has a sign that data may not tell
-_SIGNED = ".diattenuation"
-# how the logarithm of sums of squares, and the square of the way from the start, count beside a
-# corner, the square of a bend over that of the ways (radian) and a little
-_DEAR, _PULL, _SMOOTH = 1.5, 0.1, 0.1
-# a branch may be so many times worse before all are fitted again, of more wavelengths than these;
-# equal but for rounding; what is outside the bounds comes last
-_FAR_WORSE, _COARSE, _SAME, _OUTSIDE = 30.0, 4, 1e-9, 1e3
-# phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
-_OTHER_SIGN = 0.2
-# a polish ends when no bin gains a thousandth in a step, or is about to
-_STILL_GAINING = 0.999
-_STUCK = 1.0
-# a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
-# many more are taken, until the end is known so well, and an error so many times too small grows
-_STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
-# so many other thicknesses to either side are tried; each step changes the data by so much (rms)
-_LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
-# starts whose sums of squares differ by less are the same
-_APART = 1.001
+# a branch may be so many times worse before all are fitted again; equal but for rounding
+_FAR_WORSE, _SAME = 30.0, 1e-9
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
@@ -78,419 +58,12 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
 # after so many evaluations
 _HOPELESS, _GLANCE = 100.0, 15
-# a sign is told by the data if chi-square, in units of the residuals, differs by more
-_UNDECIDED = 9.0
 # below this the sign of the start is as good
 _AS_GOOD = 2.0
-# so far an axis is turned for another start (radian)
-_TURNS = np.deg2rad([45.0, 22.5, -22.5])
-# of data without noise, residuals below this are rounding
-_ROUNDED = 1e-6
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
 # a wavelength in the branch of its neighbours may have up to so many times the sum of squares
 _WORTH = 3.0
-
-
-class BinProblem(Problem):
-    """The fit of the parameters given per wavelength, all bins at once.
-
-    As long as no noise is known against which they could weigh, priors are left out.
-    """
-
-    def __init__(self, measurement, weighting):
-        super().__init__(measurement, weighting)
-        self.noise = self.noise if weighting.is_known else 0.0
-        self.n_bins = len(measurement.wavelength)
-        # with a single bin every parameter belongs to it
-        self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
-        # the data of each bin, padded, and which of them are real
-        counts = np.bincount(measurement.bins, minlength=self.n_bins)
-        self._present = np.arange(counts.max()) < counts[:, None]
-        self._data = np.zeros(self._present.shape, dtype=int)
-        self._data[self._present] = np.argsort(measurement.bins, kind="stable")
-        starts = np.array([slot.start for slot in self.slots], dtype=int)
-        #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
-        self.elements = starts[:, None] + np.arange(self.n_bins)
-        self._below, self._above = self._low[self.elements], self._high[self.elements]
-        self._own = np.isin(np.arange(self._low.size), self.elements)
-        rows = {slot.name: row for row, slot in enumerate(self.slots)}
-        #: Priors that enter the costs of the bins, with the slot of each.
-        self.priors = [
-            (rows[slot.name], prior)
-            for slot, prior in measurement.free.priors
-            if slot.name in rows and not prior.is_flat
-        ]
-
-    def of_bins(self, vector):
-        """Return weighted residuals by bin, zero where a bin has fewer data."""
-        # all bins at once: a prediction costs as much for one bin as for all; a trial that lets no
-        # light pass is not better than another
-        with np.errstate(divide="ignore", invalid="ignore"):
-            predicted = self.measurement.predict(vector)
-            residual = (predicted - self.measurement.observed) * self.weights
-            return residual[self._data] * self._present
-
-    def costs(self, vector):
-        """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
-        costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
-        for row, prior in self.priors:
-            costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
-        return costs
-
-    def _step(self, vector, damping, kept=()):
-        """Return the per-wavelength parameters after a damped step, within their bounds.
-
-        Slots that are ``kept`` stay as they are.
-        """
-        jacobian = self.measurement.jacobian(vector, self._own) * self.weights
-        # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
-        blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
-        blocks *= self._present[:, None, :]
-        residual = self.of_bins(vector)
-        normal = blocks @ np.swapaxes(blocks, 1, 2)
-        gradient = np.einsum("bsd,bd->bs", blocks, residual)
-        for row, prior in self.priors:
-            value = vector[self.elements[row]]
-            slope = self.noise * prior.slope(value)
-            normal[:, row, row] += slope**2
-            gradient[:, row] += slope * self.noise * prior.residual(value)
-        here = vector[self.elements]
-        held = (
-            ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
-        ).T
-        held[:, list(kept)] = True
-        # a parameter that leans against its bound must not slow down the others
-        normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
-        gradient = np.where(held, 0.0, gradient)
-        size = normal.shape[-1]
-        diagonal = np.einsum("bss->bs", normal)
-        # relative to the diagonal (Marquardt), plus a little for what changes nothing
-        ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
-        step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
-        return np.clip(here - step[..., 0].T, self._below, self._above)
-
-    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING, kept=()):
-        """Improve the per-wavelength parameters by batched Levenberg-Marquardt.
-
-        Slots that are ``kept`` stay as they are. Returns the vector, where no bin is worse than at
-        the start, and the cost of each bin. It ends when no bin falls below the share
-        ``still_gaining`` of its cost in a step.
-        """
-        vector = vector.copy()
-        if not self.slots:
-            return vector, self.costs(vector)
-        costs, damping = self.costs(vector), np.full(self.n_bins, 1e-3)
-        for _ in range(iterations):
-            trial = vector.copy()
-            trial[self.elements] = self._step(vector, damping, kept)
-            new = self.costs(trial)
-            # each bin has its own damping, and takes or leaves its own step
-            better = new < costs
-            gaining = new < still_gaining * costs
-            vector[self.elements[:, better]] = trial[self.elements[:, better]]
-            costs = np.where(better, new, costs)
-            damping = np.where(better, damping / 5, damping * 8)
-            if not np.any(gaining | (~better & (damping < _STUCK))):
-                break
-        return vector, costs
-
-    def walk(self, row, step, walking, unit):
-        """Return how far bins get along a slot, others following, (n_slots, n_bins).
-
-        That is where the root of chi-square's rise is two units, one for each bin; from twice
-        ``step`` on, each time half as far again, and then halving, of the bins that are
-        ``walking``.
-        """
-        places, costs = self.elements[row], self.costs(self.solution)
-        here, inside = self.solution[self.elements], self.solution.copy()
-        reached, beyond = np.zeros(self.n_bins), np.full(self.n_bins, np.inf)
-        for _ in range(_STRIDES):
-            times = np.where(np.isinf(beyond), np.maximum(1.5 * reached, 2), (reached + beyond) / 2)
-            trial = inside.copy()
-            trial[places[walking]] = (here[row] + times * step)[walking]
-            trial = np.clip(trial, self._low, self._high)
-            trial, new = self.polish(trial, kept=[row])
-            low = np.sqrt(2 * (new - costs).clip(0)) < 2 * unit
-            inside[self.elements[:, walking & low]] = trial[self.elements[:, walking & low]]
-            at_end = (trial[places] <= self._below[row]) | (trial[places] >= self._above[row])
-            reached, beyond = np.where(low, times, reached), np.where(low, beyond, times)
-            walking = walking & ~(low & at_end) & (reached < _NEAR * beyond)
-            if not walking.any():
-                break
-        return inside[self.elements] - here
-
-    def main_retardances(self):
-        """Return the first slot of each optic that can make half a turn or more."""
-        found = {}
-        for row, slot in enumerate(self.slots):
-            optic, key = slot.name.split(".")
-            low, high = slot.canonical_bounds()
-            # only a phase that may go round has mirror branches; an
-            # orientation is within its bounds
-            is_phase = key != "theta" and slot.unit is not None and slot.unit.is_equivalent(u.rad)
-            if is_phase and high - low > np.pi:
-                found.setdefault(optic, (row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
-        return list(found.values())
-
-    def phases(self):
-        """Return the elements of phases that change their sign with the hand, (n_phases, n_bins).
-
-        With them whether a turn changes nothing.
-        """
-        keys = [slot.name.split(".")[1] for slot in self.slots]
-        rows = [row for row, key in enumerate(keys) if key in (_LINEAR, *_ELLIPTICAL[:2])]
-        known = [row for row, _ in self.priors]
-        turns = [keys[row] == _LINEAR and row not in known for row in rows]
-        return self.elements[rows], np.array(turns, dtype=bool)
-
-    def branches(self, vector):
-        """Return vectors that may fit as well: this one, of the other hand, and of other signs."""
-        places, _ = self.phases()
-        found, optics = [vector], {}
-        for row, slot in enumerate(self.slots):
-            optic, key = slot.name.split(".")
-            optics.setdefault(optic, {})[key] = row
-        for own in (places, *(self.elements[[row]] for row, *_ in self.main_retardances())):
-            other = vector.copy()
-            other[own] *= -1
-            found.append(np.clip(self.turned(other, own, vector[own]), self._low, self._high))
-        for rows in optics.values():
-            if set(_ELLIPTICAL) <= set(rows):
-                own = self.elements[[rows[key] for key in _ELLIPTICAL]]
-                for one in found[:2]:
-                    # turning by d about an axis is turning by d - 360 deg about it
-                    other, length = one.copy(), np.linalg.norm(one[own], axis=0)
-                    other[own] *= 1 - 2 * np.pi / np.where(length > 0, length, np.inf)
-                    found.append(np.clip(other, self._low, self._high))
-        return found
-
-    def in_line(self, vectors, towards):
-        """Return the vector of each bin's own, with whole turns that bring its phases in line.
-
-        ``vectors`` has one for each bin, (n_bins, n_free); the first is turned ``towards`` another.
-        """
-        vector, (places, turns) = vectors[0].copy(), self.phases()
-        for i, own in enumerate(vectors):
-            vector[self.elements[:, i]] = own[self.elements[:, i]]
-        columns = places[turns].T
-        for before, there in zip((None, *columns), columns, strict=False):
-            near = towards[there] if before is None else vector[before]
-            vector = self.turned(vector, there, near)
-        return vector
-
-    def turned(self, vector, elements, towards):
-        """Return a vector with whole turns that bring elements near others, within their bounds."""
-        options = vector[elements] + 2 * np.pi * np.arange(-2, 3).reshape(-1, *[1] * elements.ndim)
-        inside = (self._low[elements] <= options) & (options <= self._high[elements])
-        # within the bounds first
-        way = np.abs(options - towards) + np.where(inside, 0.0, _OUTSIDE)
-        turned = vector.copy()
-        turned[elements] = np.take_along_axis(options, np.argmin(way, axis=0)[None], axis=0)[0]
-        return turned
-
-    def valleys(self, vector, row, low, high):
-        """Return the best values of one slot from a scan over its bounds, (n_valleys, n_bins)."""
-        grid = np.arange(low, high + _SCAN_STEP / 2, _SCAN_STEP).clip(low, high)
-        trial = vector.copy()
-        costs = np.empty((grid.size, self.n_bins))
-        for i, value in enumerate(grid):
-            trial[self.elements[row]] = value
-            costs[i] = self.costs(trial)
-        padded = np.pad(costs, ((1, 1), (0, 0)), constant_values=np.inf)
-        # local minima of the scan; the ends count, as valleys may open beyond a bound
-        valley = (costs <= padded[:-2]) & (costs <= padded[2:])
-        order = np.argsort(np.where(valley, costs, np.inf), axis=0)[:_N_VALLEYS]
-        return grid[order]
-
-
-def search_branches(problem, vector, origin=None):
-    """Return a start in which every bin sits in its best valley, and which bins moved there.
-
-    A bin keeps its own valley unless another is clearly (1 %) better. Scans begin at the
-    per-wavelength parameters of ``origin``, by default at ``vector``.
-    """
-    # in the wrong valley a bin drives its other parameters astray: scan from the origin
-    start = vector.copy()
-    if origin is not None:
-        start[problem.elements] = origin[problem.elements]
-    best, costs = problem.polish(vector)
-    moved = np.zeros(problem.n_bins, dtype=bool)
-    retardances = problem.main_retardances()
-    for row, low, high in steps(retardances, "retardances"):
-        # one that was scanned before may have moved
-        for base in (start, best.copy()) if len(retardances) > 1 else (start,):
-            for values in problem.valleys(base, row, low, high):
-                trial = base.copy()
-                trial[problem.elements[row]] = values
-                trial, new = problem.polish(trial)
-                better = new < _CLEARLY_BETTER * costs
-                best[problem.elements[:, better]] = trial[problem.elements[:, better]]
-                costs = np.where(better, new, costs)
-                moved |= better
-    return best, moved
-
-
-def _between(wavelength, phases):
-    """Return phases between the two beside each, NaN at the ends of the spectrum."""
-    found, lam = np.full(len(phases), np.nan), wavelength
-    for i in range(1, len(phases) - 1):
-        found[i] = np.interp(lam[i], lam[[i - 1, i + 1]], phases[[i - 1, i + 1]])
-    return found
-
-
-def undecided_signs(measurement, view, stds):
-    """
-    Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
-
-    These are phases, and diattenuations, of which the other sign, all else of the wavelength
-    refitted, is less than three standard deviations worse, or better. Phases that fit exactly as
-    well are a mirror solution anyway; what is zero within three of its ``stds`` has no sign.
-    With them the mean squares of the errors of q and u that the other signs would be on sky, times
-    their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
-    zero where the phases beside tell the sign.
-    """
-    problem = BinProblem(measurement, measurement.weighting)
-    vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))
-    costs, total = problem.polish(vector)[1], np.sum(problem.residuals(vector) ** 2)
-    # no more degrees of freedom than are left
-    whole = max(measurement.n_data - measurement.free.size, 1)
-    count = problem._present.sum(axis=1) * min(whole / measurement.n_data, 1.0)
-    phases = {row for row, *_ in problem.main_retardances()}
-    signed = [row for row, slot in enumerate(problem.slots) if slot.name.endswith(_SIGNED)]
-    for row in (*phases, *signed):
-        slot, places = problem.slots[row], problem.elements[row]
-        trial = vector.copy()
-        trial[places] *= -1
-        if row in phases:
-            trial = problem.turned(trial, places, np.zeros(places.shape))
-        trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()))
-        moved = np.abs(trial[places] - vector[places])
-        if row in phases:
-            moved = np.abs(np.remainder(moved + np.pi, 2 * np.pi) - np.pi)
-        # what is less than its error is no sign
-        least = _OTHER_SIGN if row in phases else 3 * np.nan_to_num(stds[places], nan=np.inf)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = new / costs
-            # against the noise of the bin, and that of all
-            lost = np.minimum(count * np.log(ratio), whole * np.log1p(2 * (new - costs) / total))
-            # which may as well fit a little better
-            close = (np.abs(ratio - 1) > _ROUNDED) | (row not in phases)
-            close &= (lost < _UNDECIDED) & (moved > least) & (costs > 0)
-        for i in np.flatnonzero(close):
-            nm, value = 1e3 * measurement.wavelength[i], trial[places[i]] / slot.factor
-            shown = f"{value:.4g} {slot.unit or ''}".strip()
-            words = (
-                f"{slot.name} at {nm:.1f} nm: with the other sign, {shown}, the "
-                f"sum of squares is {ratio[i]:.2f} times as large: the data do not tell the sign"
-            )
-            found.append({"words": words, "sky": None})
-        beside = _between(measurement.wavelength, vector[places])
-        open_ = close & ~(4 * np.abs(vector[places] - beside) < np.abs(trial[places] - beside))
-        if view is not None and open_.any():
-            other = seen_with(view, measurement.put_back(trial))
-            chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
-            errors = np.maximum(errors, chance * mean_errors(view, other))
-    return found, errors
-
-
-def bent_valleys(measurement, whitened, stds):
-    """
-    Return how far parameters of a wavelength may go where chi-square is not a parabola.
-
-    Each is an element of the flat vector, a direction, (n_free,) in canonical units, and by how
-    much the element may fall and rise. The direction is as long as a standard error: half the way
-    at which chi-square has risen by four, common parameters held and all others of the wavelength
-    refitted, to the side where it is longer. Where scatter makes the stated error, ``stds``, larger
-    than that of white noise, chi-square has to rise by as much more.
-    """
-    problem, vector = BinProblem(measurement, measurement.weighting), measurement.vector()
-    level, scale, found = measurement.weighting.level, whitened.scale, []
-    with np.errstate(divide="ignore", invalid="ignore"):
-        times = stds / (level * np.sqrt(np.diag(whitened.covariance())))
-    known, half = whitened.given_others(np.isin(np.arange(vector.size), problem.elements))
-    errors, costs, null = np.linalg.norm(half, axis=0), problem.costs(vector), whitened.null()
-    for row, places in enumerate(problem.elements):
-        live = known[places] & (times[places] > 0) & (errors[places] > 0)
-        unit = np.where(live, level * times[places], np.inf)
-        size = np.where(live, errors[places], np.inf)
-        # the way of each bin is its own: all are gone at once
-        way = half.T @ (half[:, places] @ np.where(live, level * times[places] / size, 0.0))
-        ends = []
-        for sign in (1, -1):
-            there = np.clip(vector + 2 * sign * way, *measurement.free.bounds())
-            root = np.sqrt(2 * (problem.costs(there) - costs).clip(0)) / unit
-            bent = live & ~((_STRAIGHT < root) & (root < 4 / _STRAIGHT))
-            far = 2 * sign * way[problem.elements]
-            if bent.any():
-                step = sign * np.where(live, level * times[places] * errors[places], 0.0)
-                far = np.where(bent, problem.walk(row, step, bent, unit), far)
-            ends.append(far)
-        for i in np.flatnonzero(live):
-            far = max((end[:, i] for end in ends), key=lambda end: abs(end[row]))
-            if abs(far[row]) > 2 * _MATTERS * stds[places[i]]:
-                direction = np.zeros(vector.size)
-                direction[problem.elements[:, i]] = far / 2
-                # what is open stays open
-                direction -= null.T @ (null @ (direction / scale)) * scale
-                found.append((places[i], direction, sorted(end[row, i] for end in ends)))
-    return found
-
-
-def other_laws(problem, vector, origin):
-    """
-    Return sums of squares and starts with other thicknesses of each optic, best first.
-
-    A phase that is a law of a thickness has minima of its own, as one of a bin has. Thicknesses are
-    tried around those of ``origin``, beside the other common parameters of ``vector``, with each
-    bin roughly in its best valley, and in that of the origin.
-    """
-    slots = [
-        slot
-        for slot in problem.measurement.free.slots
-        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m)
-    ]
-    slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
-    low, high = problem.measurement.free.bounds()
-    base = vector.copy()
-    for slot in slots:
-        base[slot.start] = origin[slot.start]
-    for slot in {slot.name.partition(".")[0]: slot for slot in reversed(slots)}.values():
-        size = np.sqrt(np.mean(slopes[:, slot.start] ** 2))
-        for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
-            start = base.copy()
-            start[slot.start] += k * _LAW_STEP / size
-            if low[slot.start] <= start[slot.start] <= high[slot.start]:
-                start[problem.elements] = origin[problem.elements]
-                found.append(problem.polish(start, _ROUGH))
-                for row, *bounds in problem.main_retardances():
-                    start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
-                found.append(problem.polish(start, _ROUGH))
-    ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
-    # where the best valley is the nearest one, both are the same
-    return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
-
-
-def other_axes(problem, vector, origin):
-    """Return starts with other orientations of diattenuators, and all else of these at home.
-
-    Without diattenuation its axis changes no datum, so that a fit may end where both are wrong.
-    """
-    free, found = problem.measurement.free, []
-    low, high = free.bounds()
-    for slot in (slot for slot in free.slots if slot.name.endswith(".theta")):
-        optic = f"{slot.name.partition('.')[0]}."
-        may_turn = high[slot.start] - low[slot.start] > np.pi / 2
-        may_turn &= f"{optic}diattenuation" in free.by_name
-        for turn in _TURNS if may_turn else ():
-            start = vector.copy()
-            for own in (one for one in free.slots if one.name.startswith(optic)):
-                start[own.slice] = origin[own.slice]
-            # an axis that is turned by half a turn is the same
-            start[slot.slice] = (start[slot.slice] - low[slot.slice] + turn) % np.pi
-            start[slot.slice] += low[slot.slice]
-            found.append(np.clip(start, low, high))
-    return found
 
 
 # ---- fits in place --------------------------------------------------------------
@@ -584,7 +157,7 @@ def joint(measurement, weighting, fitter, search, options=None):
         return best
     found, problem = measurement.vector(), BinProblem(*few_frames(measurement, weighting))
     least = np.sum(problem.residuals(found) ** 2)
-    starts = [(start, _CLEARLY_BETTER) for start in other_axes(problem, found, origin)]
+    starts = [(start, CLEARLY_BETTER) for start in other_axes(problem, found, origin)]
     if stands_out(measurement):
         laws = other_laws(problem, found, origin)[:_STARTS]
         starts += [(start, _BETTER) for told, start in laws if told <= _HOPELESS * least]
@@ -625,7 +198,7 @@ def stands_out(measurement):
     """Whether the residuals are far above the noise that the frames show, or the table states."""
     residuals = measurement.residuals()
     for noise in known_noises(measurement):
-        pulls = residuals / np.maximum(noise.sigma_of_data, _ROUNDED)
+        pulls = residuals / np.maximum(noise.sigma_of_data, ROUNDED)
         return bool(np.mean(pulls**2) > _STANDS_OUT**2)
     return False
 
@@ -679,7 +252,7 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
         return outcome, weighting
     branches = problem.branches(found)
     # most often nothing would be smoother, even if all branches fitted alike
-    if not _least_bent(problem, branches, np.ones((len(branches), problem.n_bins)), origin).any():
+    if not least_bent(problem, branches, np.ones((len(branches), problem.n_bins)), origin).any():
         measurement.stand_at(problem.in_line([found] * problem.n_bins, origin))
         return outcome, weighting
     before = problem.costs(found)
@@ -687,16 +260,16 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
         if not np.allclose(problem.costs(branch), before, rtol=_SAME, atol=0):
             branches[k] = problem.polish(branch)[0]
     # of data without noise residuals are rounding
-    rounding = 0.5 * np.sum((_ROUNDED * problem.weights[problem._data] * problem._present) ** 2, 1)
+    rounding = 0.5 * np.sum((ROUNDED * problem.weights[problem._data] * problem._present) ** 2, 1)
     costs = np.array([problem.costs(branch) for branch in branches]) + rounding
     # of a bin without data all are the same
     ratio = np.where(costs[0] > 0, costs / np.where(costs[0] > 0, costs[0], 1.0), 1.0)
     equal = np.abs(ratio - 1) < _SAME
     # beside few wavelengths only what is as good
     good = np.exp(_AS_GOOD / problem._present.sum(axis=1).clip(1))
-    told = ratio < (_FAR_WORSE if problem.n_bins > _COARSE else good)
+    told = ratio < (_FAR_WORSE if problem.n_bins > COARSE else good)
     for allowed in (told | equal, equal):
-        chosen = _least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
+        chosen = least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
         measurement.stand_at(problem.in_line(np.array(branches)[chosen], origin))
         moved = ~equal[chosen, np.arange(problem.n_bins)]
         if not moved.any():
@@ -705,44 +278,6 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
         if np.all(problem.costs(measurement.vector())[moved] < (_WORTH * costs[0])[moved]):
             return again
     return outcome, weighting
-
-
-def _least_bent(problem, branches, ratio, origin):
-    """
-    Return the branch of each bin, (n_bins,), with which phases bend least over the wavelengths.
-
-    ``ratio`` has the sums of squares of branches over those of the first, (n_branches, n_bins). The
-    least sum of all is found by dynamic programming over pairs of neighbours.
-    """
-    places, turns = problem.phases()
-    # (n_bins, n_branches, n_phases)
-    phases = np.transpose([branch[places] for branch in branches], (2, 0, 1))
-    away = _PULL * np.sum(_shortest(phases - origin[places].T[:, None], turns) ** 2, axis=-1)
-    alone = _DEAR * np.log(ratio.T) + away
-    if problem.n_bins == 1:
-        return np.argmin(alone, axis=1)
-    # from each branch of a bin to each of the next
-    ways = [_shortest(after - one[:, None], turns) for one, after in pairwise(phases)]
-    gaps, before = np.diff(problem.measurement.wavelength), []
-    # few wavelengths are no measure of what is smooth
-    corner = float(problem.n_bins > _COARSE)
-    # least cost of each pair of branches of the last two bins
-    least = alone[0][:, None] + alone[1]
-    for i in range(1, len(ways)):
-        straight = ways[i - 1][:, :, None] * (gaps[i] / gaps[i - 1])
-        size = _SMOOTH + ways[i] ** 2 + straight**2
-        costs = least[:, :, None] + corner * np.sum((ways[i] - straight) ** 2 / size, axis=-1)
-        before.append(np.argmin(costs, axis=0))
-        least = np.min(costs, axis=0) + alone[i + 1]
-    path = list(np.unravel_index(np.argmin(least), least.shape))
-    for back in reversed(before):
-        path.insert(0, back[path[0], path[1]])
-    return np.array(path)
-
-
-def _shortest(ways, turns):
-    """Return ways between phases, (..., n_phases), less whole turns where these change nothing."""
-    return ways - np.where(turns, 2 * np.pi * np.rint(ways / (2 * np.pi)), 0.0)
 
 
 def few_frames(measurement, weighting):

@@ -110,7 +110,7 @@ def moved(earlier, later):
     known = [one.covariance for one in (earlier, later)]
     errors = [dict(zip(one.names, one.stds, strict=True)) for one in known]
     # what is open has no error to compare with
-    names = [n for n in known[0].names if min(each.get(n, np.nan) for each in errors) > 0]
+    names = [n for n in known[0].names if all(each.get(n, 0.0) > 0 for each in errors)]
     if not names:
         return {}
     values, matrix = [], 0.0

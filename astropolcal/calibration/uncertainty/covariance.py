@@ -428,7 +428,7 @@ def sandwich(measurement, whitened, weighting, middle, slack=None):
 def _of_few(measurement, whitened, weighting):
     """Return by how much errors grow where few degrees of freedom tell the noise.
 
-    Then two of them hold the truth in 95 of 100 cases, by the quantiles of Student's t.
+    By the quantiles of Student's t, for 95 of 100 cases within two errors if noise is even.
     """
     # a calibration is read where there is no scipy
     from scipy.special import stdtrit
