@@ -47,7 +47,7 @@ _MOST_PRESSED = 0.1
 # share by which optics may seem to measure more polarization than there is
 _MORE_LIGHT = 1e-3
 # alternatives are tried where double differences are off by more than this
-_WRONG_SIGN = 0.02
+_WRONG_SIGN = 0.01
 # or by more than this share of the signal and so many times the noise, as those of stars are
 _WRONG_SHARE, _ABOVE_NOISE = 0.1, 3.0
 # an alternative must lower the residuals to this share, and those within a tenth are aliases

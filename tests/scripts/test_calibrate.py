@@ -325,7 +325,7 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
 
     right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
     lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD)
-    assert lines[0].startswith("NOT USABLE AS IT IS: calibration_polarizer.theta is at its bound")
+    assert lines[0].startswith("NOT USABLE AS IT IS: the model misses the data by ")
     assert any("astropolcal diagnose" in line for line in lines[:5])
 
 

@@ -98,6 +98,8 @@ class BinProblem(Problem):
             costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
         return costs
 
+    # where no light passes there is no slope, and the step is taken back
+    @np.errstate(divide="ignore", invalid="ignore")
     def _step(self, vector, damping, kept=()):
         """Return the per-wavelength parameters after a damped step, within their bounds.
 

@@ -262,8 +262,9 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     # of data without noise residuals are rounding
     rounding = 0.5 * np.sum((ROUNDED * problem.weights[problem._data] * problem._present) ** 2, 1)
     costs = np.array([problem.costs(branch) for branch in branches]) + rounding
-    # of a bin without data all are the same
-    ratio = np.where(costs[0] > 0, costs / np.where(costs[0] > 0, costs[0], 1.0), 1.0)
+    # of a bin without data, which a prior may still tell to rounding, all are the same
+    ratio = np.ones(costs.shape)
+    np.divide(costs, costs[0], out=ratio, where=rounding > 0)
     equal = np.abs(ratio - 1) < _SAME
     # beside few wavelengths only what is as good
     good = np.exp(_AS_GOOD / problem._present.sum(axis=1).clip(1))

@@ -30,8 +30,8 @@ _NO_MIRROR = 30 * u.percent
 _UNLIKELY = 0.01
 # the mounts are known better than this before any fit, and it turns 6 % of Q into U
 _ABSURD_ANGLE = 10 * u.deg
-# real data of three instruments leave 0.1 to 1.5 %, wrong minima more, exchanged beams leave tens
-_MISFIT = 2 * u.percent
+# real data of three instruments leave 0.1 to 1.5 %, wrong minima and exchanged beams mostly more
+_MISFIT = 1.5 * u.percent
 # a turn or a change of the DoLP by less, in degree or percent of itself, does not show
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
@@ -120,7 +120,8 @@ def verdict(calibration, targets=TARGETS):
     if not reasons:
         excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
-        cautions += [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
+        if excess > _CLEARLY:
+            cautions.append(f"residuals {excess:.2g} times the noise (astropolcal diagnose: why)")
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
