@@ -450,9 +450,9 @@ def test_a_nominal_fit_ends_where_its_last_steps_gain_next_to_nothing(monkeypatc
 
 def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
     cases = [
-        # two percent is a sign that may be wrong, whatever the signal
-        (0.9, 0.021, 1e-3, True),
-        (0.9, 0.019, 1e-3, False),
+        # one percent is a sign that may be wrong, whatever the signal
+        (0.9, 0.011, 1e-3, True),
+        (0.9, 0.009, 1e-3, False),
         # of a small signal a tenth is enough, if it is above the noise
         (0.01, 0.004, 1e-3, True),
         (0.01, 0.004, 2e-3, False),
