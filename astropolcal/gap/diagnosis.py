@@ -12,10 +12,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import expit
 
 from astropolcal import instruments
 from astropolcal.exceptions import GapError, InstrumentError
-from astropolcal.gap.attribution import Candidate
+from astropolcal.gap.attribution import ENOUGH, Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.frames import (
@@ -41,6 +42,9 @@ __all__ = ["Cause", "Diagnosis", "diagnose"]
 _SURE, _LIKELY = 0.9, 0.5
 # of an alternative beside which nothing is left
 _SURE_SIGN = 0.99
+# an alternative that is less probable than causes in its place is none; so probable is, at least,
+# that causes are of the table
+_HALF, _LEAST = 0.5, 1e-6
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
 # too large: by the roughness of a large gap, before its causes were known
 _TOO_QUIET, _TOO_PROBABLE = 0.8, 0.999
@@ -330,21 +334,17 @@ def diagnose(
         return select(model, smooth, groups, say, cells=cells, changes=changes)
 
     nominal, base = _without(nominal, base, wrong, say)
-    say("looking for causes")
-    selection = chosen(base)
-    if right := not_off(selection.model, whole[1].observations, single):
-        say("looking for causes again: they explain data that were left out")
-        kept = [fault for fault in single if fault not in right]
-        models = _without(*whole, kept + wrong, say)
-        again = chosen(models[1])
-        # unless one of them is off after all
-        if again.model.p_value > min(REMAINDER, selection.model.p_value):
-            (nominal, base), selection, single = models, again, kept
-    left = selection.model
-    if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
-        say("looking for causes again: they leave less than what was taken for noise")
-        nominal = base = _with_noise_of(base, selection)
-        selection = chosen(base)
+    models, selection, single = _chosen(chosen, whole, (nominal, base), single, wrong, say)
+    nominal, base = models
+    if exchanged and (selection.groups or selection.model.p_value < REMAINDER):
+        say("looking for causes in place of the alternative")
+        share = _share_of(selection, chosen(_without_alternative(nominal, base)))
+        exchanged[0] = exchanged[0].changed(left=max(exchanged[0].left, 1 - share))
+        rest = [effect for effect in library if effect.kind != "discrete"]
+        if share < _HALF and rest:
+            more = {"cells": cells, "changes": changes, "cross_validate": cross_validate}
+            more |= {"nested": nested, "progress": progress}
+            return diagnose(calibration, observations, effects=rest, **more)
     # what dims a frame may be a cause of the gap, and then the lamp did not
     frames = edges + single + wrong
     frames += lamp_faults(selection.model, frames)
@@ -374,6 +374,44 @@ def _without(nominal, base, faults, say):
     # with noise and effects of its own
     again = Model(fresh.problem, fresh.fit, base.added, start=base.start)
     return (again if nominal is base else nominal), again
+
+
+def _chosen(chosen, whole, models, single, wrong, say):
+    """Return models and causes, and the data that are left out after all; see `_without`."""
+    say("looking for causes")
+    selection = chosen(models[1])
+    if right := not_off(selection.model, whole[1].observations, single):
+        say("looking for causes again: they explain data that were left out")
+        kept = [fault for fault in single if fault not in right]
+        others = _without(*whole, kept + wrong, say)
+        again = chosen(others[1])
+        # unless one of them is off after all
+        if again.model.p_value > min(REMAINDER, selection.model.p_value):
+            models, selection, single = others, again, kept
+    left, (nominal, base) = selection.model, models
+    if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
+        say("looking for causes again: they leave less than what was taken for noise")
+        nominal = base = _with_noise_of(base, selection)
+        selection = chosen(base)
+    return (nominal, base), selection, single
+
+
+def _without_alternative(nominal, base):
+    """Return the nominal model, fitted to the frames and with the noise of an alternative's."""
+    problem = GapProblem(nominal.chains, base.observations, like=base.problem)
+    return Model(problem, problem.fit(nominal.fit.coefficients), {})
+
+
+def _share_of(selection, other):
+    """Return the probability of an alternative with causes, where causes alone may be true."""
+    temper = max(1.0, min(one.model.mean_square for one in (selection, other)))
+
+    def evidence(one):
+        cost = sum(ENOUGH + group.best.cost(temper) for group in one.groups)
+        unlisted = np.log(max(1 - one.unlisted, _LEAST))
+        return unlisted - cost - 0.5 * one.model.fit.chi2 / temper
+
+    return float(expit(evidence(selection) - ENOUGH - evidence(other)))
 
 
 def _with_noise_of(base, selection):

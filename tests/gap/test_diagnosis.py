@@ -13,7 +13,7 @@ from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.chain import insert_optic, leaves
+from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
@@ -388,6 +388,21 @@ def test_a_star_tells_what_a_chain_without_free_parameters_lacks():
     measured = found.chains[0]["gap_m3_diattenuation"].diattenuation.value
     np.testing.assert_allclose(measured, chain["m3"].diattenuation.value, atol=3e-4)
     assert found.gap_after_percent < 0.2 * found.gap_before_percent
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_is_not_told_where_one_cause_does_better():
+    """The polarization of a standard is a little off: halved plate angles explain most of it."""
+    source = "polarized standard star"
+    chain = star_chain(source, target="HD 30675", derotator="linear")
+    star, *behind = leaves(chain)
+    q, stokes_u = star.q.value + 0.003, star.u.value - 0.0052
+    true = join([optics.PolarizedSource(q=q, u=stokes_u, name=star.name), *behind])
+    how = {"target": "HD 30675", "parallactic": (20, 50), "flux": 1e7, "seed": 3}
+    found = diagnose(held(chain), observe_star(true, 6, source, **how))
+    assert found.verdict == "named"
+    # which the data do not tell apart
+    assert found.causes[0].name in ("standard_polarization", "sky_background")
 
 
 # ---- bad input ---------------------------------------------------------------------------------
