@@ -329,16 +329,18 @@ def diagnose(
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
         wrong = []
 
-    def chosen(model):
+    def chosen(model, **how):
         groups = frame_groups(model.observations) if cross_validate else None
-        return select(model, smooth, groups, say, cells=cells, changes=changes)
+        return select(model, smooth, groups, say, cells=cells, changes=changes, **how)
 
     nominal, base = _without(nominal, base, wrong, say)
     models, selection, single = _chosen(chosen, whole, (nominal, base), single, wrong, say)
     nominal, base = models
     if exchanged and (selection.groups or selection.model.p_value < REMAINDER):
         say("looking for causes in place of the alternative")
-        share = _share_of(selection, chosen(_without_alternative(nominal, base)))
+        # more causes than the alternative is one of are less probable
+        most = 1 + len(selection.groups)
+        share = _share_of(selection, chosen(_without_alternative(nominal, base), most=most))
         exchanged[0] = exchanged[0].changed(left=max(exchanged[0].left, 1 - share))
         rest = [effect for effect in library if effect.kind != "discrete"]
         if share < _HALF and rest:
