@@ -45,8 +45,9 @@ _SURE_SIGN = 0.99
 # an alternative that is less probable than causes in its place is none; so probable is, at least,
 # that causes are of the table
 _HALF, _LEAST = 0.5, 1e-6
-# where it needs more causes beside it, none is sure, and others in its place are not asked for
-_FEW = 4
+# where it leaves no more of the double differences, and needs more causes beside it, of which none
+# is sure, others in its place are not asked for
+_LITTLE, _FEW = 0.05, 4
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
 # too large: by the roughness of a large gap, before its causes were known
 _TOO_QUIET, _TOO_PROBABLE = 0.8, 0.999
@@ -339,7 +340,8 @@ def diagnose(
     models, selection, single = _chosen(chosen, whole, (nominal, base), single, wrong, say)
     nominal, base = models
     is_all = not selection.groups and selection.model.p_value > REMAINDER
-    if exchanged and not is_all and len(selection.groups) <= _FEW:
+    few = len(selection.groups) <= _FEW
+    if exchanged and not is_all and (few or exchanged[0].left > _LITTLE):
         say("looking for causes in place of the alternative")
         # more causes than the alternative is one of are less probable
         most = 1 + len(selection.groups)
