@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling.fitting import TRFLSQFitter
 
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.branches import BinProblem, search_branches
@@ -59,7 +58,7 @@ _SETTLED = 0.25
 _LEAST_PART, _FITS, _SUDDEN = 4, 0.1, 4
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
-_FEW, _EVALUATIONS = 3, 30
+_FEW = 3
 # alternatives that leave so many times as much as the best, after so many searches and steps, are
 # not fitted in full, which mostly lowers the misfit by less than 10 % more; below this share of
 # what is asked all are as good
@@ -411,14 +410,7 @@ def _lower(problem, vector, found):
     return other if other.converged and other.chi2 < found.chi2 else found
 
 
-class _Glance(TRFLSQFitter):
-    """A fitter that gives up soon: what fits gets there, what does not gets nowhere."""
-
-    def __call__(self, *arguments, maxiter, **settings):
-        return super().__call__(*arguments, maxiter=min(maxiter, _EVALUATIONS), **settings)
-
-
-def nominal_calibration(chains, observations, fitter=None):
+def nominal_calibration(chains, observations):
     """
     Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
     """
@@ -430,7 +422,7 @@ def nominal_calibration(chains, observations, fitter=None):
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         instrument = next((o.instrument for o in observations if o.instrument), None)
-        options = {"cross_validate": False, "instrument": instrument, "fitter": fitter}
+        options = {"cross_validate": False, "instrument": instrument}
         return calibrate(list(chains), list(observations), **options)
 
 
@@ -525,7 +517,7 @@ def _fitting(chains, before, after, whole, order, misfit):
         # all of them may be masked
         with suppress(ObservationError):
             kept = [*before, whole.select(np.sort(order[:n])), *after]
-            return _tried_misfit(chains, kept) / misfit
+            return _rough_misfit(chains, kept) / misfit
         return np.inf
 
     good, bad = len(order) // _LEAST_PART, len(order)
@@ -594,7 +586,7 @@ def _tried_misfit(chains, observations):
     # of what is not the answer a user is not warned
     with warnings.catch_warnings(), suppress(FitError, ObservationError):
         warnings.simplefilter("ignore", AstropolcalWarning)
-        return _misfit(nominal_calibration(chains, observations, _Glance()))
+        return _misfit(nominal_calibration(chains, observations))
     return np.inf
 
 
