@@ -42,9 +42,8 @@ __all__ = ["Cause", "Diagnosis", "diagnose"]
 _SURE, _LIKELY = 0.9, 0.5
 # of an alternative beside which nothing is left
 _SURE_SIGN = 0.99
-# an alternative that is less probable than causes in its place is none; so probable is, at least,
-# that causes are of the table
-_HALF, _LEAST = 0.5, 1e-6
+# so probable is, at least, that causes are of the table
+_LEAST = 1e-6
 # where it leaves no more of the double differences, and needs more causes beside it, of which none
 # is sure, others in its place are not asked for
 _LITTLE, _FEW = 0.05, 4
@@ -317,6 +316,14 @@ def diagnose(
     if cross_validate:
         # too few frames are refused before anything is fitted
         frame_groups(observations)
+    how = {"cells": cells, "changes": changes, "cross_validate": cross_validate, "nested": nested}
+    found = _diagnosed(calibration, observations, library, say, how)
+    found.seconds = time.perf_counter() - started
+    return found
+
+
+def _diagnosed(calibration, observations, library, say, how):
+    """Return the diagnosis, without its time; see `diagnose` for ``how``."""
     say("fitting the nominal model")
     nominal, base, exchanged, where = starting_model(calibration, observations, library, say)
     edges = unknown_angles(base.observations, exchanged[0]) if exchanged else []
@@ -329,37 +336,29 @@ def diagnose(
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
     smooth = _continuous(library, base)
-    if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
+    if len(wrong) > 1 and explained_by_one(base, smooth, cells=how["cells"]):
         wrong = []
 
-    def chosen(model, **how):
-        groups = frame_groups(model.observations) if cross_validate else None
-        return select(model, smooth, groups, say, cells=cells, changes=changes, **how)
+    def chosen(model, **more):
+        groups = frame_groups(model.observations) if how["cross_validate"] else None
+        more |= {"cells": how["cells"], "changes": how["changes"]}
+        return select(model, smooth, groups, say, **more)
 
-    nominal, base = _without(nominal, base, wrong, say)
-    models, selection, single = _chosen(chosen, whole, (nominal, base), single, wrong, say)
-    nominal, base = models
-    is_all = not selection.groups and selection.model.p_value > REMAINDER
-    few = len(selection.groups) <= _FEW
-    if exchanged and not is_all and (few or exchanged[0].left > _LITTLE):
-        say("looking for causes in place of the alternative")
-        # more causes than the alternative is one of are less probable
-        most = 1 + len(selection.groups)
-        share = _share_of(selection, chosen(_without_alternative(nominal, base), most=most))
+    models = _without(nominal, base, wrong, say)
+    (nominal, base), selection, single = _selected(chosen, whole, models, single, wrong, say)
+    if exchanged:
+        share = _share_of(exchanged[0], nominal, base, selection, chosen, say)
+        if share < 0.5:
+            rest = [effect for effect in library if effect.kind != "discrete"]
+            return _diagnosed(calibration, observations, rest, say, how)
         exchanged[0] = exchanged[0].changed(left=max(exchanged[0].left, 1 - share))
-        rest = [effect for effect in library if effect.kind != "discrete"]
-        if share < _HALF and rest:
-            more = {"cells": cells, "changes": changes, "cross_validate": cross_validate}
-            more |= {"nested": nested, "progress": progress}
-            return diagnose(calibration, observations, effects=rest, **more)
     # what dims a frame may be a cause of the gap, and then the lamp did not
     frames = edges + single + wrong
     frames += lamp_faults(selection.model, frames)
-    found = _conclude(nominal, base, exchanged, selection, frames, started)
-    found.settings |= {"changes": changes, "fails": where}
-    if nested and cross_validate:
-        found.nested = _nested(base, smooth, say, cells)
-        found.seconds = time.perf_counter() - started
+    found = _conclude(nominal, base, exchanged, selection, frames)
+    found.settings |= {"changes": how["changes"], "fails": where}
+    if how["nested"] and how["cross_validate"]:
+        found.nested = _nested(base, smooth, say, how["cells"])
     return found
 
 
@@ -383,7 +382,7 @@ def _without(nominal, base, faults, say):
     return (again if nominal is base else nominal), again
 
 
-def _chosen(chosen, whole, models, single, wrong, say):
+def _selected(chosen, whole, models, single, wrong, say):
     """Return models and causes, and the data that are left out after all; see `_without`."""
     say("looking for causes")
     selection = chosen(models[1])
@@ -403,14 +402,18 @@ def _chosen(chosen, whole, models, single, wrong, say):
     return (nominal, base), selection, single
 
 
-def _without_alternative(nominal, base):
-    """Return the nominal model, fitted to the frames and with the noise of an alternative's."""
+def _share_of(effect, nominal, base, selection, chosen, say):
+    """Return the probability of an alternative with its causes, where causes alone may be true."""
+    count = len(selection.groups)
+    is_all = not count and selection.model.p_value > REMAINDER
+    if is_all or (count > _FEW and effect.left < _LITTLE):
+        return 1.0
+    say("looking for causes in place of the alternative")
+    # fitted to the same frames, and with the same noise
     problem = GapProblem(nominal.chains, base.observations, like=base.problem)
-    return Model(problem, problem.fit(nominal.fit.coefficients), {})
-
-
-def _share_of(selection, other):
-    """Return the probability of an alternative with causes, where causes alone may be true."""
+    other = Model(problem, problem.fit(nominal.fit.coefficients), {})
+    # more causes than the alternative is one of are less probable
+    other = chosen(other, most=1 + count)
     temper = max(1.0, min(one.model.mean_square for one in (selection, other)))
 
     def evidence(one):
@@ -482,7 +485,7 @@ def _called(name):
 # ---- conclusion --------------------------------------------------------------------------------
 
 
-def _conclude(nominal, base, exchanged, selection, frames, started):
+def _conclude(nominal, base, exchanged, selection, frames):
     improved = selection.model
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
@@ -498,7 +501,6 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     found = Diagnosis(verdict, causes=causes, scan=selection.scan, held_out=told, **models)
     found.frames, found.courses = frames, selection.courses
     found.settings["unlisted"] = selection.unlisted
-    found.seconds = time.perf_counter() - started
     return found
 
 

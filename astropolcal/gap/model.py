@@ -14,6 +14,7 @@ from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.fit.branches import BinProblem, search_branches
 from astropolcal.calibration.fit.strategies import few_frames
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.calibration.system import at_wavelengths
 from astropolcal.calibration.validation.cross_validation import chi2_above
@@ -541,11 +542,7 @@ def _set_apart(chains):
 
 
 def _tried(chains, observations, effects, say, known, misfit):
-    """
-    Return misfit and effect of alternatives at a few wavelengths, and known ones, best first.
-
-    ``misfit`` is that of the nominal model.
-    """
+    """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
     few, glanced, found = thinned(chains, observations, _FEW), [], list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
@@ -570,14 +567,16 @@ def _rough_misfit(chains, observations):
     with warnings.catch_warnings(), suppress(ObservationError):
         warnings.simplefilter("ignore", AstropolcalWarning)
         measurement = Measurement(chains, observations)
-        vector = measurement.vector()
-        if vector.size:
+        start = vector = np.clip(measurement.vector(), *measurement.free.bounds())
+        # so few data fit anything
+        if start.size > measurement.n_data:
+            return np.inf
+        if start.size:
             problem = BinProblem(*few_frames(measurement, first_weighting(measurement, None)))
-            start = vector = np.clip(vector, *measurement.free.bounds())
             for _ in range(_SEARCHES):
                 vector = search_branches(problem, vector, start)[0]
                 vector = problem.fit(vector, evaluations=_STEPS)[0]
-        return float(np.sqrt(np.mean(np.square(measurement.residuals(vector)))))
+        return rms(measurement.residuals(vector))
     return np.inf
 
 
@@ -600,7 +599,7 @@ def _read(effect, chains, observations):
 
 def _misfit(calibration):
     """Return the root mean square residual of the double differences, in polarization."""
-    return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
+    return rms(calibration.measurement.residuals())
 
 
 def _may_be_wrong(calibration):

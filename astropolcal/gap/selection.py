@@ -179,7 +179,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     """Choose the causes that a model lacks, of one run no more than ``most``."""
     first, runs = _scanned(base, library, cells), count_runs(base.problem)
     task = _Task(base, library, cells, groups, say, has_runs=runs > 1)
-    most = most if runs < 2 or not cells else _MOST // 2
+    most = min(most, _MOST) if runs < 2 or not cells else _MOST // 2
     best = _search(task, _State(base), first, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
         best = _apart(task, first)

@@ -14,6 +14,7 @@ from astropolcal.gap import diagnose
 from astropolcal.gap.effects import EFFECTS
 from astropolcal.gap.frames import lamp_faults, suspect_frames
 from astropolcal.gap.model import nominal_model
+from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 
@@ -141,3 +142,17 @@ def test_dim_frames_that_a_cause_explains_are_not_the_lamps():
     found = diagnose(chain, type(data).from_table(table, name="night"))
     assert found.causes[0].name == "detector_nonlinearity"
     assert found.frames == []
+
+
+@pytest.mark.slow
+def test_no_part_of_a_run_is_said_to_fit_that_fits_anything():
+    """A quarter of the frames has fewer data than parameters; all are 20 % off at random."""
+    grid = [1200, 1600, 2000] * u.nm
+    chain = instruments.get("charis").chain(wavelength=grid, derotator="elliptical")
+    frames = half_wave_plate_cycles(derotator=[45, 82.5, 120] * u.deg)
+    table = simulate(chain, grid, frames, seed=1, name="lamp").to_table()
+    off = np.exp(0.2 * np.random.default_rng(1).normal(size=len(table)))
+    table["flux_right"] *= off
+    table["flux_left"] /= off
+    found = diagnose(chain, Observations.from_table(table, name="lamp"))
+    assert (found.verdict, found.settings["fails"]) == ("unexplained", "")
