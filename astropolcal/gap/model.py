@@ -19,7 +19,7 @@ from astropolcal.calibration.noise.weighting import first_weighting
 from astropolcal.calibration.system import at_wavelengths
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import AstropolcalWarning, FitError, GapError, ObservationError
+from astropolcal.exceptions import AstropolcalWarning, GapError, ObservationError
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
@@ -60,10 +60,9 @@ _LEAST_PART, _FITS, _SUDDEN = 4, 0.1, 4
 # fits of what gives the same data end with misfits that differ by a smaller share
 _EQUAL = 1e-3
 _FEW = 3
-# alternatives that leave so many times as much as the best, after so many searches and steps, are
-# not fitted in full, which mostly lowers the misfit by less than 10 % more; below this share of
-# what is asked all are as good
-_FAR_OFF, _SEARCHES, _STEPS, _FLOOR = 1.5, 2, 15, 0.1
+# what alternatives leave is told after so many searches and steps: further ones lower it by less
+# than a quarter, mostly
+_SEARCHES, _STEPS = 2, 15
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -469,22 +468,21 @@ def _alternatives(chains, observations, made, discrete, say):
     misread = [e for e in discrete if isinstance(e, Misread)]
     for some in ([e for e in discrete if e not in misread], misread):
         if not found or found[0][0] > _SETTLED * misfit:
-            found = _tried(chains, observations, some, say, found, misfit)
+            found = _tried(chains, observations, some, say, found)
     settled = bool(found) and found[0][0] <= _SETTLED * misfit
     where = ""
     if not settled:
         # or in a part of the run: there is a frame too many, or one was lost
         *parts, where = _parts(chains, observations, misfit, say)
         partly = [e.in_run(where) for e in discrete if where and e.may_be_in_part]
-        inside = _tried(*parts, partly, say, [], misfit)
-        inside = [one for one in inside if one[0] < _SETTLED * misfit]
+        inside = [one for one in _tried(*parts, partly, say, []) if one[0] < _SETTLED * misfit]
         if inside:
             return inside, (*parts, nominal_calibration(*parts)), where
     if len(observations) > 1 and (not settled or found[0][1] in misread):
         # all but one of the tables may be right
         some = [found[0][1]] if settled else misread
         apart = [e.in_run(o.name) for e in some for o in observations]
-        found = _tried(chains, observations, apart, say, found, misfit)
+        found = _tried(chains, observations, apart, say, found)
     return found, asked, where
 
 
@@ -518,7 +516,7 @@ def _fitting(chains, before, after, whole, order, misfit):
         # all of them may be masked
         with suppress(ObservationError):
             kept = [*before, whole.select(np.sort(order[:n])), *after]
-            return _rough_misfit(chains, kept) / misfit
+            return _tried_misfit(chains, kept) / misfit
         return np.inf
 
     good, bad = len(order) // _LEAST_PART, len(order)
@@ -541,19 +539,13 @@ def _set_apart(chains):
     return [join(optics) for optics in found] if known else chains
 
 
-def _tried(chains, observations, effects, say, known, misfit):
+def _tried(chains, observations, effects, say, known):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
-    few, glanced, found = thinned(chains, observations, _FEW), [], list(known)
+    few, found = thinned(chains, observations, _FEW), list(known)
     for effect in effects:
         say(f"trying: {effect.title}")
         for one in effect.ways():
-            read = _read(one, *few)
-            glanced.append((_rough_misfit(*read), one, read))
-    # most alternatives are far from what others leave, or from what they are asked to
-    asked, least = _FAR_BETTER * misfit, min((left for left, *_ in glanced), default=np.inf)
-    for left, one, read in glanced:
-        if left <= _FAR_OFF * np.clip(least, _FLOOR * asked, asked):
-            found.append((_tried_misfit(*read), one))
+            found.append((_tried_misfit(*_read(one, *few)), one))
     # where it leaves too few frames it is not asked for
     found = [one for one in found if np.isfinite(one[0])]
     misfits, best = np.array([misfit for misfit, _ in found]), {}
@@ -562,8 +554,9 @@ def _tried(chains, observations, effects, say, known, misfit):
     return list(best.values())
 
 
-def _rough_misfit(chains, observations):
+def _tried_misfit(chains, observations):
     """Return the misfit after a few steps of everything, infinite where frames are too few."""
+    # of what is not the answer a user is not warned
     with warnings.catch_warnings(), suppress(ObservationError):
         warnings.simplefilter("ignore", AstropolcalWarning)
         measurement = Measurement(chains, observations)
@@ -577,15 +570,6 @@ def _rough_misfit(chains, observations):
                 vector = search_branches(problem, vector, start)[0]
                 vector = problem.fit(vector, evaluations=_STEPS)[0]
         return rms(measurement.residuals(vector))
-    return np.inf
-
-
-def _tried_misfit(chains, observations):
-    """Return the misfit of a fit on the way, infinite where frames are too few."""
-    # of what is not the answer a user is not warned
-    with warnings.catch_warnings(), suppress(FitError, ObservationError):
-        warnings.simplefilter("ignore", AstropolcalWarning)
-        return _misfit(nominal_calibration(chains, observations))
     return np.inf
 
 
