@@ -472,6 +472,7 @@ class Forecast:
             if {name.split(".")[0], tie.source.split(".")[0]} <= own
         }
         how = {"laws": self.problem.laws, "neutral": self.problem.neutral}
+        how["wavelength"] = self.problem.wavelength * u.um
         problem = GapProblem([chain], [observations], ties=ties, **how)
         _settle_noise(problem.channels[0], self.model.problem.channels[exposure.dataset], exposure)
         slopes = problem.jacobian(problem.start)[problem.segments[0]]
@@ -577,7 +578,8 @@ def _hypothetical(base, exposure):
         states = np.tile(exposure.states, exposure.n_angles)
         frames[MODULATOR] = (states == STATES[1]).astype(float)
     how = {"flux": exposure.lamp * measured / usual, "name": f"next {base.observations[i].name}"}
-    return simulate(join(chain), problem.wavelength * u.um, frames, noise=False, **how)
+    wavelength = problem.wavelength[problem.datasets[i].bins] * u.um
+    return simulate(join(chain), wavelength, frames, noise=False, **how)
 
 
 def _middle(channel, values):

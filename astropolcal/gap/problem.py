@@ -71,8 +71,8 @@ class GapProblem:
     normal prior on their coefficients; ``neutral``, the value about which law, prior and limits
     are (0 if none is given); and ``limits``, the most by which they may differ from it, where they
     follow no law: those are held to the bounds of their optic. All by ``"optic.parameter"``,
-    canonical. Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be
-    called.
+    canonical. ``wavelength`` is a grid with more than those of the datasets. Noise, lamp and
+    fluxes are those of a problem ``like`` it, or `settle_noise` must be called.
     """
 
     def __init__(
@@ -86,6 +86,7 @@ class GapProblem:
         neutral=None,
         limits=None,
         like=None,
+        wavelength=None,
         copy=True,
     ):
         self.ties, self.laws, self.priors = dict(ties or {}), dict(laws or {}), dict(priors or {})
@@ -105,6 +106,7 @@ class GapProblem:
         how = {"observable": "intensity" if single else "normalized_single_difference"}
         seen = zip(chains, observations, self.fluxes, strict=True)
         how |= {"ties": ties, "copy": copy, "positions": [_positions(*each) for each in seen]}
+        how["wavelength"] = wavelength
         self.measurement = Measurement(chains, observations, **how)
         self.datasets = self.measurement.datasets
         self._flickering = [self._with_flicker(*each) for each in enumerate(chains)]

@@ -79,10 +79,6 @@ class Dataset:
         self.n_free = free.size
         # indices of this dataset's wavelengths on the grid common to all, (n_wavelengths,)
         self.bins = bins_on_grid(observations, wavelength)
-        #: Whether the wavelengths of the table do not ascend.
-        self.descends = bool((np.diff(self.bins) < 0).any())
-        if self.descends:
-            free.check_order(observations.name)
         self.frames = self.observations.groups(self.observable.frames_per_datum)
         columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)

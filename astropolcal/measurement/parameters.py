@@ -484,18 +484,6 @@ class FreeParameters:
                         "optic.resampled(wavelength) interpolates them"
                     )
 
-    def check_order(self, table):
-        """Refuse values that differ, where nobody has said at which wavelength each is."""
-        given = [(name, p.value) for name, several in self._table.items() for p in several]
-        given += [(slot.name, prior.mode + prior.width) for slot, prior in self.priors]
-        given += [(name, offset) for name, (_, _, offset) in self._followers.items()]
-        for name, value in given:
-            if np.ptp(value) > 0 and self._table[name][0].grid is None:
-                raise ParameterError(
-                    f"{table}: the wavelengths do not ascend, and nobody has said at which {name} "
-                    f"has its values; set {name}.wavelength, ascending"
-                )
-
     def put_wavelengths(self, wavelength):
         """Tell parameters with one value per wavelength (um) which these are."""
         for parameters in self._table.values():

@@ -106,6 +106,15 @@ def build_grid(table, label):
     _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
     unit = table["wavelength"].unit
     by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
+    order = np.argsort(by_bin)
+    if not np.array_equal(order, np.arange(len(order))):
+        warnings.warn(
+            f"{label}: the wavelengths of its bins do not ascend; here they do, and values per "
+            "wavelength have to",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+        bin_index, by_bin = np.argsort(order)[bin_index], by_bin[order]
     # the columns that belong to frames, after checking that they do
     frames = QTable({"frame": frame[first]})
     for name in table.colnames:

@@ -3,6 +3,7 @@
 
 import dataclasses
 import hashlib
+import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -10,7 +11,7 @@ import numpy as np
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.observations.grid import beam_variances, build_grid, warn_of_copies
 from astropolcal.observations.observables import PAIRINGS, frame_groups, warn_of_exposures
@@ -24,7 +25,7 @@ from astropolcal.observations.reading import (
 )
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
-from astropolcal.words import check_choice, counted, html
+from astropolcal.words import check_choice, counted, html, listed
 
 __all__ = ["Observations", "example_table"]
 
@@ -170,7 +171,8 @@ class Observations:
         """  # noqa: E501
         label = str(name if path is None else path)
         table = complete_table(table, label)
-        return cls(build_grid(table, label), getattr(table, "meta", {}), name, path)
+        grid = _seen(build_grid(table, label), label)
+        return cls(grid, getattr(table, "meta", {}), name, path)
 
     @property
     def instrument(self):
@@ -719,6 +721,18 @@ def masked_grid(grid, mask, reason, label):
         reason=np.where(new, reasons.index(reason) + 1, grid.reason),
         reasons=reasons,
     )
+
+
+def _seen(grid, label):
+    """Return the grid at wavelengths with a usable cell: a fit says nothing of any other."""
+    dark = (grid.reason > 0).all(axis=0)
+    if not dark.any():
+        return grid
+    words = listed([f"{w:.4g}" for w in grid.wavelength[dark].to_value(u.nm)])
+    warnings.warn(
+        f"{label}: no usable cell at {words} nm; left out", AstropolcalWarning, stacklevel=4
+    )
+    return some_bins(grid, ~dark, label)
 
 
 def some_frames(grid, frames, label):

@@ -13,7 +13,6 @@ from astropolcal.calibration.noise import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
-    noise_from_roughness,
 )
 from astropolcal.calibration.noise.estimates import data_by_wavelength, equal_axes
 from astropolcal.chain import join
@@ -274,25 +273,6 @@ def test_too_few_angles_for_the_null_model(make, chain):
 
 
 # --- choice, several datasets ------------------------------------------------
-
-
-def test_roughness_is_along_the_wavelengths_whatever_the_order_of_the_table(make):
-    """What neighbouring wavelengths share is no noise, and who they are their wavelengths say."""
-    lam = np.linspace(1.2, 2.3, 7) * u.um
-    truth = join([*make.truth(make.chain(wavelength=lam))][:-1]) | optics.WollastonPrism(
-        efficiency=0.97, name="wollaston"
-    )
-    truth["derotator"].retardance.wavelength = lam
-    table = simulate(truth, lam, make.frames(), seed=6).to_table()
-    tilt = np.random.default_rng(1).normal(0, 0.02, 64)[table["frame"] - min(table["frame"])]
-    table["flux_right"] *= 1 + tilt * (table["wavelength"].to_value(u.um) - 1.7)
-    levels = []
-    for order in (np.arange(7), [3, 0, 6, 2, 5, 1, 4]):
-        shuffled = table.copy()
-        shuffled["bin"] = np.array(order)[table["bin"]]
-        live = Measurement(truth, Observations.from_table(shuffled))
-        levels.append(np.sort(noise_from_roughness(live).sigma_of_data))
-    np.testing.assert_allclose(*levels, rtol=1e-9)
 
 
 def test_each_dataset_has_its_own_noise(make, chain, faint):

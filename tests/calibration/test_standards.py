@@ -18,7 +18,6 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, Tie
-from astropolcal.observations import Observations
 
 LAM = [1.2, 1.6, 2.2] * u.um
 META = {"source": "polarized"}
@@ -109,18 +108,6 @@ def test_some_of_the_wavelengths_will_do(make, chain, calibrated):
         for table in (own, whole):
             np.testing.assert_allclose(percent(table["s_standard"]), rms)
             np.testing.assert_allclose(table["s_cv"], calibrated.accuracy["s_cv"][rows])
-
-
-def test_order_of_the_wavelengths_does_not_matter(calibrated, chain, standard):
-    down = standard.to_table()
-    down["bin"] = 2 - down["bin"]
-    down = Observations.from_table(down, name="down")
-    chain = chain.copy()
-    for optic, key in (("derotator", "retardance"), ("wollaston", "efficiency")):
-        getattr(chain[optic], key).wavelength = LAM
-    tables = [standard_accuracy(calibrated, chain, table) for table in (standard, down)]
-    for key in ("wavelength", "s_standard", "s_cv"):
-        np.testing.assert_allclose(tables[0][key], tables[1][key][::-1], err_msg=key)
 
 
 def test_tables_of_a_group_with_values_of_its_own(make, chain, observations):

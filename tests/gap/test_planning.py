@@ -59,6 +59,14 @@ def test_aliases_are_told_apart(full):
     assert all(f"({name})" in found["words"] for name in PAIR)
 
 
+def test_a_run_is_repeated_at_its_own_wavelengths():
+    true = with_effect(PAIR[0], retardance=1.5)
+    one, other = (observed(true, seed=seed) for seed in (1, 2))
+    runs = [one.select_bins(np.arange(7) < 3), other.select_bins(np.arange(7) > 2)]
+    (found,) = plan(even(fitted(runs).with_effect(get_effect(PAIR[0])), *PAIR))
+    assert found["probability_after"] > 0.8
+
+
 def test_what_is_the_same_everywhere_is_said_to_be(full):
     """A gain of one beam against the other is the same whatever name it has."""
     same = get_effect("beam_gain")

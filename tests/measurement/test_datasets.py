@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from astropolcal import instruments, optics
-from astropolcal.calibration.noise.weighting import first_weighting
+from astropolcal import optics
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.measurement.datasets import as_pairs
 from astropolcal.measurement.parameters import FreeParameters, Uniform, bind_prior
-from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
@@ -218,46 +216,6 @@ def test_wavelength_off_the_grid_names_the_nearest(chain, observations):
 
 
 # --- parameters ----------------------------------------------------------------------------------
-
-
-def test_values_of_descending_wavelengths_have_to_say_theirs(make_chain, observations):
-    """In the order of the table they would be those of other wavelengths."""
-    table = observations.to_table()
-    table["bin"] = 2 - table["bin"]
-    down = Observations.from_table(table, name="down")
-    chain, free = make_chain(), make_chain()
-    for one in (chain, free):
-        for key in ("horizontal", "diagonal", "circular"):
-            getattr(one["derotator"], key).wavelength = WAVELENGTH
-    chain["wollaston"].efficiency = [0.9, 0.95, 0.98]
-    free["wollaston"].efficiency = np.full(3, 0.95)
-    free["wollaston"].efficiency.prior = Normal([0.9, 0.95, 0.98], 0.01)
-    for one in (chain, free):
-        with pytest.raises(ParameterError, match=r"down: .*do not ascend.*wollaston\.efficiency"):
-            Measurement(one, down)
-        one["wollaston"].efficiency.wavelength = WAVELENGTH
-        np.testing.assert_allclose(
-            np.sort(Measurement(one, down).residuals()),
-            np.sort(Measurement(one, observations).residuals()),
-        )
-    alike = free.copy()
-    alike["wollaston"].efficiency.prior = None
-    measurement = Measurement(alike, down)
-    with pytest.raises(ParameterError, match="noise: the wavelengths do not ascend"):
-        first_weighting(measurement, [0.001, 0.01, 0.02])
-    assert first_weighting(measurement, [0.01] * 3).sigma.max() == 0.01
-
-
-def test_instruments_say_the_wavelengths_of_their_values():
-    charis = instruments.get("charis")
-    frames = half_wave_plate_cycles(derotator=[45, 62] * u.deg)
-    meta = charis.published_meta()
-    table = simulate(charis.chain(wavelength=WAVELENGTH), WAVELENGTH, frames, seed=1, meta=meta)
-    rows = table.to_table()
-    rows["bin"] = 2 - rows["bin"]
-    down = Observations.from_table(rows, name="down")
-    up, down = (Measurement(charis.chains_for([t]), [t]).residuals() for t in (table, down))
-    np.testing.assert_allclose(np.sort(up), np.sort(down))
 
 
 def test_a_vector_at_its_bounds(chain, observations):

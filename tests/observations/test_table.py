@@ -134,6 +134,16 @@ def test_the_order_of_rows_does_not_matter(obs, table):
         assert_same(Observations.from_table(table[order]), obs)
 
 
+def test_wavelengths_ascend_whatever_the_order_of_the_bins(obs, table):
+    table["bin"] = np.array([4, 9, 2])[table["bin"]]
+    with pytest.warns(AstropolcalWarning, match="the wavelengths of its bins do not ascend"):
+        found = Observations.from_table(table)
+    np.testing.assert_array_equal(found.wavelength, obs.wavelength)
+    np.testing.assert_array_equal(found.flux_left, obs.flux_left)
+    # what is written needs no warning
+    assert_same(Observations.from_table(found.to_table()), found)
+
+
 def test_the_hash_sees_every_number_mask_selection_and_source(obs, table):
     hashes = {obs.content_hash, obs.with_mask(obs.position("hwp") == 0, "test").content_hash}
     hashes.add(obs.select([0, 1]).content_hash)
@@ -181,6 +191,13 @@ def test_round_trip_with_a_missing_cell(tmp_path, table):
         obs = Observations.from_table(table[:-1])
     obs.write(tmp_path / "missing.ecsv")
     assert_same(Observations.read(tmp_path / "missing.ecsv"), obs)
+
+
+def test_a_wavelength_without_a_usable_cell_is_left_out(obs, table):
+    table["mask_reason"] = np.where(table["bin"] == 1, "absorbed", "")
+    with pytest.warns(AstropolcalWarning, match=r"no usable cell at 1600 nm; left out"):
+        left = Observations.from_table(table)
+    assert_same(left, obs.select_bins([True, False, True]))
 
 
 def test_round_trip_with_single_errors(tmp_path, table):

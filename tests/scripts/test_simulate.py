@@ -10,6 +10,7 @@ import pytest
 from astropy.io import fits
 
 from astropolcal import Observations, instruments
+from astropolcal.chain import stages
 from astropolcal.reduction.cubes import DetectorModel, simulate_cubes
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
@@ -120,6 +121,18 @@ def test_cubes_are_not_written_over_others(tmp_path, capsys):
     assert simulated(*argv) == 2
     # an argument of Python is no way out in a terminal
     assert "exists already; remove it, name another" in capsys.readouterr().err
+
+
+# IRDIS says that the telescope's mirrors are those of today
+@pytest.mark.filterwarnings("ignore:irdis. neither date nor coating")
+def test_its_tables_say_what_chain_is_theirs(tmp_path):
+    for name in ("charis", "irdis", "vampires"):
+        tables = [tmp_path / f"{name}_{source}.ecsv" for source in ("lamp", "star")]
+        assert simulated("-o", tables[0], "--instrument", name, "--derotator", "50,65,80") == 0
+        assert simulated("-o", tables[1], "--instrument", name, *STAR, "--derotator", "97") == 0
+        lamp, star = instruments.get(name).chains_for([Observations.read(t) for t in tables])
+        assert "parallactic" in stages(star), name
+        assert "parallactic" not in stages(lamp), name
 
 
 # an internal source and an unpolarized star do not tell where north is

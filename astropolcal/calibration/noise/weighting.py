@@ -509,8 +509,6 @@ def given_noise(measurement, noise):
     if not np.all(np.isfinite(noise) & (noise > 0)):
         raise ParameterError(f"noise must be positive and finite; the least is {np.min(noise)}")
     if noise.shape == measurement.wavelength.shape:
-        if np.ptp(noise) > 0 and any(dataset.descends for dataset in measurement.datasets):
-            raise ParameterError("noise: the wavelengths do not ascend; give one per datum")
         return noise[measurement.bins]
     if noise.shape not in ((), (measurement.n_data,)):
         raise ParameterError(

@@ -531,8 +531,7 @@ def _predicted_chain(calibration, chain, observations, sources):
 
     At the wavelengths of the observations; polarized sources stay free if ``sources``.
     """
-    # ascending, whatever the order of the table
-    rows = np.sort(bins_on_grid(observations, calibration.wavelength.to_value(u.um)))
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     # reversed, so that of optics in several chains the first dataset's counts
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
