@@ -76,13 +76,17 @@ def p(value):
 
 
 def share(value):
-    """Return a share as percent."""
+    """Return a share as percent; what another cause takes back may be more than all."""
+    if value > 1.005:
+        return "more than 100 %"
     return "less than 1 %" if 0 < value <= 0.005 else f"{100 * value:.0f} %"
 
 
 def short_share(value):
     """Return a share as percent, for a column of a table; a dash if there is none."""
-    return "-" if value is None else share(value).replace("less than", "<")
+    return (
+        "-" if value is None else share(value).replace("less than", "<").replace("more than", ">")
+    )
 
 
 def change(old, new, digits=2):

@@ -27,7 +27,7 @@ from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
 from astropolcal.observations.pointings import frame_names
-from astropolcal.observations.reading import common_wavelengths
+from astropolcal.observations.reading import bins_on_grid, common_wavelengths
 from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
 __all__ = []
@@ -119,7 +119,8 @@ class Model:
         """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
         own = {key: [getattr(mine, key)[i]] for key in ("fluxes", "flickering", "channels")}
-        noise = SimpleNamespace(**own, waves=None, known=mine.known)
+        shared = {"known": mine.known, "wavelength": mine.wavelength}
+        noise = SimpleNamespace(**own, **shared, waves=None)
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
 
@@ -480,7 +481,7 @@ def _alternatives(chains, observations, made, discrete, say):
             return inside, (*parts, nominal_calibration(*parts)), where
     if len(observations) > 1 and (not settled or found[0][1] in misread):
         # all but one of the tables may be right
-        some = [found[0][1]] if settled else misread
+        some = [found[0][1]] if settled else [e for e in discrete if e.may_be_in_part]
         apart = [e.in_run(o.name) for e in some for o in observations]
         found = _tried(chains, observations, apart, say, found)
     return found, asked, where
@@ -621,14 +622,15 @@ def _with_alternative(edited, observations, given, best, found):
 
 
 def thinned(chains, observations, count):
-    """Return chains and datasets at a few of the wavelengths."""
+    """Return chains and datasets at a few of the wavelengths of each."""
     grid = common_wavelengths(observations)
-    if count >= len(grid):
+    own = [bins_on_grid(o, grid) for o in observations]
+    keep = [o[np.linspace(0, len(o) - 1, min(count, len(o))).round().astype(int)] for o in own]
+    keep = np.unique(np.concatenate(keep))
+    if len(keep) == len(grid):
         return list(chains), list(observations)
-    keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
-    own = [o.wavelength.to_value(u.um)[:, None] for o in observations]
-    near = [np.isclose(one, grid[keep], rtol=1e-4).any(axis=1) for one in own]
-    few = [o.select_bins(bins) for o, bins in zip(observations, near, strict=True)]
+    pairs = zip(observations, own, strict=True)
+    few = [o.select_bins(np.isin(bins, keep)) for o, bins in pairs]
     return [at_wavelengths(c, np.eye(len(grid))[keep], len(grid)) for c in chains], few
 
 

@@ -9,6 +9,7 @@ one column a coefficient. What is fitted is the flat vector of coefficients.
 from copy import copy as copied
 from itertools import pairwise
 
+import astropy.units as u
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, null_space, solve_triangular
 from scipy.optimize import lsq_linear, nnls
@@ -106,7 +107,9 @@ class GapProblem:
         how = {"observable": "intensity" if single else "normalized_single_difference"}
         seen = zip(chains, observations, self.fluxes, strict=True)
         how |= {"ties": ties, "copy": copy, "positions": [_positions(*each) for each in seen]}
-        how["wavelength"] = wavelength
+        # of a part of the data that of all
+        grid = None if like is None else like.wavelength * u.um
+        how["wavelength"] = grid if wavelength is None else wavelength
         self.measurement = Measurement(chains, observations, **how)
         self.datasets = self.measurement.datasets
         self._flickering = [self._with_flicker(*each) for each in enumerate(chains)]

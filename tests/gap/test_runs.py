@@ -18,6 +18,7 @@ from astropolcal.gap.effects import Context
 from astropolcal.gap.effects.effect import CellEffect, label_of
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.gap.runs import changes, distinct, paragraph
+from astropolcal.observations import Observations
 from astropolcal.optics import LinearRetarder, Perturbation
 from astropolcal.optics.perturbations import Dependence
 from astropolcal.scripts.main import main
@@ -49,6 +50,27 @@ def pair(first=(), second=(), names=(JULY, OCTOBER)):
 
 GAIN = ("detector", "gain", "constant", 0.01)
 BEHIND = ("after:derotator", "retardance_d", "constant", 0.05)
+
+
+# ---- wavelengths of their own ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_fault_of_one_of_two_runs_at_other_wavelengths():
+    one, other = np.arange(7) == 1, np.arange(7) == 4
+    first, second = pair([], [BEHIND])
+    exchanged = pair()[1].to_table()
+    exchanged.rename_columns(["flux_right", "flux_left"], ["other", "flux_right"])
+    exchanged.rename_column("other", "flux_left")
+    exchanged = Observations.from_table(exchanged, name=OCTOBER)
+    nominal = data.chain(data.WAVELENGTH[one | other])
+    for run, name in [
+        (second, "after:derotator/retardance_d/dataset:October 5"),
+        (exchanged, "beams_swapped/dataset:October 5"),
+    ]:
+        runs = [first.select_bins(one), run.select_bins(other)]
+        (cause,) = diagnose([nominal] * 2, runs).causes
+        assert cause.name == name
 
 
 # ---- what changed ------------------------------------------------------------------------------
