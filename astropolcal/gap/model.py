@@ -27,7 +27,7 @@ from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
 from astropolcal.observations.pointings import frame_names
-from astropolcal.observations.reading import bins_on_grid, common_wavelengths
+from astropolcal.observations.reading import bins_on_grid, common_wavelengths, nearest_bins
 from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
 __all__ = []
@@ -439,7 +439,7 @@ def starting_model(calibration, observations, library, say):
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
-    chains = _set_apart(chains)
+    chains = [_at_data(chain, observations) for chain in _set_apart(chains)]
     # of a calibration too: in other data a wavelength may be in another branch
     made, where = nominal_calibration(chains, observations), ""
     if _may_be_wrong(made):
@@ -455,6 +455,17 @@ def starting_model(calibration, observations, library, say):
                 return *_with_alternative(*read, given, best, found), where
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, [], where
+
+
+def _at_data(chain, observations):
+    """Return a chain at the wavelengths of all datasets, where it has values at more."""
+    grid, optics = common_wavelengths(observations), leaves(chain)
+    known = (getattr(leaf, key).grid for leaf in optics for key in leaf.param_names)
+    own = next((one for one in known if one is not None), grid)
+    rows, off = nearest_bins(grid, own)
+    if off.any() or len(own) == len(grid):
+        return chain
+    return at_wavelengths(chain, np.eye(len(own))[rows], len(own))
 
 
 def _alternatives(chains, observations, made, discrete, say):

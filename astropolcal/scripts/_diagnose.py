@@ -137,12 +137,15 @@ def _of_calibration(path, files, datasets, edits, arguments):
     """Return the model of a calibration for the datasets, which need not be its own."""
     from astropolcal.calibration import Calibration
     from astropolcal.gap.diagnosis import check_instruments
+    from astropolcal.observations.reading import bins_on_grid
 
     for option in ("instrument", *common.MODEL):
         if getattr(arguments, option):
             raise AstropolcalError(f"--{option}: the model is that of {path}; give one of them")
     calibration = Calibration.read(path)
     check_instruments(calibration, datasets)
+    for dataset in datasets:
+        bins_on_grid(dataset, calibration.wavelength.to_value("um"))
     records = [_record(calibration, path, *pair) for pair in zip(files, datasets, strict=True)]
     # the very tables of the calibration: its fit need not be repeated
     hashes = [dataset.content_hash for dataset in datasets]

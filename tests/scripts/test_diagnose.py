@@ -137,6 +137,11 @@ def test_model_of_a_calibration(folder, cal, tmp_path):
     assert content["causes"][0]["effect"] == "beam_gain"
     # a linear derotator, as in the calibration
     assert "derotator.retardance" in content["nominal"]
+    # at some of its wavelengths
+    few = Observations.read(folder / "polarized.ecsv").select_bins(np.arange(len(WAVELENGTH)) < 3)
+    few.write(tmp_path / "few.ecsv")
+    found = run(tmp_path, cal, tmp_path / "few.ecsv", *FEW)
+    assert found["causes"][0]["effect"] == "beam_gain"
     edited = run(tmp_path, cal, folder / "polarized.ecsv", *FEW, "--fix", "hwp.theta=0")
     assert edited["n_free"] == content["n_free"] - 1
 
@@ -214,6 +219,10 @@ def test_bad_input(folder, cal, tmp_path, capsys):
     assert "unpolarized.ecsv: its source is 'unpolarized'" in line
     assert "'polarized' only" in line
     other = tmp_path / "other.ecsv"
+    moved = Observations.read(table).to_table()
+    moved["wavelength"] = 1.02 * moved["wavelength"]
+    Observations.from_table(moved).write(other)
+    assert "are none of the" in complaint(capsys, cal, other)
     other.write_text(table.read_text().replace("SCExAO/CHARIS", "irdis"))
     assert "of different instruments: charis and irdis" in complaint(capsys, cal, other)
     assert "nowhere.ecsv" in complaint(capsys, folder / "nowhere.ecsv")
