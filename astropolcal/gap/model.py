@@ -54,6 +54,9 @@ _WRONG_SHARE, _ABOVE_NOISE = 0.1, 3.0
 _FAR_BETTER, _ALIKE = 0.5, 1.1
 # one that leaves more than this share is no answer before the others were tried
 _SETTLED = 0.25
+# a wrong sign is in most data: what leaves in this share of them less than that share of the misfit
+# is wrong in a few frames
+_MOST_DATA, _SHOWS = 0.95, 0.5
 # the part of a run that a model fits is at least one in so many of the frames, and its misfit at
 # most such a share of that of the whole; with so many frames more it is twice that
 _LEAST_PART, _FITS, _SUDDEN = 4, 0.1, 4
@@ -601,6 +604,9 @@ def _misfit(calibration):
 def _may_be_wrong(calibration):
     """Return whether the double differences are so far off that a sign may be wrong."""
     misfit, datasets = _misfit(calibration), calibration.measurement.datasets
+    size = np.sort(np.abs(calibration.measurement.residuals()))
+    if rms(size[: int(_MOST_DATA * size.size)]) < _SHOWS * misfit:
+        return False
     signal, noise = (
         float(np.sqrt(np.mean(np.concatenate([np.square(part(d)) for d in datasets]))))
         for part in (lambda d: d.observed, lambda d: d.sigma)
