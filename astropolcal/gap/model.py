@@ -205,11 +205,18 @@ class Model:
         A context of None is that of the data. An effect that has no place without another that is
         not among them is left out.
         """
-        model = self.edited(*effects)
         # not fitted in between: one fit at the end is enough
+        model = self.edited(*effects)
+        if model is self:
+            return self
         if like is not None:
-            model = Model(model.problem, like.start_of(model.problem), model.added)
-        return self if model is self else model._off_extrema().polished(**settings)
+            start = like.start_of(model.problem)
+            found = Model(model.problem, start, model.added)._off_extrema().polished(**settings)
+            # where it has an effect less it may end in another branch, above the model without any
+            if found.fit.chi2 <= self.fit.chi2 or settings.get("steps") == 0:
+                return found
+        other = model._off_extrema().polished(**settings)
+        return other if like is None or other.fit.chi2 < found.fit.chi2 else found
 
     def _off_extrema(self):
         """Return the model with the effects moved whose derivative vanishes where they start."""
