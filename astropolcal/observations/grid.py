@@ -131,7 +131,7 @@ def build_grid(table, label):
     # -1: no row has spoken for this cell yet
     reason = np.full(shape, -1)
     reason[frame_index, bin_index] = code
-    mask_missing(reason, reasons, frame_names(frames), bin_numbers, label)
+    mask_missing(reason, reasons, frame_names(frames), bin_numbers[order], label)
     if reason.all():
         raise ObservationError(
             f"{label}: all {reason.size} cells are masked ({', '.join(reasons)}), "

@@ -47,14 +47,18 @@ def usable(row):
     return all(0 < row[name].value < np.inf for name in ("flux_right", "flux_left"))
 
 
+def by_wavelength(table):
+    return table["bin"][np.unique(table["wavelength"], return_index=True)[1]].tolist()
+
+
 @pytest.mark.slow
 @given(tables())
 def test_grid_agrees_with_a_loop_over_rows(table):
     assume(any(usable(row) for row in table))
     grid = quiet_grid(table)
-    frames, bins = sorted(set(table["frame"])), sorted(set(table["bin"]))
+    frames, bins = sorted(set(table["frame"])), by_wavelength(table)
     assert grid.frames["frame"].tolist() == frames
-    assert grid.bin.tolist() == bins
+    assert grid.bin.tolist() == sorted(bins)
     expected = np.full((len(frames), len(bins)), np.nan)
     for row in table:
         if usable(row):
@@ -68,9 +72,10 @@ def test_grid_agrees_with_a_loop_over_rows(table):
 def test_every_masked_cell_has_the_right_reason(table):
     assume(any(usable(row) for row in table))
     grid = quiet_grid(table)
-    given_cells = {(row["frame"], row["bin"]): row for row in table}
+    bins = by_wavelength(table)
+    given_cells = {(row["frame"], bins.index(row["bin"])): row for row in table}
     for i, j in np.ndindex(grid.reason.shape):
-        cell = grid.frames["frame"][i], grid.bin[j]
+        cell = grid.frames["frame"][i], j
         code = grid.reason[i, j]
         reason = grid.reasons[code - 1] if code else None
         if cell not in given_cells:
