@@ -612,7 +612,7 @@ def _may_be_wrong(calibration):
     """Return whether the double differences are so far off that a sign may be wrong."""
     misfit, datasets = _misfit(calibration), calibration.measurement.datasets
     size = np.sort(np.abs(calibration.measurement.residuals()))
-    if rms(size[: int(_MOST_DATA * size.size)]) < _SHOWS * misfit:
+    if rms(size[: max(1, int(_MOST_DATA * size.size))]) < _SHOWS * misfit:
         return False
     signal, noise = (
         float(np.sqrt(np.mean(np.concatenate([np.square(part(d)) for d in datasets]))))

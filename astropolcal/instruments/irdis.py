@@ -461,7 +461,7 @@ class IRDIS(Instrument):
 
     def published_meta(self):
         """Return the meta of a table taken with the chain of `published`."""
-        # the mirrors of stars on whose way the source is
+        # a star is seen through the mirrors of today
         return {"instrument": "SPHERE/IRDIS", "source": "polarized", "coating": "after"}
 
     def telescope_optics(self, behind, *, wavelength=None, coating=None, date=None):

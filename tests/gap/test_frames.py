@@ -225,6 +225,13 @@ def test_many_bad_frames_are_no_single_faults():
     assert harmful(found(observed(frames))) == []
 
 
+def test_one_bad_frame_is_no_wrong_sign():
+    said = []
+    result = diagnose(data.chain(), observed(table(hwp=(18, 40.0))), progress=said.append)
+    assert [fault.frame for fault in result.frames] == [18]
+    assert not [line for line in said if line.startswith("trying")]
+
+
 def test_lamp_is_named_and_not_masked():
     seen = observed(lamp=np.where(np.arange(N) == 9, 0.9, 1.0))
     (fault,) = found(seen)
