@@ -141,6 +141,15 @@ def test_wavelengths_in_a_wrong_mirror_branch_are_no_gap():
     assert fit.mean_square < 1.2
 
 
+def test_effects_never_leave_more_than_the_model_without_them():
+    base = data.clean_model()
+    vector = base.problem.vector(base.fit.coefficients)
+    vector[base.problem.free.by_name["derotator.retardance"].slice][3] *= -1
+    bent = Model(base.problem, Fit(base.problem.coefficients(vector), np.inf, False), {})
+    found = base.with_effects([(get_effect("beam_gain"), None)], like=bent)
+    assert found.fit.chi2 <= base.fit.chi2
+
+
 @pytest.mark.slow
 def test_another_zero_of_a_stage_is_found_in_both_directions():
     """A plate that is no exact half-wave plate is another one when it is turned by 90 deg."""
