@@ -349,12 +349,15 @@ def number_or(*words, kind=float):
     """Return the type of an option that takes one of some words or a number."""
 
     def read(text):
-        return text if text in words else plain_number(text, kind)
+        return text if text in words else _NUMBERS[kind](text)
 
     return text_type(f"{', '.join(words)} or a number", read)
 
 
-_TYPES = {"float": float, "int": int, "angles": text_type("a list of angles in degree", numbers)}
+_NUMBERS = {float: lambda text: numbers(text, 1)[0], int: partial(plain_number, kind=int)}
+_TYPES = {"angles": text_type("a list of angles in degree", numbers)}
+_TYPES["float"] = text_type("a finite number", _NUMBERS[float])
+_TYPES["int"] = text_type("a whole number", _NUMBERS[int])
 _TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Drawing, Folder)}
 
 

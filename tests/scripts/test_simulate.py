@@ -105,7 +105,7 @@ def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys):
         (["--cubes", "cubes", *STAR, "--flux", "-1"], "flux"),
         (["-o", "x.ecsv", "--flux", "-1"], "flux"),
         (["-o", "x.ecsv", "--gain", "0"], "gain"),
-        (["-o", "x.ecsv", "--read-noise", "nan"], "read_noise"),
+        (["-o", "x.ecsv", "--read-noise", "-2"], "read_noise"),
         (["-o", "x.ecsv", "--calibration", "missing.asdf"], "missing.asdf"),
     ]:
         monkeypatch.chdir(tmp_path)
