@@ -724,7 +724,7 @@ def masked_grid(grid, mask, reason, label):
 
 
 def _seen(grid, label):
-    """Return the grid at wavelengths with a usable cell: a fit says nothing of any other."""
+    """Return the grid at wavelengths with a usable cell, the ones that a fit can constrain."""
     dark = (grid.reason > 0).all(axis=0)
     if not dark.any():
         return grid
