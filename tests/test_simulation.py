@@ -200,8 +200,10 @@ def test_values_per_wavelength_are_those_of_ascending_wavelengths(chain, frames)
     with pytest.raises(ParameterError, match="ascending"):
         simulate(chain, WAVELENGTH[::-1], frames)
     plain = optics.LinearPolarizer(theta=20 * u.deg) | optics.WollastonPrism()
-    up, down = (simulate(plain, w, frames, noise=False) for w in (WAVELENGTH, WAVELENGTH[::-1]))
-    np.testing.assert_allclose(up.flux_right, down.flux_right[:, ::-1])
+    up = simulate(plain, WAVELENGTH, frames, noise=False)
+    with pytest.warns(AstropolcalWarning, match="do not ascend; here they do"):
+        down = simulate(plain, WAVELENGTH[::-1], frames, noise=False)
+    np.testing.assert_allclose(up.flux_right, down.flux_right)
 
 
 def test_stage_without_position_is_refused(chain, frames):

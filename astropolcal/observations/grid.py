@@ -105,16 +105,7 @@ def build_grid(table, label):
     shape = (len(first), len(bin_numbers))
     _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
     unit = table["wavelength"].unit
-    by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
-    order = np.argsort(by_bin)
-    if not np.array_equal(order, np.arange(len(order))):
-        warnings.warn(
-            f"{label}: the wavelengths of its bins do not ascend; here they do, and values per "
-            "wavelength have to",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
-        bin_index, by_bin = np.argsort(order)[bin_index], by_bin[order]
+    by_bin, order = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
     # the columns that belong to frames, after checking that they do
     frames = QTable({"frame": frame[first]})
     for name in table.colnames:
@@ -129,7 +120,7 @@ def build_grid(table, label):
     flux_unit, values = _measured(table, label, ("flux",) if single else BEAMS)
     code, reasons = mask_rows(table, values, label, height)
     # -1: no row has spoken for this cell yet
-    reason = np.full(shape, -1)
+    reason, bin_index = np.full(shape, -1), np.argsort(order)[bin_index]
     reason[frame_index, bin_index] = code
     mask_missing(reason, reasons, frame_names(frames), bin_numbers[order], label)
     if reason.all():
@@ -271,6 +262,7 @@ def _check_cells(cell, frame, bins, shape, label):
 
 
 def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
+    """Return the wavelengths in ascending order, and the order of the bins that they have."""
     by_bin = np.full(len(bin_numbers), np.inf)
     # the least of each bin as its reference; plain indexing would keep one at random
     np.minimum.at(by_bin, bin_index, wavelength)
@@ -292,7 +284,14 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
             f"{label}, row {row + 1}: wavelength = {wavelength[row]:.9g} {unit} of bin "
             f"{bin_numbers[two]} is also that of bin {bin_numbers[one]}; one bin each is allowed"
         )
-    return by_bin * unit
+    if not np.array_equal(order, np.arange(len(order))):
+        warnings.warn(
+            f"{label}: the wavelengths of its bins do not ascend; here they do, and values per "
+            "wavelength have to",
+            AstropolcalWarning,
+            stacklevel=4,
+        )
+    return by_bin[order] * unit, order
 
 
 def _check_constant(column, name, reference, frame, label):
