@@ -144,6 +144,7 @@ def _of_calibration(path, files, datasets, edits, arguments):
             raise AstropolcalError(f"--{option}: the model is that of {path}; give one of them")
     calibration = Calibration.read(path)
     check_instruments(calibration, datasets)
+    # refused here, with the name of the table
     for dataset in datasets:
         bins_on_grid(dataset, calibration.wavelength.to_value("um"))
     records = [_record(calibration, path, *pair) for pair in zip(files, datasets, strict=True)]
