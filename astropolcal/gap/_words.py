@@ -18,6 +18,8 @@ _CONSPICUOUS = 0.01
 _WIDTH = 80
 # so many causes are named in a sentence, in a title, and in place of another
 _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
+# a course that explains so much more of the gap than all causes is named before them
+_MORE = 0.1
 # more single data than this are counted
 _SINGLE = 5
 # so many lines say where the gap lies, and so many has the summary
@@ -360,33 +362,46 @@ def _what(content):
         nameless = "" if verdict == "named" else ", not all of which have a name"
         many = f"The model lacks {len(causes)} things{nameless}: "
         return _found(causes[0]) if len(causes) == 1 else f"{many}{listed(names, most=_NAMED)}."
-    text = "I do not know what the model lacks: "
+    text = "I do not know what the model lacks"
+    if _is_one(content):
+        return f"{text}."
     if causes:
-        text += f"what helps most, {names[0]}, "
+        text += f": what helps most, {names[0]}, "
         text += "needs others beside it." if len(causes) > 1 else "is not probable enough."
         text += _ONE_THING[alike([entry["cell"] and Cell(**entry["cell"]) for entry in causes])]
     else:
-        text += f"none of the {content['n_effects']} causes that were tried explains the gap."
+        text += f": none of the {content['n_effects']} causes that were tried explains the gap."
     where = content["where_left"] or content["where"]
     of = "what is left" if content["where_left"] else "the gap"
-    return f"{text} {where_words(where[0], of)}." if where and not _instead(content) else text
+    return f"{text} {where_words(where[0], of)}." if where and not _courses(content) else text
+
+
+def _courses(content):
+    found = [one for one in content["where"] if one["axis"] == "course"]
+    return found if content["verdict"] != "none" else []
+
+
+def _is_one(content):
+    """Whether one perturbation of any course does more than all causes together."""
+    found = _courses(content) if content["verdict"] == "unexplained" else []
+    return bool(found) and found[0]["share"] > 1 - content["left_share"] + _MORE
 
 
 def _instead(content):
     """Return what one perturbation of any course does in place of the causes."""
-    found = [one for one in content["where"] if one["axis"] == "course"]
-    if not found or content["verdict"] == "none":
+    found, causes = _courses(content), content["causes"]
+    if not found:
         return ""
     more, others = "", [one["detail"].partition(",")[0] for one in found[1:]]
     if others:
         more = f" These data do not tell it from such a course of {listed(others, 'or', _NAMED)}."
-    if not content["causes"]:
-        return f"It may be one thing: {found[0]['detail']}.{more}"
-    those = "this" if len(content["causes"]) == 1 else "these together"
-    return (
-        f"It may be one thing instead: {found[0]['detail']}. That does about as well as {those} "
-        f"and explains {share(found[0]['share'])} of the gap.{more}"
-    )
+    instead = " instead" if causes and not _is_one(content) else ""
+    text = f"It may be one thing{instead}: {found[0]['detail']}."
+    if causes:
+        those = "the cause that helps most" if len(causes) == 1 else "all causes together"
+        does = f"It does more than {those}" if _is_one(content) else f"It does as well as {those}"
+        text += f" {does} and explains {share(found[0]['share'])} of the gap."
+    return f"{text}{more}"
 
 
 def where_words(entry, of=None):
@@ -399,6 +414,9 @@ def where_words(entry, of=None):
 
 def _how_large(content):
     them = "it" if len(content["causes"]) == 1 else "them"
+    if _is_one(content):
+        # what helps more is no part of the improved model
+        them = "the causes of the table"
 
     def gaps(before, after, noise):
         more = f", with {them} by {percent(after)} %" if content["causes"] else ""

@@ -121,6 +121,8 @@ _KINDS = {
     "depolarization_d": "depolarization at 45 deg to the axes",
     "depolarization_circular": "depolarization of circular light",
     "gain": "gain of one beam against the other",
+    "gain_of_right_beam": "gain of the right beam",
+    "gain_of_left_beam": "gain of the left beam",
     "background": "background in both beams",
     "background_of_one_beam": "background in one beam",
     "nonlinearity": "answer that is not linear",

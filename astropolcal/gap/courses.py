@@ -15,8 +15,10 @@ import numpy as np
 from scipy.linalg import block_diag, eigh
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
+from astropolcal.gap.attribution import ENOUGH
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.problem import law_basis
+from astropolcal.observations.pointings import frame_names
 
 __all__ = []
 
@@ -26,6 +28,10 @@ _DEGREE = 4
 _ROUNDS, _MORE, _BEST = 1, 5, 6
 # what lowers chi-square by less than this share more is the same
 _SAME = 1e-4
+# what explains this share of a course may be its shape, the simplest of those as near as that; a
+# law is where it has more than a part of its largest value
+_NEARLY, _AS_MUCH, _PART = 0.9, 0.05, 0.5
+_TWO_SIGMA = 4.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-6
 
@@ -46,6 +52,8 @@ class Course:
     wave, std : list of `~numpy.ndarray`
         The course in each dataset, (F,), radian or shares, and its errors, without what model and
         lamp absorb; zero and infinite in frames that do not tell it.
+    equations : tuple
+        Which frames tell it, and its whitened normal equations there.
     lowered, freedom : float, int
         By how much it lowers chi-square, and by how many directions.
     gained, behind : float
@@ -60,6 +68,7 @@ class Course:
     reduced: Reduced | None
     law: np.ndarray
     wave: list = field(default_factory=list)
+    equations: tuple = ()
     std: list = field(default_factory=list)
     lowered: float = 0.0
     freedom: int = 0
@@ -72,6 +81,82 @@ class Course:
         """What it is, in words."""
         what = Cell(self.place, self.kind, "constant").title
         return f"{what}, with a course through the run that no table has"
+
+    def shape(self, model):
+        """Return in which frames and wavelengths it is, in words; empty where it is everywhere."""
+        size, nm = np.abs(self.law), np.round(1000 * model.problem.wavelength).astype(int)
+        there = np.flatnonzero(size > _PART * size.max())
+        few = bool(len(there) == np.ptp(there) + 1 <= len(size) / 2)
+        sharp = few and bool(np.sum(size[there] ** 2) > _NEARLY * np.sum(size**2))
+        ends = dict.fromkeys(nm[[there[0], there[-1]]])
+        found = [self._when(model.observations), f"at {'-'.join(map(str, ends))} nm" * sharp]
+        return ", ".join(filter(None, found))
+
+    def _when(self, observations):
+        names = [name for o in observations for name in frame_names(o.frames)]
+        sizes = [o.n_frames for o in observations]
+        run = np.repeat(np.arange(len(sizes)), sizes)
+        of = [f' of "{o.name}"' * (len(sizes) > 1) for o in observations]
+        # from each frame on to the end of its dataset
+        steps = np.tril(run[:, None] == run).astype(float)
+        one, both = (_best(gained) for gained in self._of_steps(steps))
+        (k,), (i, j) = one[1:], sorted(both[1:])
+        known = [(f"from {one[0]}frame {names[k]}{of[run[k]]} on", steps[:, [k]])]
+        ends = [f"{names[i]}{of[run[i]]}", f"{names[j]}{of[run[j]]}"]
+        if run[i] == run[j]:
+            # between two steps of one dataset, and not before and after
+            frames = list(dict.fromkeys((names[i], names[j - 1])))
+            word = f"in {both[0]}frame{'s' * (len(frames) > 1)} {'-'.join(frames)}{of[run[i]]}"
+            known.append((word, steps[:, [i]] - steps[:, [j]]))
+            ends[0] = names[i]
+        known.append((f"with steps at {both[0]}frames {' and '.join(ends)}", steps[:, [i, j]]))
+        known += [
+            self._of_period(end - n, n, of[r])
+            for r, (end, n) in enumerate(zip(np.cumsum(sizes), sizes, strict=True))
+        ]
+        shares = [self._share(waves) for _, waves in known]
+        least = max(_NEARLY, max(shares) - _AS_MUCH)
+        return next((w for (w, _), one in zip(known, shares, strict=True) if one >= least), "")
+
+    def _of_steps(self, steps):
+        """Return by how much each step, and each two of them, lower chi-square."""
+        gram, target = self._normal(steps)
+        own = np.diagonal(gram)
+        is_open = own > _ABSORBED * max(own.max(), 1e-300)
+        one = np.where(is_open, target**2 / np.where(is_open, own, 1.0), 0.0)
+        det = np.multiply.outer(own, own) - gram**2
+        is_open = det > _ABSORBED * np.multiply.outer(own, own)
+        both = np.multiply.outer(target**2, own)
+        both = both + both.T - 2 * np.multiply.outer(target, target) * gram
+        return one, np.triu(np.where(is_open, both / np.where(is_open, det, 1.0), 0.0))
+
+    def _of_period(self, start, size, of):
+        """Return the period, in words, that explains most of one dataset, and its waves (F, 2)."""
+        rates = np.linspace(1.5 / size, 1 / 3, 4 * size)
+        waves = np.zeros((len(rates), len(self.equations[0]), 2))
+        phases = 2 * np.pi * rates[:, None] * np.arange(size)
+        waves[:, start : start + size] = np.stack([np.cos(phases), np.sin(phases)], axis=-1)
+        best = max(range(len(rates)), key=lambda n: self._share(waves[n]))
+        return f"with a period of about {1 / rates[best]:.0f} frames{of}", waves[best]
+
+    def _normal(self, courses):
+        """Return the normal equations of courses (F, n), less what model and lamp absorb."""
+        told, root, seen, target = self.equations
+        columns = courses[told] * root[:, None]
+        taken = seen.T @ columns
+        return columns.T @ columns - taken.T @ taken, columns.T @ target
+
+    def _share(self, courses):
+        """Return the share of what the course explains that one along columns (F, n) explains."""
+        gram, target = self._normal(courses)
+        gained = target @ np.linalg.lstsq(gram, target, rcond=_ABSORBED)[0] - len(target)
+        return gained / max(self.lowered - self.freedom, 1.0)
+
+    @property
+    def chosen(self):
+        """What the choice of the law gains from noise: of k singular values the largest counts."""
+        k = len(self.reduced.target[0][0])
+        return 2 * np.sqrt((k - 1) * max(self.freedom - k + 1, 0))
 
     def fit(self, rounds):
         """Fit law and course in turn, until nothing is gained."""
@@ -93,7 +178,9 @@ class Course:
         told = gram > _ABSORBED * gram.max()
         root = np.sqrt(gram[told])
         target = np.concatenate([t @ law for t in reduced.target])[told] / root
-        left, strength, _ = np.linalg.svd(taken[told] / root[:, None], full_matrices=False)
+        taken = taken[told] / root[:, None]
+        self.equations = told, root, taken, target
+        left, strength, _ = np.linalg.svd(taken, full_matrices=False)
         # (1 - t t^T)^-1 of what is left of each direction, nothing of what is taken up whole
         rest = 1 - strength**2
         is_open = rest > _ABSORBED
@@ -109,6 +196,12 @@ class Course:
         self.freedom = int(told.sum() - np.sum(~is_open)) + len(law) - 1
 
 
+def _best(gained):
+    """Return where a table is largest, after "about " where that is not the only place (95 %)."""
+    count = np.sum(gained > gained.max() - _TWO_SIGMA)
+    return "about " * bool(count > 1), *np.unravel_index(np.argmax(gained), gained.shape)
+
+
 def courses(model, base):
     """
     Return the courses in place of all causes of a fitted model, the best first.
@@ -117,47 +210,76 @@ def courses(model, base):
     course does better: many causes that are not the true ones are far from where it is.
     """
     names = [name for name in model.added if name not in base.added]
-    temper, best = model.alike * max(1.0, model.mean_square), {}
+    found = []
     for at, absent in ((model, names), (base, ())) if names else ((base, ()),):
         without = at.without(absent)
+        found += [(one, without) for one in _fitted(at, absent, without)]
+    # measured by what the better of the two answers leaves, as alike as that is
+    large = max(1.0, model.mean_square)
+    temper = max(1.0, min([large, *(_left(without, one) for one, without in found)]))
+    temper *= 1 + (model.alike - 1) * temper / large
+    best = {}
+    for one, without in found:
         # to first order, as the courses are
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
-        for one in _fitted(at, absent):
-            freer = max(one.freedom - freedom, 1.0)
-            one.gained = float((one.lowered - lost) / temper - freer)
-            one.behind = float(-one.gained / np.sqrt(2 * freer))
-            # the law is chosen: of k singular values the largest is more than a share of their sum
-            k = len(one.reduced.target[0][0])
-            gain = 2 * np.sqrt((k - 1) * max(one.freedom - k + 1, 0))
-            one.p_value = float(chi2_above(one.lowered / temper - gain, max(one.freedom, 1)))
-            one.std = [np.sqrt(temper) * std for std in one.std]
-            known = best.setdefault((one.place, one.kind), one)
-            best[one.place, one.kind] = max(known, one, key=lambda course: course.gained)
+        freer = max(one.freedom - freedom, 1.0)
+        one.gained = float((one.lowered - lost) / temper - freer - one.chosen)
+        one.behind = float(-one.gained / np.sqrt(2 * freer))
+        one.p_value = float(chi2_above(one.lowered / temper - one.chosen, max(one.freedom, 1)))
+        one.std = [np.sqrt(temper) * std for std in one.std]
+        known = best.setdefault((one.place, one.kind), one)
+        best[one.place, one.kind] = max(known, one, key=lambda course: course.gained)
     for one in best.values():
         # large, and of no use once it is fitted
         one.reduced = None
     return sorted(best.values(), key=lambda one: -one.gained)
 
 
-def _fitted(model, absent):
+def _left(without, course):
+    """Return the mean square that a course leaves of a model to first order."""
+    return (without.chi2 - course.lowered) / max(without.freedom - course.freedom, 1)
+
+
+def _fitted(model, absent, without):
     """Return the courses at a fitted model of which some effects are taken out."""
     probes = Probes(model, absent)
-    basis = law_basis(probes.problem.wavelength, _DEGREE)
-    found = []
-    for (place, kind), slopes in probes.slopes.items():
-        reduced = Reduced(probes, slopes, basis)
+    wavelength, found = probes.problem.wavelength, []
+    basis = law_basis(wavelength, _DEGREE)
+    slopes = probes.slopes | _of_one_beam(probes)
+    for (place, kind), slope in slopes.items():
+        reduced = Reduced(probes, slope, basis)
         found.append(Course(place, kind, reduced, _first_law(reduced)))
         found[-1].fit(_ROUNDS)
     found = [one for one in found if one.lowered > 0]
     found.sort(key=lambda one: one.freedom - one.lowered)
-    for one in found[:_BEST]:
+    for i, one in enumerate(found[:_BEST]):
         one.fit(_MORE)
+        if len(basis.T) < len(wavelength):
+            # what is sharp in wavelength has no smooth law
+            free = Reduced(probes, slopes[one.place, one.kind], np.eye(len(wavelength)))
+            free = Course(one.place, one.kind, free, basis @ one.law, list(one.wave))
+            free.fit(_MORE)
+            left = max(_left(without, free), 1.0)
+            gained = [o.lowered / left - o.freedom - o.chosen for o in (one, free)]
+            if gained[1] > gained[0] + ENOUGH:
+                found[i] = free
     for one in found:
-        law = basis @ one.law
+        law = one.law if len(one.law) == len(wavelength) else basis @ one.law
         largest = law[np.argmax(np.abs(law))]
         one.law = law / largest
         one.wave = [wave * largest for wave in one.wave]
         one.std = [std * abs(largest) for std in one.std]
+    return found
+
+
+def _of_one_beam(probes):
+    """Return the derivatives to a gain of either beam alone, of which the sums of both tell."""
+    problem, found = probes.problem, {}
+    for i, slope in probes.slopes.get(("detector", "gain"), {}).items():
+        channel = problem.channels[i]
+        for sign, beam in ((1, "right"), (-1, "left")) if channel.groups is None else ():
+            both = np.stack([slope[0], slope[1] + sign * channel.valid]) / 2
+            found.setdefault(("detector", f"gain_of_{beam}_beam"), {})[i] = both
     return found
 
 

@@ -76,12 +76,12 @@ _UNLISTED = (0.0, 0.01, 0.03, 0.8, 0.92, 0.93, 0.94, 0.95, 0.97)
 # of 20, and a quarter of all gaps may be of this sort
 _MAY_HIDE, _UNSEEN = (0.25, 0.35), (0.0, 0.11)
 # the same where one course that no table has does as well as several causes do together, and below
-# how many standard deviations it does: within 2 were 7 of 52 answers to pairs, all right, and 34 of
-# 36 to mechanisms, of whose 68 causes 9 were right
-_ONE_COURSE, _AS_WELL = 0.65, 1.5
-# and where it does better than a single cause: beyond 2 were 17 answers to mechanisms, 4 of them
-# right, and none of 53 to cells; of other cells one or another is there
-_BETTER_COURSE, _BETTER = 0.85, -2.8
+# how many standard deviations it does: within 4.8 were 7 of 52 answers to pairs, all right, and 34
+# of 36 to mechanisms, of whose 68 causes 9 were right
+_ONE_COURSE, _AS_WELL = 0.65, 4.3
+# and where it does better than a single cause: of 150 answers to cells none was below 0, but those
+# that leave a remainder anyway; of 63 to mechanisms 11, and below -0.7 one right of eight
+_BETTER_COURSE, _BETTER = 0.85, -0.7
 # and where two causes have the same course, or the same place and kind: of such causes given to
 # mechanisms with 0.8 or more 2 of 16 and 2 of 10 were right (4 of 10 if any law counts); of 229
 # answers to pairs none was of the first sort, and all six of the second were right
@@ -154,9 +154,8 @@ class _State:
 
     @property
     def is_dear(self):
-        """Whether one cause explains all, but by much freedom."""
-        alone = len(self.chosen) == 1 and self.model.p_value > REMAINDER
-        return alone and self.chosen[0].cost(1.0) > _DEAR
+        """Whether one cause alone has much freedom."""
+        return len(self.chosen) == 1 and self.chosen[0].cost(1.0) > _DEAR
 
 
 @dataclass
@@ -218,7 +217,7 @@ def _real_courses(model, base, runs):
 
 def _alike_courses(found):
     """Return the best courses, which the data do not tell apart."""
-    near = [np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
+    near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
     return [o for o, noise in zip(found, near, strict=True) if o.gained > found[0].gained - noise]
 
 
@@ -465,9 +464,11 @@ def _search(task, best, first, most_causes):
         is_doubtful = task.groups and k >= _BY_EVIDENCE
         fitted = _by_left_out_frames(fitted, least, task.groups) if is_doubtful else fitted
         best, states = fitted[0], fitted[:width]
-        if best.model.p_value > REMAINDER and not best.is_dear:
-            # what is left may be noise: one look beside the best set will tell
-            states = states[:1]
+        if best.model.p_value > REMAINDER:
+            # what is left may be noise: one look beside the best set will tell, and one beside
+            # those of little freedom where it has much
+            simple = [one for one in fitted if not one.is_dear] if best.is_dear else []
+            states = [best, *simple][:width]
     return best
 
 
@@ -504,7 +505,9 @@ def _fitted(grown, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
-        share = _HALF if any(other.is_dear for other in found) else _PROMISING
+        share = (
+            _HALF if any(o.is_dear and o.model.p_value > REMAINDER for o in found) else _PROMISING
+        )
         if promised - state.evidence < share * (most - state.evidence):
             break
         one = _extended(promised, state, added, instead)

@@ -543,7 +543,7 @@ def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
             star.flux_right,
             star.flux_left,
             star.wavelength,
-            dict(charis.positions(star, sky_chain(fitted))),
+            {k: v * u.rad for k, v in charis.positions(star, sky_chain(fitted)).items()},
             hwp=star.frames["hwp"],
             date=star.meta.get("date", "2025-07-15"),
             mode=star.meta["mode"],

@@ -11,6 +11,7 @@ from astropolcal.gap.courses import courses
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.problem import law_basis
 from astropolcal.gap.report import to_dict
+from astropolcal.observations import Observations
 
 
 def answered(seed, **how):
@@ -46,6 +47,27 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
         rank = len(told)
         assert one.lowered == pytest.approx(told @ told, rel=1e-6), one.words
         assert one.freedom == rank + basis.shape[1] - 1, one.words
+
+
+def test_frames_wavelengths_and_beam_of_a_course_are_found():
+    clean, number = data.observed(), np.arange(data.observed().n_frames)
+    middle = np.isin(np.arange(clean.n_bins), (2, 3))
+    for beam, course, law, words in (
+        ("right", (number > 9) & (number < 19), middle, ["in frames 10-18", "at 1450-1620 nm"]),
+        ("left", (number > 12) + 2.0 * (number > 23), 1, ["with steps at frames 13 and 24"]),
+        ("right", np.cos(2 * np.pi * number / 7.3), 1, ["with a period of about 7 frames"]),
+        ("left", number > 19, middle, ["from frame 20 on", "at 1450-1620 nm"]),
+    ):
+        table = clean.to_table()
+        factor = 1 + 0.04 * np.multiply.outer(course, law * np.ones(clean.n_bins))
+        table[f"flux_{beam}"] *= factor.ravel()
+        model = data.fitted(Observations.from_table(table, name="lamp"))
+        found = courses(model, model)
+        # light that is added to one beam at these wavelengths looks nearly the same
+        one = next(one for one in found if one.kind == f"gain_of_{beam}_beam")
+        assert found[0].gained - one.gained < 2 * np.sqrt(2 * one.freedom), words
+        assert one.lowered > 0.99 * found[0].lowered, words
+        assert one.shape(model).split(", ") == words
 
 
 @pytest.mark.slow
