@@ -101,7 +101,10 @@ class Course:
         steps = np.tril(run[:, None] == run).astype(float)
         one, both = (_best(gained) for gained in self._of_steps(steps))
         (k,), (i, j) = one[1:], sorted(both[1:])
-        known = [(f"from {one[0]}frame {names[k]}{of[run[k]]} on", steps[:, [k]])]
+        word = f"from {one[0]}frame {names[k]}{of[run[k]]} on"
+        if k and run[k - 1] != run[k]:
+            word = f'in "{observations[run[k]].name}"'
+        known = [(word, steps[:, [k]])]
         ends = [f"{names[i]}{of[run[i]]}", f"{names[j]}{of[run[j]]}"]
         if run[i] == run[j]:
             # between two steps of one dataset, and not before and after
