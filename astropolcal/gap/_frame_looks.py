@@ -65,7 +65,10 @@ class Look:
             zip(numbers, self.problem.channels, self.problem.segments, strict=True)
         )
         rows = self.problem.rows([~o for o in out])
-        columns = np.concatenate([self.problem.open_slopes(coefficients), self._of_flux()], axis=1)
+        #: Of each dataset what the lamp takes up of its sums, (n_rows, k); nothing of groups.
+        self.lamps = [self._of_lamp(*each) for each in self._datasets]
+        slopes = self.problem.open_slopes(coefficients)
+        columns = np.concatenate([slopes, self._of_flux(), *self.lamps], axis=1)
         #: Share of each datum, (2, W, F), that goes to the brightness of the group of a single
         #: beam; of a frame that takes no part, its variance by that of the datum.
         self.shares = [np.zeros(channel.shape) for channel in self.problem.channels]
@@ -79,7 +82,8 @@ class Look:
         #: Sum of squares and degrees of freedom of the frames that take part.
         self.chi2 = float(np.sum(self.residual[rows] ** 2))
         lost = sum(c.count * int(c.valid[:, out[i]].sum()) for i, c, _ in self._datasets)
-        self.freedom = max(self.problem.n_data - lost - self.tangent.shape[1], 1)
+        lost += self.tangent.shape[1] - sum(lamp.shape[1] for lamp in self.lamps)
+        self.freedom = max(self.problem.n_data - lost, 1)
 
     @property
     def excess(self):
@@ -109,6 +113,13 @@ class Look:
             # the only frame of its group that takes part says nothing, nor does any other of it
             self.shares[i][1] = np.where(total > 0, np.square(unit) / known, _UNKNOWN)
         return columns
+
+    def _of_lamp(self, i, channel, rows):
+        count = channel.nuisance.shape[1] if channel.groups is None else 0
+        found = np.zeros((self.problem.n_rows, count))
+        # the sums are the second half of the rows of a dataset
+        found[rows][len(found[rows]) // 2 :] = channel.nuisance[:, :count]
+        return found
 
     def _of_flux(self):
         """
@@ -144,14 +155,11 @@ class Look:
 
     @cached_property
     def _parts(self):
-        """Residual (2, W, F), and tangent with lamp (2, W, F, k), of each dataset."""
-        parts = []
-        for _, channel, rows in self._datasets:
-            lamp = channel.nuisance if channel.groups is None else channel.nuisance[:, :0]
-            taken = [self.tangent[rows], np.concatenate([np.zeros_like(lamp), lamp])]
-            taken = np.concatenate(taken, axis=1).reshape(*channel.shape, -1)
-            parts.append((self.residual[rows].reshape(channel.shape), taken))
-        return parts
+        """Residual (2, W, F), and tangent (2, W, F, k), of each dataset."""
+        return [
+            (self.residual[rows].reshape(c.shape), self.tangent[rows].reshape(*c.shape, -1))
+            for _, c, rows in self._datasets
+        ]
 
     # ---- small errors, all frames at once -----------------------------------------------------
 
@@ -244,8 +252,9 @@ class Look:
 
         The latter two are (W, W).
         """
-        channel, (residual, taken) = self.problem.channels[i], self._parts[i]
-        n, lamp = channel.shape[1], taken[1, :, f, self.tangent.shape[1] :]
+        channel, residual = self.problem.channels[i], self._parts[i][0]
+        n, rows = channel.shape[1], self.problem.segments[i]
+        lamp = self.lamps[i][rows].reshape(*channel.shape, -1)[1, :, f]
         single = np.zeros((n, *channel.shape))
         single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
         whiten = channel.whiten_frames(single)[:, 1, :, f].T
@@ -354,8 +363,15 @@ class Frame:
         beams = [self.beam(law[:, : n + 1], side) for n in range(law.shape[1]) for side in sides]
         # every wavelength of the frame is off by its own amount, or one alone
         width = np.log1p((_ANY * self.weight) ** 2)
-        unknown = Trial("unknown", 0.0, float(width[self.valid].sum()))
-        return [*stages, *beams, *self.wavelength(width, sides), unknown]
+        unknown = [Trial("unknown", 0.0, float(width[self.valid].sum()))]
+        if not self.single:
+            # in its differences, or in its sums, too
+            missed, whiten = self._sums
+            freed = np.log1p(_ANY**2 * np.linalg.eigvalsh(whiten.T @ whiten).clip(0)).sum()
+            unknown.append(
+                Trial("unknown", -float(missed @ missed), unknown[0].cost + float(freed))
+            )
+        return [*stages, *beams, *self.wavelength(width, sides), *unknown]
 
     def wavelength(self, width, sides):
         """Return the trials in which the data of one wavelength are off, of three or more."""

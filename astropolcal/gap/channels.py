@@ -85,16 +85,18 @@ class Channels:
 
     # ---- noise and lamp -----------------------------------------------------------------
 
-    def set_noise(self, sigma, residual, saturating):
+    def set_noise(self, sigma, residual, saturating, without=None):
         """
-        Set the noise of both channels, (2, W, F), and fit the lamp.
+        Set the noise of both channels, (2, W, F), and fit the lamp, some frames (F,) aside.
 
         The sums of the residual, (2, W, F), tell how the lamp drifts and flickers. What optics
         could do to the sum of a frame, columns (F, k), is taken away first, lest a missing optic be
         taken for a restless lamp.
         """
         if self.groups is None:
-            weight = np.where(self.valid, 1 / sigma[1], 0.0)
+            weight = np.where(
+                self.valid & ~(np.array(False) if without is None else without), 1 / sigma[1], 0.0
+            )
             self.lamp = _Lamp(residual[1], weight, self.sequence, saturating)
         else:
             self.lamp = _GroupLamp(self.groups)

@@ -37,6 +37,9 @@ _CERTAIN = 0.99
 _TELLS, _DECIDED = 0.95, 0.8
 # brightness off by so many robust standard deviations is at odds with the drift of the lamp
 _FAR, _LARGEST_DRIFT = 6.0, 4
+# share of the frames, those nearest to the drift, that tell it: a drift at the end of a run is in
+# more than the other tenth; and the mean deviation of these for noise of unit width
+_TRUSTED, _OF_TRUSTED = 0.9, 0.657
 # chance of a false accusation in a run, and the share of the frames that may be accused
 _ALPHA = 1e-3
 _MOST, _LEAST_MOST = 0.05, 2
@@ -87,6 +90,8 @@ class FrameFault:
     #: That it is this, and neither noise nor another of these faults.
     probability: float = 0.0
     words: str = ""
+    #: ``"right"`` or ``"left"``, where the data tell which beam is off.
+    beam: str | None = None
     #: Index of the dataset and of the frame, and of that with which it was exchanged.
     place: tuple = field(default=(0, 0), repr=False)
     partner_place: tuple | None = field(default=None, repr=False)
@@ -95,7 +100,17 @@ class FrameFault:
 
     def to_dict(self):
         """Return the fault as JSON holds it (dict)."""
-        names = ("dataset", "frame", "what", "value", "error", "evidence", "probability", "words")
+        names = (
+            "dataset",
+            "frame",
+            "what",
+            "value",
+            "error",
+            "evidence",
+            "probability",
+            "words",
+            "beam",
+        )
         return {name: getattr(self, name) for name in names} | {"with": self.with_}
 
 
@@ -342,6 +357,7 @@ def _fault(problem, place, trial, evidence, probability):
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()
     numbers, names = observations.frames["frame"], frame_names(observations.frames)
     told_of = {"evidence": evidence, "probability": probability, "place": place, "bin": trial.bin}
+    told_of["beam"] = trial.beam or None
     fault = FrameFault(observations.name, int(numbers[f]), trial.what, **told_of)
     if np.isfinite(value):
         fault.value, fault.error = value, error
@@ -438,10 +454,11 @@ def _off_the_drift(channel, gap):
     # the curve whose median deviation is least for what its degree costs
     for degree in range(min(_LARGEST_DRIFT, n // 4) + 1):
         curve = robust_curve(2 * channel.sequence - 1, common, degree)
-        middle = np.nanmedian(np.abs(common - curve))
+        off = np.sort(np.abs(common - curve))[: int(np.ceil(_TRUSTED * n))]
+        middle = np.mean(off) if off.size else np.nan
         cost = n * np.log(max(middle, 1e-12)) + degree * np.log(max(n, 2))
         if cost < least:
-            least, deviation, spread = cost, common - curve, np.fmax(MAD_TO_SIGMA * middle, error)
+            least, deviation, spread = cost, common - curve, np.fmax(middle / _OF_TRUSTED, error)
     return deviation, deviation / spread
 
 

@@ -301,7 +301,7 @@ class GapProblem:
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
             told = noise(channel, residual, angles, dataset.bins, out)
-            channel.set_noise(told, residual, saturating)
+            channel.set_noise(told, residual, saturating, out)
             found.append(expected_fluxes(channel, dataset.forward(self.vector(q))))
         self.fluxes, self.flickering = map(list, zip(*found, strict=True))
 

@@ -120,6 +120,20 @@ def test_datum_of_one_wavelength_that_was_off():
         assert np.argwhere(kept.mask).tolist() == [[frame, k]]
 
 
+def test_frame_whose_wavelengths_are_others_is_named_for_no_reason_that_is_known():
+    """What its sums are off by must not be taken for the brightness of all frames."""
+    (polarized, lamp), chains, _ = make_challenge(1, kind="none")
+    for change in (lambda beam: np.roll(beam, 1), lambda beam: beam[::-1]):
+        seen = lamp.to_table()
+        for beam in ("flux_right", "flux_left"):
+            flux = seen[beam].reshape(lamp.n_frames, -1)
+            flux[20] = change(flux[20])
+            seen[beam] = flux.ravel()
+        shifted = Observations.from_table(seen, name="lamp")
+        (fault,) = harmful(all_faults(nominal_model(chains, [polarized, shifted])))
+        assert (fault.frame, fault.what, fault.dataset) == (20, "unknown", "lamp")
+
+
 def test_one_wavelength_of_three_is_no_beam():
     setup = SETUPS["vampires"]()
     for factors, what in (((1, 1.1, 1), "one wavelength"), ((1.03, 1.05, 1.02), "one beam")):
@@ -236,6 +250,9 @@ def test_lamp_is_named_and_not_masked():
     seen = observed(lamp=np.where(np.arange(N) == 9, 0.9, 1.0))
     (fault,) = found(seen)
     assert (fault.frame, fault.what) == (9, "lamp")
+    # one that grows brighter towards the end of a run drifts
+    brighter = 1 + 0.03 * np.clip((np.arange(N) - 36) / 12, 0, 1) ** 2
+    assert found(observed(lamp=brighter)) == []
     np.testing.assert_allclose(fault.value, 0.9, atol=0.01)
     assert not without_frames([seen], [fault])[0].mask.any()
 
