@@ -59,6 +59,8 @@ class Course:
     gained, behind : float
         By how much more than the causes that were found it lowers chi-square, beyond what its
         larger freedom gains from noise; by how much less, in standard deviations of that.
+    shape : str
+        In which frames and wavelengths it is, in words; empty where it is everywhere.
     p_value : float
         Probability that noise alone lowers chi-square so much, for this place and kind alone.
     """
@@ -74,6 +76,7 @@ class Course:
     freedom: int = 0
     gained: float = -np.inf
     behind: float = np.inf
+    shape: str = ""
     p_value: float = 1.0
 
     @property
@@ -82,15 +85,15 @@ class Course:
         what = Cell(self.place, self.kind, "constant").title
         return f"{what}, with a course through the run that no table has"
 
-    def shape(self, model):
-        """Return in which frames and wavelengths it is, in words; empty where it is everywhere."""
+    def find_shape(self, model):
+        """Find in which frames and wavelengths it is."""
         size, nm = np.abs(self.law), np.round(1000 * model.problem.wavelength).astype(int)
         there = np.flatnonzero(size > _PART * size.max())
         few = bool(len(there) == np.ptp(there) + 1 <= len(size) / 2)
         sharp = few and bool(np.sum(size[there] ** 2) > _NEARLY * np.sum(size**2))
         ends = dict.fromkeys(nm[[there[0], there[-1]]])
         found = [self._when(model.observations), f"at {'-'.join(map(str, ends))} nm" * sharp]
-        return ", ".join(filter(None, found))
+        self.shape = ", ".join(filter(None, found))
 
     def _when(self, observations):
         names = [name for o in observations for name in frame_names(o.frames)]
@@ -135,12 +138,15 @@ class Course:
 
     def _of_period(self, start, size, of):
         """Return the period, in words, that explains most of one dataset, and its waves (F, 2)."""
-        rates = np.linspace(1.5 / size, 1 / 3, 4 * size)
-        waves = np.zeros((len(rates), len(self.equations[0]), 2))
-        phases = 2 * np.pi * rates[:, None] * np.arange(size)
-        waves[:, start : start + size] = np.stack([np.cos(phases), np.sin(phases)], axis=-1)
-        best = max(range(len(rates)), key=lambda n: self._share(waves[n]))
-        return f"with a period of about {1 / rates[best]:.0f} frames{of}", waves[best]
+
+        def waves(rate):
+            found, phase = np.zeros((len(self.equations[0]), 2)), 2 * np.pi * rate * np.arange(size)
+            found[start : start + size] = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            return found
+
+        rates = np.linspace(min(1.5 / size, 1 / 3), 1 / 3, max(4 * size // 3, 1))
+        best = max(rates, key=lambda rate: self._share(waves(rate)))
+        return f"with a period of about {1 / best:.0f} frames{of}", waves(best)
 
     def _normal(self, courses):
         """Return the normal equations of courses (F, n), less what model and lamp absorb."""

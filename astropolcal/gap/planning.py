@@ -44,8 +44,8 @@ _LEVELS = (0.5, 2.0)
 _NEW_ANGLES, _LONGEST = 3, 128
 # a stage that modulates without such a plate is turned by so much (degree)
 _TURNED_BY = (22.5, 45.0)
-# an alias of a smaller share is not asked about; so many are
-_LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
+# a cause, and an alias of a smaller share, is not asked about; so many are
+_LEAST_CHANCE, _LEAST_SHARE, _MOST_MEMBERS = 0.05, 0.02, 6
 # of the doubt, the least that an exposure has to take; what a change of the set-up and a frame
 # have to bring
 _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
@@ -257,7 +257,8 @@ def plan(diagnosis, candidates=None):
     ``probability_after``, that the true one is expected to have, None for parameters. The questions
     are in the order of the causes.
     """
-    model, groups, lines = diagnosis.improved, _groups(diagnosis), _repetitions(diagnosis)
+    model, groups = diagnosis.improved, _groups(diagnosis)
+    lines = [*_moved(diagnosis), *_repetitions(diagnosis)]
     forecast = Forecast(model, [recipe for group in groups for _, recipe, _ in group])
     # a member may have lost its place to another one
     groups = [[one for one in group if one[0] in forecast.own] for group in groups]
@@ -286,7 +287,7 @@ def plan(diagnosis, candidates=None):
 def _groups(diagnosis):
     """Return name, recipe and probability of the aliases of every cause."""
     found = []
-    for cause in diagnosis.causes:
+    for cause in (one for one in diagnosis.causes if one.probability > _LEAST_CHANCE):
         members = {cause.cell or cause.name: [cause.name, (cause.effect, None), cause.share]}
         for one, share in cause.aliases:
             # a name and its cell are one cause
@@ -371,6 +372,23 @@ def _repetitions(diagnosis):
     take = f"the run of {name} {_REPEATS} times"
     found = _line(take, purpose, "structure", [], float(gain), 0.5, float(ndtr(gain)))
     return [found] if gain > LEAST_GAIN else []
+
+
+def _moved(diagnosis):
+    """Return the line on how to know whether a course follows a stage or happened once."""
+    for one in diagnosis.courses[:1] if diagnosis.verdict == "unexplained" else ():
+        told = [np.sum((wave / std) ** 2) for wave, std in zip(one.wave, one.std, strict=True)]
+        model, gain = diagnosis.improved, np.sqrt(max(one.lowered - one.freedom, 0.0))
+        seen = model.observations[int(np.argmax(told))]
+        if any(stage in _SKY for chain in model.trains for stage in stages(chain)):
+            continue
+        purpose = (
+            "tells whether the one thing that may be it follows a stage, with whose angles it "
+            f"moves, or what happened in these frames, at {_sigmas(gain)} standard deviations"
+        )
+        take = f"the frames of {seen.name} in shuffled order"
+        return [_line(take, purpose, "structure", [], float(gain), 0.5, float(ndtr(gain)))]
+    return []
 
 
 def _fixing(forecast, directions, foreseen):

@@ -189,18 +189,15 @@ def _courses(diagnosis):
     """Return what may be in place of all causes, as places where the gap lies."""
     model = diagnosis.nominal
     excess = max(model.fit.chi2 - model.linear.freedom, 1e-300)
-    found = [(one, one.shape(model)) for one in diagnosis.courses]
-    # one that is at some time is simpler than one of any course
-    found.sort(key=lambda each: not each[1])
     return [
         {
             "axis": "course",
-            "detail": f"{one.words}: {shape}" if shape else one.words,
+            "detail": f"{one.words}: {one.shape}" if one.shape else one.words,
             "share": min(one.lowered / excess, 1.0),
             "p_value": one.p_value,
             "kind": "place",
         }
-        for one, shape in found
+        for one in diagnosis.courses
     ]
 
 

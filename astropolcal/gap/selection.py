@@ -185,7 +185,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = _alike_courses(_real_courses(base, base, runs))
+        seen = _alike_courses(base, _real_courses(base, base, runs))
         return Selection([], base, first, 0.0, [_errors(base, groups)], seen)
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
@@ -206,7 +206,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
     told = rivals if max(chances, default=0.0) > _MAY_BE else []
-    return Selection(found, best.model, first, unlisted, history, _alike_courses(told))
+    return Selection(found, best.model, first, unlisted, history, _alike_courses(base, told))
 
 
 def _real_courses(model, base, runs):
@@ -215,10 +215,13 @@ def _real_courses(model, base, runs):
     return [one for one in found if one.p_value * len(found) < REMAINDER]
 
 
-def _alike_courses(found):
-    """Return the best courses, which the data do not tell apart."""
+def _alike_courses(base, found):
+    """Return the best courses, which the data do not tell apart, those of a simple shape first."""
     near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
-    return [o for o, noise in zip(found, near, strict=True) if o.gained > found[0].gained - noise]
+    best = [o for o, noise in zip(found, near, strict=True) if o.gained > found[0].gained - noise]
+    for one in best:
+        one.find_shape(base)
+    return sorted(best, key=lambda one: not one.shape)
 
 
 def _errors(model, groups):

@@ -31,14 +31,29 @@ def full(model):
     return model.with_effect(get_effect(PAIR[0]))
 
 
+def answer(model, causes=(), p=1.0, courses=()):
+    return SimpleNamespace(
+        improved=model,
+        causes=causes,
+        remainder_p_value=p,
+        courses=courses,
+        verdict="unexplained",
+    )
+
+
 def asked(model, *members, p=1.0):
     """Return a diagnosis that cannot tell some causes apart: effects and their probabilities."""
     first, *others = ((get_effect(one), share) for one, share in members)
     alias = [(SimpleNamespace(name=e.name, cell=None, recipe=(e, None)), c) for e, c in others]
     cause = SimpleNamespace(
-        effect=first[0], name=first[0].name, cell=None, share=first[1], aliases=alias
+        effect=first[0],
+        name=first[0].name,
+        cell=None,
+        share=first[1],
+        aliases=alias,
+        probability=0.9,
     )
-    return SimpleNamespace(improved=model, causes=[cause], remainder_p_value=p)
+    return answer(model, [cause], p)
 
 
 def even(model, *effects):
@@ -46,7 +61,7 @@ def even(model, *effects):
 
 
 def open_only(model):
-    return SimpleNamespace(improved=model, causes=[], remainder_p_value=1.0)
+    return answer(model)
 
 
 def test_aliases_are_told_apart(full):
@@ -195,7 +210,7 @@ def test_a_modulator_has_both_states():
 
 def test_structure_without_a_cause_wants_the_run_again(model):
     """Residuals that nothing explains: repetitions tell structure from noise larger than stated."""
-    unexplained = SimpleNamespace(improved=model, causes=[], remainder_p_value=1e-20)
+    unexplained = answer(model, p=1e-20)
     (found,) = plan(unexplained)
     assert found["question"] == "structure"
     assert found["words"].startswith("Take the run of lamp 3 times")
@@ -204,7 +219,17 @@ def test_structure_without_a_cause_wants_the_run_again(model):
         0.5,
         pytest.approx(1, abs=0.01),
     )
-    assert plan(SimpleNamespace(improved=model, causes=[], remainder_p_value=0.5)) == []
+    assert plan(answer(model, p=0.5)) == []
+
+
+def test_a_course_wants_another_order_and_an_improbable_cause_nothing(full):
+    course = SimpleNamespace(lowered=400.0, freedom=39, wave=[np.ones(4)], std=[np.ones(4)])
+    improbable = even(full, *PAIR).causes
+    improbable[0].probability = 0.01
+    (found,) = plan(answer(full, improbable, courses=[course]))
+    assert found["exposure"] == "Take the frames of lamp in shuffled order"
+    assert (found["question"], found["gain"]) == ("structure", 19)
+    assert plan(answer(full, improbable)) == []
 
 
 def test_the_run_to_take_again_is_that_with_most_structure_in_its_data():
@@ -213,7 +238,7 @@ def test_the_run_to_take_again_is_that_with_most_structure_in_its_data():
     runs = [observed(with_effect("beam_gain", imbalance=size), name=n) for n, size in sizes.items()]
     half = np.tile((np.arange(32) % 2 == 0)[:, None], len(WAVELENGTH))
     model = fitted([runs[0], runs[1].with_mask(half, "clouds")])
-    (found,) = plan(SimpleNamespace(improved=model, causes=[], remainder_p_value=1e-20))
+    (found,) = plan(answer(model, p=1e-20))
     assert found["exposure"] == "Take the run of run: more 3 times"
     assert found["words"].startswith(f"{found['exposure']}: tells structure")
 
