@@ -125,7 +125,7 @@ class Selection:
 
     ``scan`` is the evidence beside the base, ``unlisted`` the probability of a cause that no table
     has, and ``history`` the errors on left-out frames of the base and after each cause. One of the
-    ``courses`` may be in place of all causes; for several runs none is asked for.
+    ``courses`` may be in place of all causes.
     """
 
     groups: list
@@ -185,7 +185,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = _alike_courses(base, _real_courses(base, base, runs))
+        seen = _alike_courses(base, _real_courses(base, base))
         return Selection([], base, first, 0.0, [_errors(base, groups)], seen)
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
@@ -201,17 +201,19 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = _real_courses(best.model, base, runs)
-    chances = [_of_course(len(best.chosen), one.behind) for one in rivals]
+    rivals = _real_courses(best.model, base)
+    # what changed between runs has two causes, and one course in all of them: that is no evidence
+    count = 1 if runs > 1 else len(best.chosen)
+    chances = [_of_course(count, one.behind) for one in rivals]
     unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
     found = _grouped(task, best, steps, scans, unlisted, stable)
     told = rivals if max(chances, default=0.0) > _MAY_BE else []
     return Selection(found, best.model, first, unlisted, history, _alike_courses(base, told))
 
 
-def _real_courses(model, base, runs):
-    """Return the courses that noise does not make, of so many looks; none of several runs."""
-    found = courses(model, base) if runs < 2 else []
+def _real_courses(model, base):
+    """Return the courses that noise does not make, of so many looks."""
+    found = courses(model, base)
     return [one for one in found if one.p_value * len(found) < REMAINDER]
 
 
@@ -675,10 +677,10 @@ def _rivals_beside(found, own, library):
 
 
 def _gains(new, fresh, old, one):
-    """Whether a full fit with another cause keeps what the scan promised."""
+    """Whether a full fit with another cause is worth what its freedom costs more."""
     scale = max(1.0, min(new.mean_square, old.mean_square))
     lost = 0.5 * (new.fit.chi2 - old.fit.chi2) / scale
-    return lost < max(one.cost(scale) - fresh.cost(scale), 0.0) + _CLEARLY
+    return lost < one.cost(scale) - fresh.cost(scale) + _CLEARLY
 
 
 def _unlisted(base, best, stable, instead):
