@@ -276,11 +276,15 @@ def _basis(columns, rows):
     kept = columns * rows[:, None]
     norm = np.linalg.norm(kept, axis=0)
     seen = norm > 0
-    left, singular, right = np.linalg.svd(kept[:, seen] / norm[seen], full_matrices=False)
-    good = singular > _SEEN * singular.max(initial=0.0)
-    full = columns[:, seen] / norm[seen] @ (right[good].T / singular[good])
-    # what was in the basis need not be worked out again, and is more exact
-    return np.where(rows[:, None], left[:, good], full), left[:, good]
+    scaled = columns[:, seen] / norm[seen]
+    basis, mix = scaled * rows[:, None], np.eye(int(seen.sum()))
+    # by the small matrix of products, and once more for what that has rounded
+    for least in (_SEEN**2, 0.5):
+        values, vectors = np.linalg.eigh(basis.T @ basis)
+        good = values > least * values.max(initial=0.0)
+        mix = mix @ (vectors[:, good] / np.sqrt(values[good]))
+        basis = scaled @ mix * rows[:, None]
+    return np.where(rows[:, None], basis, scaled @ mix), basis
 
 
 @dataclass
