@@ -210,6 +210,22 @@ def test_what_an_optic_of_one_run_brought():
     assert "only one run has (dichroic)" in content["sentences"][-1]
 
 
+@pytest.mark.slow
+def test_steps_in_one_of_two_runs_are_no_harmonic_of_a_stage():
+    """They look like one; a course in that run does better, and has its steps."""
+    first, table = (
+        data.observed(seed=3, name=JULY),
+        data.observed(seed=4, name=OCTOBER).to_table(),
+    )
+    grown = 1 + 0.01 * ((table["frame"] > 8).astype(float) + (table["frame"] > 20))
+    table["flux_right"] *= grown
+    second = Observations.from_table(table, name=OCTOBER)
+    found = diagnose(data.chain(), [first, second], cross_validate=False)
+    assert max(cause.probability for cause in found.causes) < 0.5
+    assert found.courses[0].shape == f'with steps at frames 9 and 21 of "{OCTOBER}"'
+    assert "gain" in found.courses[0].kind
+
+
 # ---- parts -------------------------------------------------------------------------------------
 
 

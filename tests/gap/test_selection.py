@@ -196,6 +196,17 @@ def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
 
 
 @pytest.mark.slow
+def test_a_cause_of_one_number_is_not_exchanged_for_one_of_much_freedom():
+    """To first order the other does better; a full fit gains less than its freedom costs."""
+    making = np.random.SeedSequence(176, spawn_key=(509,)).spawn(2)[1]
+    how = {"kind": "listed", "snr": 102.2}
+    observations, chains, case = make_challenge(np.random.default_rng(making), **how)
+    diagnosis = diagnose(chains, observations, cross_validate=False)
+    assert score_answer(case, to_dict(diagnosis)) == "right"
+    assert diagnosis.verdict == "named"
+
+
+@pytest.mark.slow
 def test_two_causes_that_follow_the_same_thing_may_be_one_that_no_table_has():
     setup = SETUPS["charis"]()
     first = Cell("in:hwp", "diattenuation_h", "harmonic:derotator:1")
