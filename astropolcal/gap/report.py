@@ -196,6 +196,7 @@ def _courses(diagnosis):
             "share": min(one.lowered / excess, 1.0),
             "p_value": one.p_value,
             "kind": "place",
+            "cell": {"place": one.place, "kind": one.kind, "dependence": None},
         }
         for one in diagnosis.courses
     ]

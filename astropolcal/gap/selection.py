@@ -488,7 +488,9 @@ def _extensions(task, states, known, most, least):
     instead = partial(_in_place, replace(task, library=names))
     fitted = _fitted(_grown(states, known, most)[:most], instead)
     if not k:
-        fitted += _far(states[0], known[states[0].outline], fitted, instead)
+        found = known[states[0].outline]
+        fitted += _far(states[0], found, fitted, instead)
+        fitted += _simple(states[0], found, fitted, instead)
     fitted = sorted(fitted, key=preference)
     return fitted if fitted and fitted[0].evidence >= least else []
 
@@ -530,10 +532,30 @@ def _far(state, found, fitted, instead):
     """
     if found.temper < _STRUCTURED:
         return []
-    known = {one for grown in fitted for one in grown.outline}
     least = _FAR_PROMISE * found.best.evidence
     simple = [o for o in found.candidates if o.is_named and o.rank == 1 and o.evidence > least]
-    new = (one for one in simple[: _FITTED[0]] if one.name not in known)
+    return _new(state, simple[: _FITTED[0]], fitted, instead)
+
+
+def _simple(state, found, fitted, instead):
+    """
+    Return sets of one cause of little freedom, where one of much freedom explains all.
+
+    Two of them may be what is there.
+    """
+    best = max(fitted, key=attrgetter("evidence"), default=None)
+    if best is None or not best.is_dear or best.model.p_value < REMAINDER:
+        return []
+    least = _HALF * found.best.evidence
+    most = _HALF * best.chosen[0].cost(1.0)
+    few = [one for one in found.candidates if one.evidence > least and one.cost(1.0) < most]
+    return _new(state, _distinct(few, _FITTED[1]), fitted, instead)
+
+
+def _new(state, added, fitted, instead):
+    """Return the sets with each of some causes, fitted in full, that are not among those fitted."""
+    known = {one for grown in fitted for one in grown.outline}
+    new = (one for one in added if one.name not in known)
     grown = [_extended(state.evidence + one.evidence, state, (one,), instead) for one in new]
     return [one for one in grown if one is not None]
 

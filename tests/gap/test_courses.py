@@ -82,6 +82,8 @@ def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
     assert (place, kind) in where, where
     assert content["verdict"] == "unexplained"
     assert content["where"][0]["share"] > 0.9
+    cells = [one["cell"] for one in content["where"] if one["axis"] == "course"]
+    assert {"place": place, "kind": kind, "dependence": None} in cells
     # before the causes that do less
     assert content["sentences"][0] == "I do not know what the model lacks."
     assert "course through the run" in content["sentences"][1]
