@@ -38,45 +38,30 @@ _ABSORBED = 1e-6
 
 @dataclass
 class Course:
-    """
-    A perturbation with a size of its own in every frame.
-
-    Parameters
-    ----------
-    place, kind : str
-        As in `Cell`.
-    reduced : Reduced or None
-        Sums over the wavelengths of its derivatives, during the fit.
-    law : `~numpy.ndarray`
-        The law in wavelength, (W,), which is 1 where it is largest; coefficients during the fit.
-    wave, std : list of `~numpy.ndarray`
-        The course in each dataset, (F,), radian or shares, and its errors, without what model and
-        lamp absorb; zero and infinite in frames that do not tell it.
-    equations : tuple
-        Which frames tell it, and its whitened normal equations there.
-    lowered, freedom : float, int
-        By how much it lowers chi-square, and by how many directions.
-    gained, behind : float
-        By how much more than the causes that were found it lowers chi-square, beyond what its
-        larger freedom gains from noise; by how much less, in standard deviations of that.
-    shape : str
-        In which frames and wavelengths it is, in words; empty where it is everywhere.
-    p_value : float
-        Probability that noise alone lowers chi-square so much, for this place and kind alone.
-    """
+    """A perturbation with a size of its own in every frame; place and kind are as in `Cell`."""
 
     place: str
     kind: str
+    #: Sums over the wavelengths of its derivatives, during the fit.
     reduced: Reduced | None
+    #: The law in wavelength, (W,), which is 1 where it is largest; coefficients during the fit.
     law: np.ndarray
+    #: The course in each dataset, (F,), radian or shares, and its errors, without what model and
+    #: lamp absorb; zero and infinite in frames that do not tell it.
     wave: list = field(default_factory=list)
-    equations: tuple = ()
     std: list = field(default_factory=list)
+    #: Which frames tell it, and its whitened normal equations there.
+    equations: tuple = ()
+    #: By how much it lowers chi-square, and by how many directions.
     lowered: float = 0.0
     freedom: int = 0
+    #: By how much more than the causes that were found it lowers chi-square, beyond what its larger
+    #: freedom gains from noise; by how much less, in standard deviations of that.
     gained: float = -np.inf
     behind: float = np.inf
+    #: In which frames and wavelengths it is, in words; empty where it is everywhere.
     shape: str = ""
+    #: Probability that noise alone lowers chi-square so much, for this place and kind alone.
     p_value: float = 1.0
 
     @property
