@@ -702,7 +702,10 @@ def _gains(new, fresh, old, one):
     """Whether a full fit with another cause is worth what its freedom costs more."""
     scale = max(1.0, min(new.mean_square, old.mean_square))
     lost = 0.5 * (new.fit.chi2 - old.fit.chi2) / scale
-    return lost < one.cost(scale) - fresh.cost(scale) + _CLEARLY
+    cheaper = one.cost(scale) - fresh.cost(scale)
+    # a name has the freedom of what it is, which is favoured over its cell
+    is_name = fresh.is_named and not one.is_named and one.cell in fresh.effect.cells(old.trains)
+    return lost < (max(cheaper, 0.0) if is_name else cheaper) + _CLEARLY
 
 
 def _unlisted(base, best, stable, instead):
