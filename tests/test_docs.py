@@ -149,8 +149,7 @@ def test_metadata_of_the_software_agree(repository):
 # ---- the gallery of models -----------------------------------------------------------------
 
 
-# the pages themselves are built by .ci/run
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_optic_has_a_page(gallery):
     for name in OPTICS:
         page = gallery["pages"].optic_page(name, "wavelength", "somewhere")

@@ -254,7 +254,7 @@ def plan(diagnosis, candidates=None):
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
     the standard deviations at which they come apart, or at which a change of that direction by 0.01
     (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
-    ``probability_after``, that the true one is expected to have, None for parameters. The questions
+    ``probability_after``, that the true one is expected to have, None for parameters and courses. The questions
     are in the order of the causes.
     """
     model, groups = diagnosis.improved, _groups(diagnosis)
@@ -383,11 +383,12 @@ def _moved(diagnosis):
         if any(stage in _SKY for chain in model.trains for stage in stages(chain)):
             continue
         purpose = (
-            "tells whether the one thing that may be it follows a stage, with whose angles it "
-            f"moves, or what happened in these frames, at {_sigmas(gain)} standard deviations"
+            "may tell whether the one thing that may be it follows a stage, with whose angles it "
+            f"moves, or what happened in these frames; it stands out at {_sigmas(gain)} standard "
+            "deviations now"
         )
         take = f"the frames of {seen.name} in shuffled order"
-        return [_line(take, purpose, "structure", [], float(gain), 0.5, float(ndtr(gain)))]
+        return [_line(take, purpose, "structure", [], float(gain))]
     return []
 
 
