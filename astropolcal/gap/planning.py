@@ -254,8 +254,8 @@ def plan(diagnosis, candidates=None):
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
     the standard deviations at which they come apart, or at which a change of that direction by 0.01
     (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
-    ``probability_after``, that the true one is expected to have, None for parameters and courses. The questions
-    are in the order of the causes.
+    ``probability_after``, that the true one is expected to have, None for parameters and courses.
+    The questions are in the order of the causes.
     """
     model, groups = diagnosis.improved, _groups(diagnosis)
     lines = [*_moved(diagnosis), *_repetitions(diagnosis)]

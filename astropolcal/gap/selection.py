@@ -513,9 +513,8 @@ def _fitted(grown, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
-        share = (
-            _HALF if any(o.is_dear and o.model.p_value > REMAINDER for o in found) else _PROMISING
-        )
+        is_dear = any(one.is_dear and one.model.p_value > REMAINDER for one in found)
+        share = _HALF if is_dear else _PROMISING
         if promised - state.evidence < share * (most - state.evidence):
             break
         one = _extended(promised, state, added, instead)
