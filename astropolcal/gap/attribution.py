@@ -23,8 +23,8 @@ from astropolcal.optics.perturbations import split_run
 
 __all__ = []
 
-# sizes of the prior, in units of the usual one
-_SIZES = (0.1, 1.0, 10.0)
+#: Sizes of the prior, in units of the usual one.
+PRIOR_SIZES = (0.1, 1.0, 10.0)
 # laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
 # None for one value per wavelength
 _DEGREES, _FREER = (0, 2), (4, None)
@@ -103,10 +103,6 @@ class Candidate:
     def recipe(self):
         """Effect and context, as `Model.with_effects` takes them."""
         return self.effect, self.context
-
-    def cost(self, temper):
-        """Return what its freedom costs, in the logarithm of the evidence."""
-        return 0.5 * self.statistic / temper - (self.tempered(temper).evidence - self.prior)
 
     @cached_property
     def effect(self):
@@ -364,15 +360,15 @@ def _spectra(gram, target):
 
 def _log_factor(values, share, scale, temper):
     """Return the log Bayes factor against no such cause, shape (n,)."""
-    spreads = np.square(scale * np.array(_SIZES))[:, None, None] / temper
+    spreads = np.square(scale * np.array(PRIOR_SIZES))[:, None, None] / temper
     gains = share / temper * (spreads * values / (1 + spreads * values))
     each = 0.5 * (gains - np.log1p(spreads * values)).sum(axis=2)
-    return np.logaddexp.reduce(each, axis=0) - np.log(len(_SIZES))
+    return np.logaddexp.reduce(each, axis=0) - np.log(len(PRIOR_SIZES))
 
 
 def _rank(values, scale):
     """Return in how many directions even a large size would show."""
-    return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
+    return (np.square(scale * PRIOR_SIZES[-1]) * values > 1).sum(axis=-1)
 
 
 def _named(probes, effects, temper, degree="default", others=()):

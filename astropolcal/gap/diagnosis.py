@@ -417,7 +417,8 @@ def _share_of(effect, nominal, base, selection, chosen, say):
     temper = max(1.0, min(one.model.mean_square for one in (selection, other)))
 
     def evidence(one):
-        cost = sum(ENOUGH + group.best.cost(temper) for group in one.groups)
+        costs = one.model.costs(temper)
+        cost = sum(ENOUGH + costs.get(group.best.name, 0.0) for group in one.groups)
         unlisted = np.log(max(1 - one.unlisted, _LEAST))
         return unlisted - cost - 0.5 * one.model.fit.chi2 / temper
 

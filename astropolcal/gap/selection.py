@@ -61,6 +61,8 @@ _NAMES = 2
 _AMONG = 12
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
+# evidence of sets is compared to so many decimals
+_DECIMALS = 3
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
@@ -139,11 +141,20 @@ class Selection:
 
 @dataclass
 class _State:
-    """A set of causes, its model, and the logarithm of its evidence."""
+    """A set of causes, and its model."""
 
     model: object
     chosen: list = field(default_factory=list)
-    evidence: float = 0.0
+
+    def evidence(self, temper):
+        """Return the logarithm of the evidence, up to what is the same for all sets."""
+        costs = self.model.costs(temper)
+        costs = sum(costs.get(one.name, 0.0) - one.prior for one in self.chosen)
+        return -0.5 * self.model.fit.chi2 / temper - costs
+
+    def worth(self, temper):
+        """Return the same with the prior odds against every cause."""
+        return self.evidence(temper) - ENOUGH * len(self.chosen)
 
     @property
     def outline(self):
@@ -156,7 +167,7 @@ class _State:
     @property
     def is_dear(self):
         """Whether one cause alone has much freedom."""
-        return len(self.chosen) == 1 and self.chosen[0].cost(1.0) > _DEAR
+        return len(self.chosen) == 1 and sum(self.model.costs(1.0).values()) > _DEAR
 
 
 @dataclass
@@ -173,6 +184,15 @@ class _Task:
     def fitted(self, chosen, like, **how):
         """Return the base with causes, fitted in full."""
         return self.base.with_effects([one.recipe for one in chosen], like=like, **how)
+
+    def quickly(self, chosen, like):
+        """Return a set of causes, fitted well enough to be compared."""
+        return _State(self.fitted(chosen, like, **_QUICK), chosen)
+
+
+def _temper(*states):
+    """Return the variance of residuals, in units of noise, by which sets are compared."""
+    return max(1.0, min(one.model.mean_square for one in states))
 
 
 def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST):
@@ -235,19 +255,16 @@ def _merged(task, best):
     """Return the set with two causes exchanged for one that does what both do."""
     if not _MERGED[0] <= len(best.chosen) <= _MERGED[1]:
         return best
-    temper, found = max(1.0, best.model.mean_square), best
+    temper, found = _temper(best), best
     for pair in combinations(best.chosen, 2):
         task.say(f"as one cause: {' and '.join(one.effect.title for one in pair)}")
         others = [one for one in best.chosen if one not in pair]
         beside = task.fitted(others, best.model, **_QUICK)
         seen = scan(beside, task.library, cells=task.cells, temper=temper)
         for one in _best_of(seen, _FITTED[-1]):
-            model = beside.with_effects([one.recipe], **_QUICK)
-            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
-            gained = sum(o.cost(temper) for o in pair) - one.cost(temper) - lost
-            if gained > -ENOUGH and model.is_physical(one.name):
-                state = _State(model, [*others, one], best.evidence + gained)
-                found = max(found, state, key=lambda s: s.evidence - ENOUGH * len(s.chosen))
+            state = _State(beside.with_effects([one.recipe], **_QUICK), [*others, one])
+            if state.model.is_physical(one.name):
+                found = max(found, state, key=lambda state: state.worth(temper))
     return found
 
 
@@ -258,7 +275,7 @@ def _with_axes(task, best):
     An optic that turns with a stage has a second harmonic of it in each component of a static
     frame: four numbers for the two components in its own frame.
     """
-    temper = max(1.0, best.model.mean_square)
+    temper = _temper(best)
     stages = {leaf.stage: leaf.name for chain in task.base.trains for leaf in leaves(chain)}
     for pair in combinations([one for one in best.chosen if one.cell is not None], 2):
         kinds, patterns = ({getattr(o.cell, key) for o in pair} for key in ("kind", "dependence"))
@@ -278,11 +295,8 @@ def _with_axes(task, best):
                 break
             chosen = [*chosen, seen.freer(fresh)]
         else:
-            model = task.fitted(chosen, best.model, **_QUICK)
-            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
-            dearer = sum(o.cost(temper) for o in chosen) - sum(o.cost(temper) for o in best.chosen)
-            if lost + dearer < 0:
-                best = _State(model, chosen, best.evidence - lost - dearer)
+            turned = task.quickly(chosen, best.model)
+            best = max(best, turned, key=lambda state: state.evidence(temper))
     return best
 
 
@@ -319,8 +333,7 @@ def _checked(task, best):
         if not worse:
             return best, steps, history
         chosen = [one for i, one in enumerate(best.chosen) if i not in worse]
-        model = task.fitted(chosen, best.model)
-        best = _State(model, chosen, best.evidence - sum(best.chosen[i].evidence for i in worse))
+        best = _State(task.fitted(chosen, best.model), chosen)
 
 
 def _worse(best, steps, history, groups):
@@ -408,22 +421,19 @@ def _apart(task, first):
     names = {one.name for one in chosen}
     nominal = [one for one in _nominal_changes(first) if one.name not in names]
     model = task.fitted([*chosen, *nominal], base, **_QUICK)
-    chosen += _needed(model, nominal)
-    model = task.fitted(chosen, model, **_QUICK)
-    temper = max(1.0, model.mean_square)
-    gained = 0.5 * (base.fit.chi2 - model.fit.chi2) / temper
-    return _State(model, chosen, gained - sum(one.cost(temper) for one in chosen))
+    return task.quickly([*chosen, *_needed(model, nominal)], model)
 
 
 def _needed(model, causes):
     """Return those causes of a model that have evidence beside the others, the least dropped."""
     temper, left, dropped = max(1.0, model.mean_square), list(causes), []
+    costs = model.costs(temper)
     # one at a time: of two that do the same, the other is needed once the first is gone
     while left:
         now = model.without(dropped).chi2
         lost = [model.without([*dropped, one.name]).chi2 - now for one in left]
         pairs = zip(lost, left, strict=True)
-        evidence = [0.5 * more / temper - one.cost(temper) for more, one in pairs]
+        evidence = [0.5 * more / temper - costs.get(one.name, 0.0) for more, one in pairs]
         least = int(np.argmin(evidence))
         if evidence[least] > ENOUGH:
             break
@@ -463,12 +473,15 @@ def _search(task, best, first, most_causes):
         # of several runs, whose causes are many, the sets are fewer one step earlier
         step = k + (task.has_runs and k > 1)
         width, most = (part[min(step, len(part) - 1)] for part in (_WIDTH, _FITTED))
-        least = best.evidence + ENOUGH
-        fitted = _extensions(task, states, known, most, least)
-        if not fitted:
+        fitted = _extensions(task, states, known, most)
+        temper = _temper(best, *fitted)
+        # those that are worth more than what they are to be better than
+        least = best.worth(temper)
+        if not fitted or fitted[0].worth(temper) < least:
             break
-        is_doubtful = task.groups and k >= _BY_EVIDENCE
-        fitted = _by_left_out_frames(fitted, least, task.groups) if is_doubtful else fitted
+        if task.groups and k >= _BY_EVIDENCE and temper >= _STRUCTURED:
+            fitted = [state for state in fitted if state.worth(temper) >= least]
+            fitted = _by_left_out_frames(fitted, task.groups)
         best, states = fitted[0], fitted[:width]
         if best.model.p_value > REMAINDER:
             # what is left may be noise: one look beside the best set will tell, and one beside
@@ -478,8 +491,8 @@ def _search(task, best, first, most_causes):
     return best
 
 
-def _extensions(task, states, known, most, least):
-    """Return sets with one cause more that have enough evidence, fitted in full, best first."""
+def _extensions(task, states, known, most):
+    """Return sets with one cause more, fitted in full, best first."""
     k = len(states[0].chosen)
     # what takes many causes has no names; they are asked for once more at the end
     names = task.library if k <= _NAMES or not task.cells else ()
@@ -487,40 +500,38 @@ def _extensions(task, states, known, most, least):
         if state.outline not in known:
             known[state.outline] = _scanned(state.model, names, task.cells)
     instead = partial(_in_place, replace(task, library=names))
-    fitted = _fitted(_grown(states, known, most)[:most], instead)
+    temper = min(known[state.outline].temper for state in states)
+    fitted = _fitted(_grown(states, known, temper, most)[:most], temper, instead)
     if not k:
         found = known[states[0].outline]
         fitted += _far(states[0], found, fitted, instead)
         fitted += _simple(states[0], found, fitted, instead)
-    fitted = sorted(fitted, key=preference)
-    return fitted if fitted and fitted[0].evidence >= least else []
+    temper = _temper(*fitted) if fitted else 1.0
+    return sorted(fitted, key=lambda state: (-round(state.evidence(temper), _DECIMALS), state.name))
 
 
-def _by_left_out_frames(states, least, groups):
+def _by_left_out_frames(states, groups):
     """
     Return sets of causes in the order in which they foresee frames that are left out.
 
     Evidence counts where a set leaves no more than noise. Where several causes leave more, none of
     them is what it seems, and a set is as good as what it says of other frames.
     """
-    if any(state.model.mean_square < _STRUCTURED for state in states):
-        return states
-    enough = [state for state in states if state.evidence >= least]
-    return sorted(enough, key=lambda state: foreseen(state.model, groups).typical_percent)
+    return sorted(states, key=lambda state: foreseen(state.model, groups).typical_percent)
 
 
-def _fitted(grown, instead):
+def _fitted(grown, temper, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in progress.steps(grown, "fits"):
         is_dear = any(one.is_dear and one.model.p_value > REMAINDER for one in found)
-        share = _HALF if is_dear else _PROMISING
-        if promised - state.evidence < share * (most - state.evidence):
+        share, before = _HALF if is_dear else _PROMISING, state.evidence(temper)
+        if promised - before < share * (most - before):
             break
-        one = _extended(promised, state, added, instead)
+        one = _extended(state, added, instead)
         if one is not None:
             found.append(one)
-            most = max(most, one.evidence)
+            most = max(most, one.evidence(temper))
     return found
 
 
@@ -543,12 +554,12 @@ def _simple(state, found, fitted, instead):
 
     Two of them may be what is there.
     """
-    best = max(fitted, key=attrgetter("evidence"), default=None)
+    best = max(fitted, key=lambda one: one.evidence(_temper(*fitted)), default=None)
     if best is None or not best.is_dear or best.model.p_value < REMAINDER:
         return []
     least = _HALF * found.best.evidence
-    most = _HALF * best.chosen[0].cost(1.0)
-    few = [one for one in found.candidates if one.evidence > least and one.cost(1.0) < most]
+    most = _HALF * best.chosen[0].rank
+    few = [one for one in found.candidates if one.evidence > least and one.rank <= most]
     return _new(state, _distinct(few, _FITTED[1]), fitted, instead)
 
 
@@ -556,16 +567,17 @@ def _new(state, added, fitted, instead):
     """Return the sets with each of some causes, fitted in full, that are not among those fitted."""
     known = {one for grown in fitted for one in grown.outline}
     new = (one for one in added if one.name not in known)
-    grown = [_extended(state.evidence + one.evidence, state, (one,), instead) for one in new]
+    grown = [_extended(state, (one,), instead) for one in new]
     return [one for one in grown if one is not None]
 
 
-def _grown(states, known, most):
+def _grown(states, known, temper, most):
     """Return evidence, set and causes to add of all continuations of sets, best first."""
     grown = {}
     for state in states:
         for added in _continuations(known[state.outline], most):
-            evidence = state.evidence + sum(one.evidence for one in added)
+            promised = sum(one.tempered(temper).evidence for one in added)
+            evidence = state.evidence(temper) + promised
             outline = state.outline.union(one.name for one in added)
             if outline not in grown or grown[outline][0] < evidence:
                 grown[outline] = (evidence, state, added)
@@ -586,15 +598,12 @@ def _continuations(found, most):
     return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
 
 
-def _extended(evidence, state, added, instead):
+def _extended(state, added, instead):
     """Return a set with more causes, fitted in full, None where that is impossible."""
     model = state.model.with_effects([one.recipe for one in added], **_QUICK)
     chosen = [*state.chosen, *added]
-    # what the full fit gains over the linear promise
-    gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
-    evidence += 0.5 * gained / max(1.0, model.mean_square)
     impossible = [one for one in chosen if not model.is_physical(one.name)]
-    grown = _State(model, chosen, evidence)
+    grown = _State(model, chosen)
     if len(impossible) != 1 or impossible[0] in added:
         return None if impossible else grown
     # what was possible before is driven to its limit by what is added: another is in its place
@@ -603,19 +612,17 @@ def _extended(evidence, state, added, instead):
 
 def _in_place(task, one, state):
     """Return a set with the best that is possible in place of a cause, None if nothing is."""
-    temper = max(1.0, state.model.mean_square)
-    found = scan(state.model, task.library, cells=task.cells, temper=temper, without=one.name)
+    ask = {"cells": task.cells, "temper": _temper(state), "without": one.name}
+    found = scan(state.model, task.library, **ask)
     taken = {other.name for other in state.chosen}
     for rival in _best_of(found, _FITTED[-1]):
         if rival.name in taken or rival.evidence < ENOUGH:
             continue
         chosen = [rival if other is one else other for other in state.chosen]
-        model = task.fitted(chosen, state.model, **_QUICK)
+        new = task.quickly(chosen, state.model)
         asked = [o for o in chosen if o is rival or state.model.is_physical(o.name)]
-        if all(model.is_physical(other.name) for other in asked):
-            lost = 0.5 * (model.fit.chi2 - state.model.fit.chi2) / temper
-            dearer = rival.cost(temper) - one.cost(temper)
-            return _State(model, chosen, state.evidence - lost - dearer)
+        if all(new.model.is_physical(other.name) for other in asked):
+            return new
     return None
 
 
@@ -641,10 +648,9 @@ def _exchanged(task, best, first):
         few = len(best.chosen) <= _MERGED[1]
         if few and others and (not rivals or rivals[0].evidence < ENOUGH):
             # the others do what it did
-            model = task.fitted(others, best.model, **_QUICK)
-            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2)
-            if lost < ENOUGH * max(1.0, best.model.mean_square):
-                best, like = _State(model, others, best.evidence - one.evidence), None
+            fewer = task.quickly(others, best.model)
+            if 0.5 * (fewer.model.fit.chi2 - best.model.fit.chi2) < ENOUGH * _temper(best):
+                best, like = fewer, None
                 continue
         for fresh in rivals if few else rivals[:1]:
             if (fresh.name, fresh.degree) == (one.name, one.degree):
@@ -652,10 +658,10 @@ def _exchanged(task, best, first):
             if fresh.name in {other.name for other in others}:
                 continue
             chosen = [fresh if o is one else o for o in best.chosen]
-            model = task.fitted(chosen, best.model, **_QUICK)
-            if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
+            new = task.quickly(chosen, best.model)
+            if new.model.is_physical(fresh.name) and _gains(new, fresh, best, one):
                 scans[fresh.name], like = scans.pop(one.name), None
-                best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
+                best = new
                 break
     return best, scans
 
@@ -699,13 +705,14 @@ def _rivals_beside(found, own, library):
 
 
 def _gains(new, fresh, old, one):
-    """Whether a full fit with another cause is worth what its freedom costs more."""
-    scale = max(1.0, min(new.mean_square, old.mean_square))
-    lost = 0.5 * (new.fit.chi2 - old.fit.chi2) / scale
-    cheaper = one.cost(scale) - fresh.cost(scale)
+    """Whether a set with another cause is not clearly behind."""
+    temper = _temper(new, old)
+    gained = new.evidence(temper) - old.evidence(temper)
     # a name has the freedom of what it is, which is favoured over its cell
-    is_name = fresh.is_named and not one.is_named and one.cell in fresh.effect.cells(old.trains)
-    return lost < (max(cheaper, 0.0) if is_name else cheaper) + _CLEARLY
+    if fresh.is_named and not one.is_named and one.cell in fresh.effect.cells(old.model.trains):
+        costs = old.model.costs(temper) | new.model.costs(temper)
+        gained += max(costs.get(fresh.name, 0.0) - costs.get(one.name, 0.0), 0.0)
+    return gained > -_CLEARLY
 
 
 def _unlisted(base, best, stable, instead):
@@ -752,17 +759,19 @@ def _grouped(task, best, steps, scans, unlisted, stable):
 
 
 def _refits(task, best, chosen):
-    """Return what gives the loss of chi-square of a full fit with another in place of a cause."""
+    """Return what gives the chi-square and the evidence that another in place of a cause loses."""
     if len(best.chosen) > _MERGED[1]:
         # none of so many is sure: derivatives tell what they are like
         return None
-    taken = {one.name for one in best.chosen if one is not chosen}
+    taken, temper = {one.name for one in best.chosen if one is not chosen}, _temper(best)
 
     def loss(other):
         if other.name in taken:
-            return np.inf
+            return np.inf, np.inf
         new = [other if one is chosen else one for one in best.chosen]
-        return task.fitted(new, best.model, **_QUICK).fit.chi2 - best.model.fit.chi2
+        new = task.quickly(new, best.model)
+        lost = 0.5 * (new.model.fit.chi2 - best.model.fit.chi2) / temper
+        return lost, best.evidence(temper) - new.evidence(temper)
 
     return loss
 
@@ -805,7 +814,6 @@ def _members(chosen, beside, loss):
     own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
     promised, known = max(chosen.statistic, own.statistic), {}
-    cost = max(chosen.cost(beside.temper), 0.0)
     for one in rivals:
         if one.name == own.name or len(weights) > _MOST_ALIASES:
             continue
@@ -818,10 +826,9 @@ def _members(chosen, beside, loss):
             # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
-                known[key] = 0.5 * loss(one) / beside.temper
-            dearer = max(one.cost(beside.temper), 0.0) - cost
-            lost = known.get(key, np.inf)
-            fitted = np.exp(min(-lost - dearer, 0.0))
+                known[key] = loss(one)
+            lost, behind = known.get(key, (np.inf, np.inf))
+            fitted = np.exp(min(-behind, 0.0))
             # a fit that does as well as that of the chosen one confirms what was promised
             weight = max(weight, fitted) if lost < 1 else fitted
             is_same = is_same and lost < 1
