@@ -53,13 +53,13 @@ _OTHER = -0.5
 _ALONE = -1.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
-# evidence that is the same to so many decimals is of causes that do the same
-_DECIMALS = 3
+#: Evidence that is the same to so many decimals is of causes that do the same.
+DECIMALS = 3
 
 
 def preference(candidate):
     """Return the key that sorts the best first; of what does the same, the name decides."""
-    return -round(candidate.evidence, _DECIMALS), candidate.name
+    return -round(candidate.evidence, DECIMALS), candidate.name
 
 
 @dataclass

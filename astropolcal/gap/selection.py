@@ -20,7 +20,7 @@ from scipy.special import expit
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
-from astropolcal.gap.attribution import ALIKE, ENOUGH, preference, scan
+from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, preference, scan
 from astropolcal.gap.cells import Cell, alike, count_runs
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -61,8 +61,6 @@ _NAMES = 2
 _AMONG = 12
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
-# evidence of sets is compared to so many decimals
-_DECIMALS = 3
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
@@ -480,8 +478,10 @@ def _search(task, best, first, most_causes):
         if not fitted or fitted[0].worth(temper) < least:
             break
         if task.groups and k >= _BY_EVIDENCE and temper >= _STRUCTURED:
+            # where several causes leave more than noise, none of them is what it seems, and a set
+            # is as good as what it says of frames that are left out
             fitted = [state for state in fitted if state.worth(temper) >= least]
-            fitted = _by_left_out_frames(fitted, task.groups)
+            fitted.sort(key=lambda state: foreseen(state.model, task.groups).typical_percent)
         best, states = fitted[0], fitted[:width]
         if best.model.p_value > REMAINDER:
             # what is left may be noise: one look beside the best set will tell, and one beside
@@ -501,23 +501,17 @@ def _extensions(task, states, known, most):
             known[state.outline] = _scanned(state.model, names, task.cells)
     instead = partial(_in_place, replace(task, library=names))
     temper = min(known[state.outline].temper for state in states)
-    fitted = _fitted(_grown(states, known, temper, most)[:most], temper, instead)
-    if not k:
-        found = known[states[0].outline]
-        fitted += _far(states[0], found, fitted, instead)
-        fitted += _simple(states[0], found, fitted, instead)
-    temper = _temper(*fitted) if fitted else 1.0
-    return sorted(fitted, key=lambda state: (-round(state.evidence(temper), _DECIMALS), state.name))
+    fitted = _ranked(_fitted(_grown(states, known, temper, most)[:most], temper, instead))
+    for more in (_far, _simple) if not k else ():
+        new = more(states[0], known[states[0].outline], fitted, instead)
+        fitted = _ranked(fitted + new)
+    return fitted
 
 
-def _by_left_out_frames(states, groups):
-    """
-    Return sets of causes in the order in which they foresee frames that are left out.
-
-    Evidence counts where a set leaves no more than noise. Where several causes leave more, none of
-    them is what it seems, and a set is as good as what it says of other frames.
-    """
-    return sorted(states, key=lambda state: foreseen(state.model, groups).typical_percent)
+def _ranked(states):
+    """Return sets of causes, those with most evidence first; of the same, the name decides."""
+    temper = _temper(*states) if states else 1.0
+    return sorted(states, key=lambda state: (-round(state.evidence(temper), DECIMALS), state.name))
 
 
 def _fitted(grown, temper, instead):
@@ -536,11 +530,8 @@ def _fitted(grown, temper, instead):
 
 
 def _far(state, found, fitted, instead):
-    """
-    Return sets of one name with one number each, fitted in full, where no derivative suffices.
-
-    An angle that is far off does more, and other things, than its derivative promises.
-    """
+    """Return sets of one name of one number, fitted in full, where no derivative suffices."""
+    # an angle that is far off does more, and other things, than its derivative promises
     if found.temper < _STRUCTURED:
         return []
     least = _FAR_PROMISE * found.best.evidence
@@ -549,16 +540,11 @@ def _far(state, found, fitted, instead):
 
 
 def _simple(state, found, fitted, instead):
-    """
-    Return sets of one cause of little freedom, where one of much freedom explains all.
-
-    Two of them may be what is there.
-    """
-    best = max(fitted, key=lambda one: one.evidence(_temper(*fitted)), default=None)
-    if best is None or not best.is_dear or best.model.p_value < REMAINDER:
+    """Return sets of one cause of little freedom, where one of much freedom explains all."""
+    # two of them may be what is there
+    if not (fitted and fitted[0].is_dear and fitted[0].model.p_value > REMAINDER):
         return []
-    least = _HALF * found.best.evidence
-    most = _HALF * best.chosen[0].rank
+    least, most = _HALF * found.best.evidence, _HALF * fitted[0].chosen[0].rank
     few = [one for one in found.candidates if one.evidence > least and one.rank <= most]
     return _new(state, _distinct(few, _FITTED[1]), fitted, instead)
 

@@ -87,6 +87,17 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
 
 
 @pytest.mark.slow
+def test_exchanged_beams_are_asked_about_where_little_else_shows_them(example):
+    """With the polarizer held, the other angles make up for all but 1.1 % of polarization."""
+    table, fix = example.to_table(), {"calibration_polarizer.theta": None}
+    for right, left in (("flux_right", "flux_left"), ("flux_right_err", "flux_left_err")):
+        table[right], table[left] = table[left].copy(), table[right].copy()
+    for data, asked in ((example, False), (Observations.from_table(table), True)):
+        cal = calibrate(CHARIS.chains_for([data])[0], data, fix=fix, cross_validate=False)
+        assert ("beams exchanged?" in fits_a_terminal(cal)[0]) is asked
+
+
+@pytest.mark.slow
 def test_a_polarized_star_alone_determines_nothing():
     options = {"target": "HD 30675", "star": "star_HD30675"}
     truth = star_chain("polarized standard star", **options)

@@ -31,7 +31,7 @@ _UNLIKELY = 0.01
 # the mounts are known better than this before any fit, and it turns 6 % of Q into U
 _ABSURD_ANGLE = 10 * u.deg
 # real data of three instruments leave 0.1 to 1.5 %, exchanged beams of the example 1.1 to 2.2 %
-_MISFIT = 1.5 * u.percent
+_MISFIT, _MAYBE = 1.5 * u.percent, 1.0 * u.percent
 # a turn or a change of the DoLP by less, in degree or percent of itself, does not show
 _SHOWS = 0.005
 # residuals of so many times the noise are worth a word: the noise is not known better
@@ -121,7 +121,8 @@ def verdict(calibration, targets=TARGETS):
         excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         if excess > _CLEARLY:
-            cautions.append(f"residuals {excess:.2g} times the noise (astropolcal diagnose: why)")
+            why = "beams exchanged?" if _worst(calibration, "s_res") > _MAYBE.value else "why"
+            cautions.append(f"residuals {excess:.2g} times the noise (astropolcal diagnose: {why})")
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
