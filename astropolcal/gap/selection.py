@@ -691,7 +691,7 @@ def _rivals_beside(found, own, library):
 
 
 def _gains(new, fresh, old, one):
-    """Whether a set with another cause is not clearly behind."""
+    """Whether a set with another cause is not clearly worse."""
     temper = _temper(new, old)
     gained = new.evidence(temper) - old.evidence(temper)
     # a name has the freedom of what it is, which is favoured over its cell
