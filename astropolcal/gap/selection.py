@@ -544,9 +544,13 @@ def _simple(state, found, fitted, instead):
     # two of them may be what is there
     if not (fitted and fitted[0].is_dear and fitted[0].model.p_value > REMAINDER):
         return []
-    least, most = _HALF * found.best.evidence, _HALF * fitted[0].chosen[0].rank
-    few = [one for one in found.candidates if one.evidence > least and one.rank <= most]
-    return _new(state, _distinct(few, _FITTED[1]), fitted, instead)
+    best, most = found.best.evidence, _HALF * fitted[0].chosen[0].rank
+    few = [one for one in found.candidates if one.rank <= most]
+    # names, which are few, may each explain less: such as fringes of two periods
+    named = [one for one in few if one.is_named and one.evidence > _FAR_PROMISE * best]
+    few = [one for one in few if one.evidence > _HALF * best]
+    few = _distinct(few, _FITTED[1]) + _distinct(named, _FITTED[1])
+    return _new(state, {one.name: one for one in few}.values(), fitted, instead)
 
 
 def _new(state, added, fitted, instead):
@@ -645,7 +649,9 @@ def _exchanged(task, best, first):
                 continue
             chosen = [fresh if o is one else o for o in best.chosen]
             new = task.quickly(chosen, best.model)
-            if new.model.is_physical(fresh.name) and _gains(new, fresh, best, one):
+            temper = _temper(new, best)
+            gained = new.evidence(temper) - best.evidence(temper)
+            if new.model.is_physical(fresh.name) and gained > -_CLEARLY:
                 scans[fresh.name], like = scans.pop(one.name), None
                 best = new
                 break
@@ -688,17 +694,6 @@ def _rivals_beside(found, own, library):
         min((n for n in same if n.is_named), key=preference, default=one)
         for one, same in zip(best, as_good, strict=True)
     ]
-
-
-def _gains(new, fresh, old, one):
-    """Whether a set with another cause is not clearly worse."""
-    temper = _temper(new, old)
-    gained = new.evidence(temper) - old.evidence(temper)
-    # a name has the freedom of what it is, which is favoured over its cell
-    if fresh.is_named and not one.is_named and one.cell in fresh.effect.cells(old.model.trains):
-        costs = old.model.costs(temper) | new.model.costs(temper)
-        gained += max(costs.get(fresh.name, 0.0) - costs.get(one.name, 0.0), 0.0)
-    return gained > -_CLEARLY
 
 
 def _unlisted(base, best, stable, instead):
