@@ -571,7 +571,15 @@ def _grown(states, known, temper, most):
             outline = state.outline.union(one.name for one in added)
             if outline not in grown or grown[outline][0] < evidence:
                 grown[outline] = (evidence, state, added)
-    return sorted(grown.values(), key=lambda item: -item[0])
+    found = sorted(grown.values(), key=lambda item: -item[0])
+    if len(states[0].chosen) < _BY_EVIDENCE:
+        return found
+    # sets of several causes are much alike: another cause tells more than the same beside another
+    first = {}
+    for item in found:
+        first.setdefault(frozenset(one.name for one in item[2]), item)
+    first = list(first.values())
+    return first + [item for item in found if all(item is not one for one in first)]
 
 
 def _continuations(found, most):
