@@ -672,10 +672,11 @@ def _beside(task, best, one, like):
     temper = max(1.0, model.mean_square)
     ask = partial(scan, effects=task.library, cells=task.cells, temper=temper)
     found = ask(model, without=one.name, like=like)
-    own = max((c.statistic for c in found.candidates if c.name == one.name), default=0.0)
-    if own <= task.base.fit.chi2 - model.fit.chi2:
+    own = next((c for c in found.candidates if c.name == one.name), one)
+    if own.statistic <= task.base.fit.chi2 - model.fit.chi2 and own.evidence > ENOUGH:
         return found, True
-    # no cause does more than all of them: along an open direction it went too far for derivatives
+    # no cause does more than all of them, and what was chosen was asked for: it went too far for
+    # derivatives, along an open direction or to a large size
     others = [other for other in best.chosen if other is not one]
     return ask(task.fitted(others, model, **_QUICK)), False
 
