@@ -23,8 +23,8 @@ from astropolcal.optics.perturbations import split_run
 
 __all__ = []
 
-#: Sizes of the prior, in units of the usual one.
-PRIOR_SIZES = (0.1, 1.0, 10.0)
+# sizes of the prior, in units of the usual one
+_SIZES = (0.1, 1.0, 10.0)
 # laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
 # None for one value per wavelength
 _DEGREES, _FREER = (0, 2), (4, None)
@@ -112,7 +112,7 @@ class Candidate:
     def tempered(self, temper):
         """Return the same with residuals of another variance, in units of the noise."""
         values, share, scale = self.spectrum
-        evidence = _log_factor(values[None], share[None], scale, temper)[0] + self.prior
+        evidence = log_factor(values, share, scale, temper) + self.prior
         return replace(self, evidence=float(evidence))
 
     @property
@@ -285,7 +285,7 @@ def _sharpest(probes, temper, least):
             )
             gram, target = (x.reshape(len(names), -1) for x in (gram, target))
             share = np.divide(target**2, gram, out=np.zeros_like(gram), where=gram > 0)
-            factors = _log_factor(gram, share, scale, temper)
+            factors = log_factor(gram, share, scale, temper)
             found += [(f + _prior(n), place, kind, n) for f, n in zip(factors, names, strict=True)]
     found = sorted((one for one in found if one[0] > least), reverse=True)
     return [Cell(*cell) for _, *cell in found[:_SHARP]]
@@ -329,7 +329,7 @@ def _candidates(place, kind, names, by_law, temper):
     scale, best = Cell(place, kind, "constant").scale, {}
     for degree, (gram, target) in by_law:
         values, share = _spectra(gram, target)
-        factors, ranks = _log_factor(values, share, scale, temper), _rank(values, scale)
+        factors, ranks = log_factor(values, share, scale, temper), _rank(values, scale)
         for i in np.flatnonzero(ranks):
             if i not in best or best[i][0] < factors[i]:
                 best[i] = (factors[i], int(ranks[i]), values[i], share[i], degree)
@@ -358,17 +358,17 @@ def _spectra(gram, target):
     return values, np.divide(square, values, out=np.zeros_like(square), where=seen)
 
 
-def _log_factor(values, share, scale, temper):
-    """Return the log Bayes factor against no such cause, shape (n,)."""
-    spreads = np.square(scale * np.array(PRIOR_SIZES))[:, None, None] / temper
+def log_factor(values, share, scale, temper):
+    """Return the log Bayes factor against no such cause, of (..., k) arrays."""
+    spreads = np.square(scale * np.array(_SIZES)).reshape(-1, *[1] * values.ndim) / temper
     gains = share / temper * (spreads * values / (1 + spreads * values))
-    each = 0.5 * (gains - np.log1p(spreads * values)).sum(axis=2)
-    return np.logaddexp.reduce(each, axis=0) - np.log(len(PRIOR_SIZES))
+    each = 0.5 * (gains - np.log1p(spreads * values)).sum(axis=-1)
+    return np.logaddexp.reduce(each, axis=0) - np.log(len(_SIZES))
 
 
 def _rank(values, scale):
     """Return in how many directions even a large size would show."""
-    return (np.square(scale * PRIOR_SIZES[-1]) * values > 1).sum(axis=-1)
+    return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
 
 
 def _named(probes, effects, temper, degree="default", others=()):

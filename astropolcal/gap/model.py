@@ -20,7 +20,7 @@ from astropolcal.calibration.system import at_wavelengths
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError, ObservationError
-from astropolcal.gap.attribution import PRIOR_SIZES
+from astropolcal.gap.attribution import log_factor
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
@@ -256,51 +256,43 @@ class Model:
         return self.problem.jacobian(self.fit.coefficients)
 
     @cached_property
-    def _freedom(self):
+    def _spectra(self):
         """
-        Return of each effect what its freedom and its size cost, by name, for `costs`.
+        Return what the data say of each effect at the fit, by name, for `costs`.
 
         Eigenvalues of its normal equations beside the nominal model and the effects before it, and
-        squares of its sizes along their vectors, in units of the usual size.
+        by how much chi-square rises along their vectors without it, in units of the usual size.
         """
-        problem, q = self.problem, self.fit.coefficients
-        own = {
-            name: [(problem.numbers([p.name]), p.canonical_scale) for p in parameters]
-            for name, parameters in self.added.items()
-        }
-        own = {name: parts for name, parts in own.items() if sum(k.size for k, _ in parts)}
-        numbers = {name: np.concatenate([k for k, _ in parts]) for name, parts in own.items()}
-        scales = {n: np.concatenate([np.full(k.size, s) for k, s in own[n]]) for n in own}
-        nominal = np.setdiff1d(np.arange(problem.size), [k for n in numbers.values() for k in n])
-        order = np.concatenate([nominal, *numbers.values()]).astype(int)
-        slopes = (self.jacobian * ~problem.at_bound(q))[:, order]
-        gram = slopes.T @ slopes
-        gram[np.diag_indices(len(nominal))] += problem.tight[nominal] ** 2
-        length = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
-        triangle = np.linalg.cholesky(gram / np.outer(length, length) + _HELD * np.eye(len(gram)))
-        found, start = {}, len(nominal)
-        for name, where in numbers.items():
+        problem, q, scale = self.problem, self.fit.coefficients, np.ones(self.problem.size)
+        own = {name: problem.numbers(p.name for p in added) for name, added in self.added.items()}
+        for one in (parameter for added in self.added.values() for parameter in added):
+            scale[problem.numbers([one.name])] = one.canonical_scale
+        nominal = ~np.isin(np.arange(problem.size), [k for where in own.values() for k in where])
+        order = np.concatenate([np.flatnonzero(nominal), *own.values()]).astype(int)
+        slopes = (self.jacobian * ~problem.at_bound(q) * scale)[:, order]
+        gram = slopes.T @ slopes + np.diag((problem.tight * nominal)[order] ** 2)
+        length = np.sqrt(np.diag(gram))
+        unit = gram / np.outer(*[np.where(length > 0, length, 1.0)] * 2)
+        triangle = np.linalg.cholesky(unit + _HELD * np.eye(len(unit)))
+        found, size, start = {}, (q - problem.absent) / scale, int(nominal.sum())
+        for name, where in own.items():
             part = slice(start, start := start + where.size)
-            root = (scales[name] * length[part])[:, None] * triangle[part, part]
-            size = (q - problem.absent)[where] / scales[name]
-            along, singular, _ = np.linalg.svd(root)
-            found[name] = singular**2, np.square(size @ along)
+            if where.size:
+                along, singular, _ = np.linalg.svd(length[part, None] * triangle[part, part])
+                found[name] = singular**2, (singular * (size[where] @ along)) ** 2
         return found
 
     def costs(self, temper):
         """
         Return what freedom and size of each effect cost, in the logarithm of the evidence, by name.
 
-        That is the difference between chi-square at the fit and the integral over the sizes
-        (Laplace), with residuals of variance ``temper``, and sizes known as in
-        `astropolcal.gap.attribution`.
+        That is the difference between chi-square at the fit, with residuals of variance ``temper``,
+        and the integral over the sizes (Laplace), known as in `astropolcal.gap.attribution`.
         """
-        found = {}
-        for name, (values, squares) in self._freedom.items():
-            freedom = np.square(PRIOR_SIZES)[:, None] * values / temper
-            each = np.sum(np.log1p(freedom) + squares * values / temper / (1 + freedom), axis=1)
-            found[name] = float(np.log(len(each)) - np.logaddexp.reduce(-0.5 * each))
-        return found
+        return {
+            name: float(share.sum() / 2 / temper - log_factor(values, share, 1.0, temper))
+            for name, (values, share) in self._spectra.items()
+        }
 
     def start_of(self, problem):
         """Return a start for another problem: this solution where the two share parameters."""

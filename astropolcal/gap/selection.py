@@ -575,11 +575,8 @@ def _grown(states, known, temper, most):
     if len(states[0].chosen) < _BY_EVIDENCE:
         return found
     # sets of several causes are much alike: another cause tells more than the same beside another
-    first = {}
-    for item in found:
-        first.setdefault(frozenset(one.name for one in item[2]), item)
-    first = list(first.values())
-    return first + [item for item in found if all(item is not one for one in first)]
+    names = [sorted(one.name for one in added) for _, _, added in found]
+    return [found[i] for i in sorted(range(len(found)), key=lambda i: names[i] in names[:i])]
 
 
 def _continuations(found, most):
@@ -669,8 +666,7 @@ def _exchanged(task, best, first):
 def _beside(task, best, one, like):
     """Return the evidence beside all other causes, and whether it is of the derivatives of all."""
     model = best.model
-    temper = max(1.0, model.mean_square)
-    ask = partial(scan, effects=task.library, cells=task.cells, temper=temper)
+    ask = partial(scan, effects=task.library, cells=task.cells, temper=_temper(best))
     found = ask(model, without=one.name, like=like)
     own = next((c for c in found.candidates if c.name == one.name), one)
     if own.statistic <= task.base.fit.chi2 - model.fit.chi2 and own.evidence > ENOUGH:

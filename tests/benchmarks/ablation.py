@@ -41,10 +41,7 @@ RULES = {
         "attribution._OTHER": 0.0,
         "attribution._ALONE": 0.0,
     },
-    "sizes are known within two orders": {
-        "attribution.PRIOR_SIZES": (1.0,),
-        "model.PRIOR_SIZES": (1.0,),
-    },
+    "sizes are known within two orders": {"attribution._SIZES": (1.0,)},
     "laws in wavelength are freed": {"attribution._FREER": ()},
     "far rivals and those of strong signals are fitted in full": {
         "selection._FAR": np.inf,
