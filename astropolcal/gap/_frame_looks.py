@@ -97,10 +97,10 @@ class Look:
 
     def _less_groups(self, columns):
         """Return columns, (n_rows, k), less the brightness of groups as frames that count say."""
-        columns = columns.copy()
         for i, channel, rows in self._datasets:
             if channel.groups is None:
                 continue
+            columns = columns.copy()
             # a datum of unit brightness, in standard deviations
             unit = channel.whiten_frames(np.ones(channel.shape) * channel.valid)[1]
             seen = np.square(unit) * ~self.out[i]
@@ -273,18 +273,28 @@ def _basis(columns, rows):
 
     A coefficient that these rows do not determine is left out.
     """
-    kept = columns * rows[:, None]
-    norm = np.linalg.norm(kept, axis=0)
-    seen = norm > 0
-    scaled = columns[:, seen] / norm[seen]
-    basis, mix = scaled * rows[:, None], np.eye(int(seen.sum()))
-    # by the small matrix of products, and once more for what that has rounded
-    for least in (_SEEN**2, 0.5):
-        values, vectors = np.linalg.eigh(basis.T @ basis)
-        good = values > least * values.max(initial=0.0)
-        mix = mix @ (vectors[:, good] / np.sqrt(values[good]))
-        basis = scaled @ mix * rows[:, None]
-    return np.where(rows[:, None], basis, scaled @ mix), basis
+    every = rows.all()
+    basis = columns if every else columns * rows[:, None]
+    gram = basis.T @ basis
+    norm = np.sqrt(np.diag(gram))
+    unit = np.diag(1 / np.where(norm > 0, norm, 1.0))[:, norm > 0]
+    mix = unit @ _inverse_root(unit.T @ gram @ unit, _SEEN**2)
+    basis = basis @ mix
+    # once more for what that has rounded
+    again = _inverse_root(basis.T @ basis, 0.5)
+    basis = basis @ again
+    if every:
+        return basis, basis
+    whole = basis.copy()
+    whole[~rows] = columns[~rows] @ (mix @ again)
+    return whole, basis
+
+
+def _inverse_root(gram, least):
+    """Return what makes columns with these products orthonormal, without directions that vanish."""
+    values, vectors = np.linalg.eigh(gram)
+    good = values > least * values.max(initial=0.0)
+    return vectors[:, good] / np.sqrt(values[good])
 
 
 @dataclass

@@ -109,7 +109,8 @@ class Channels:
             weight[0] = 0.0
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
-        design = self._sum_whitened(self.lamp.design(self.valid))
+        design = self.lamp.design(self.valid) * weight[1]
+        self._calm(design)
         #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
         design = design.reshape(len(design), -1)
         if self.groups is None:
@@ -119,19 +120,18 @@ class Channels:
             norm = np.linalg.norm(design, axis=1, keepdims=True)
             self.nuisance = (design / np.where(norm > 0, norm, 1.0))[norm[:, 0] > 0].T
 
-    def whiten(self, array):
+    def whiten(self, array, out=None):
         """Divide residuals or derivatives, (..., 2, W, F), by the noise and take the lamp out."""
-        out = self.whiten_frames(array)
+        out = self.whiten_frames(array, out)
         sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
         sums -= (flat @ self.nuisance @ self.nuisance.T).reshape(sums.shape)
         return out
 
-    def whiten_frames(self, array):
+    def whiten_frames(self, array, out=None):
         """Divide by noise and flicker only, frame by frame: the lamp's drift stays; as `whiten`."""
-        out = np.empty(array.shape)
-        out[..., 0, :, :] = array[..., 0, :, :] * self._whitening[0][0]
-        out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
+        out = np.multiply(array, self._whitening[0], out=out)
+        self._calm(out[..., 1, :, :])
         return out
 
     def gap(self, residual):
@@ -141,11 +141,12 @@ class Channels:
         level, weight = residual[1], self.valid / np.square(self.sigma[1])
         return np.where(self.valid, level - self.lamp.mean(level, weight), 0.0)
 
-    def _sum_whitened(self, array):
-        weight, (direction, shrink) = self._whitening[0][1], self._whitening[1]
-        scaled = array * weight
-        common = np.einsum("...wf,wf->...f", scaled, direction)
-        return scaled - direction * (shrink * common)[..., None, :]
+    def _calm(self, sums):
+        """Take the flicker out of sums in units of their noise, (..., W, F), where they are."""
+        direction, shrink = self._whitening[1]
+        if shrink.any():
+            common = np.einsum("...wf,wf->...f", sums, direction)
+            sums -= direction * (shrink * common)[..., None, :]
 
     @property
     def n_nuisance(self):

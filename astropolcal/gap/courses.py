@@ -174,15 +174,15 @@ class Course:
         target = np.concatenate([t @ law for t in reduced.target])[told] / root
         taken = taken[told] / root[:, None]
         self.equations = told, root, taken, target
-        left, strength, _ = np.linalg.svd(taken, full_matrices=False)
         # (1 - t t^T)^-1 of what is left of each direction, nothing of what is taken up whole
-        rest = 1 - strength**2
-        is_open = rest > _ABSORBED
-        factor = np.where(is_open, 1 / np.where(is_open, rest, 1.0) - 1, -1.0)
-        solved = target + left @ (factor * (left.T @ target))
+        strength, directions = np.linalg.eigh(taken.T @ taken)
+        is_open = 1 - strength > _ABSORBED
+        factor = 1 / np.where(is_open, 1 - strength, -strength)
+        taken = taken @ directions
+        solved = target + taken @ (factor * (taken.T @ target))
         wave, variance = np.zeros(len(gram)), np.full(len(gram), np.inf)
         wave[told] = solved / root
-        kept = 1 + left**2 @ factor
+        kept = 1 + taken**2 @ factor
         variance[told] = np.where(kept > _ABSORBED, kept, np.inf) / root**2
         edges = np.cumsum([len(g) for g in reduced.gram])[:-1]
         self.wave, self.std = np.split(wave, edges), np.split(np.sqrt(variance), edges)

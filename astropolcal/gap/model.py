@@ -269,8 +269,9 @@ class Model:
             scale[problem.numbers([one.name])] = one.canonical_scale
         nominal = ~np.isin(np.arange(problem.size), [k for where in own.values() for k in where])
         order = np.concatenate([np.flatnonzero(nominal), *own.values()]).astype(int)
-        slopes = (self.jacobian * ~problem.at_bound(q) * scale)[:, order]
-        gram = slopes.T @ slopes + np.diag((problem.tight * nominal)[order] ** 2)
+        weight = ~problem.at_bound(q) * scale
+        gram = self.jacobian.T @ self.jacobian * np.outer(weight, weight)
+        gram = (gram + np.diag((problem.tight * nominal) ** 2))[np.ix_(order, order)]
         length = np.sqrt(np.diag(gram))
         unit = gram / np.outer(*[np.where(length > 0, length, 1.0)] * 2)
         triangle = np.linalg.cholesky(unit + _HELD * np.eye(len(unit)))

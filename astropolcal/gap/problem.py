@@ -250,11 +250,14 @@ class GapProblem:
         Those that are not whitened are of the data alone.
         """
         vector = self.vector(coefficients)
-        out = np.empty((self.size, self.n_rows))
+        out = np.zeros((self.size, self.n_rows))
         for i, (channel, rows) in enumerate(zip(self.channels, self.segments, strict=True)):
-            slopes = self._slopes(channel, i, vector)
-            slopes = channel.whiten(slopes) if whitened else slopes
-            out[:, rows] = slopes.reshape(self.size, rows.stop - rows.start)
+            table = out[:, rows].reshape(self.size, *channel.shape)
+            self._add_slopes(table, channel, i, vector)
+            if whitened:
+                channel.whiten(table, out=table)
+            else:
+                table *= channel.valid
         seen = self.n_rows - len(self.known)
         out[:, seen:] = self._holds.T
         return out.T if whitened else out.T[:seen]
@@ -265,29 +268,30 @@ class GapProblem:
         kept = [np.broadcast_to(mask, channel.shape).ravel() for mask, channel in parts]
         return np.concatenate([*kept, np.ones(len(self.known), dtype=bool)])
 
-    def _slopes(self, channel, number, vector):
-        """Return the derivative of a dataset's channels, shape (n_coefficients, 2, W, F)."""
+    def _add_slopes(self, out, channel, number, vector):
+        """Add the derivative of a dataset's channels to a table, (n_coefficients, 2, W, F)."""
         dataset, flickering = self.datasets[number], self._flickering[number]
         keys = [key for key, *_ in dataset._live]
-        out = np.zeros((self.size, *channel.shape))
         sums = dataset.forward(vector)
         sweeps = (sums if flickering is None else flickering.forward(vector), sums)
         for i, sweep in enumerate(sweeps):
             slopes = sweep.derivatives(keys, channel.slopes(sweep)[i])
             for key, where, factor, _ in dataset._live:
                 self._add(out[:, i], where, factor * slopes[key])
-        return out * channel.valid
 
     def _add(self, out, where, slope):
         """Add the derivative to a free value to those to its coefficients."""
         first = int(np.min(where))
         owners = zip(self.free.slots, self._blocks, strict=True)
         slot, block = next(o for o in owners if o[0].start <= first < o[0].start + o[0].size)
-        rows = out[self.slices[slot.name]]
-        if np.ndim(where):
-            rows += block[np.asarray(where) - slot.start].T[:, :, None] * slope
-        else:
+        rows, at = out[self.slices[slot.name]], np.asarray(where) - slot.start
+        if not at.ndim:
             rows[0] += slope
+        elif len(block) == len(rows):
+            # one number for each wavelength
+            rows[at, np.arange(len(at))] += slope
+        else:
+            rows += block[at].T[:, :, None] * slope
 
     # ---- noise -----------------------------------------------------------------------
 
@@ -362,7 +366,9 @@ class GapProblem:
 
     def _normal(self, q, residual, take, live):
         """Return the normal equations of a step in columns of unit length, and their lengths."""
-        slopes, tight = self.jacobian(q)[take][:, live], self.tight[live]
+        # rows of the transposed table are contiguous
+        slopes, tight = self.jacobian(q).T[:, take], self.tight[live]
+        slopes = (slopes if live.all() else slopes[live]).T
         gram = slopes.T @ slopes + np.diag(tight**2)
         target = slopes.T @ residual + tight**2 * (self.centre - q)[live]
         scale = np.sqrt(np.diag(gram))

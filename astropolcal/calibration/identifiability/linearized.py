@@ -16,6 +16,8 @@ __all__ = []
 RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
+# share of the largest eigenvalue of products above which no column is nearly a sum of others
+_CLEAR = 1e-8
 # rows of a block of a triangular factorization
 _BLOCK = 4096
 # a parameter that moves by less than this share along an open direction is static
@@ -72,6 +74,11 @@ def orthonormal(columns, keep=RANK):
     columns = columns[:, norm > 0] / norm[norm > 0]
     if not columns.shape[1]:
         return np.zeros((len(columns), 0))
+    values, vectors = np.linalg.eigh(columns.T @ columns)
+    if values.min() > _CLEAR * values.max():
+        # from the small matrix of products, and once more for what that has rounded
+        basis = columns @ (vectors / np.sqrt(values))
+        return basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
     # a calibration is read where there is no scipy
     from scipy.linalg import qr
 
