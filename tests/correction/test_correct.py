@@ -588,22 +588,23 @@ def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, see
         correct(sky, frames, observable="single", weights=weights)
 
 
+@pytest.mark.slow
 def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
     """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
     chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
     chain, hwp = chain | optics.WollastonPrism(name="wollaston"), [0, 45, 22.5, 67.5] * u.deg
     # the wavelengths are draws of the noise
-    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 1500, 25, 25))
+    noise = 1000 + 30 * np.random.default_rng(1).standard_normal((2, 4, 200, 17, 17))
     known = {"variance_right": np.full(noise[0].shape, 900.0)}
     known["variance_left"] = known["variance_right"]
     for camera in ([0, 0, 0, 0], [90, 17, 30, 45], [20, 20, 20, 20]):
         frames = ScienceFrames.from_arrays(
-            *noise, np.linspace(1, 2, 1500) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
+            *noise, np.linspace(1, 2, 200) * u.um, {"hwp": hwp}, position_angle=camera * u.deg,
             **known,
         )  # fmt: skip
-        star = correct(chain, frames, brightness="given").aperture(9)
+        star = correct(chain, frames, brightness="given").aperture(6)
         claimed = star.error("Q").mean()
-        assert claimed == pytest.approx(star["Q"].std(), rel=0.06), camera
+        assert claimed == pytest.approx(star["Q"].std(), rel=0.12), camera
 
 
 def test_a_sign_that_the_calibration_does_not_tell_is_said(calibration, disk_frames, charis):

@@ -138,6 +138,7 @@ def numbers(shared_data):
     }
 
 
+@pytest.mark.rounding
 @pytest.mark.skipif(
     platform.machine().lower() not in ("x86_64", "amd64"),
     reason="the kernels of OpenBLAS that the test compares are those of x86-64",
