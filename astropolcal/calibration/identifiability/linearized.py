@@ -16,7 +16,7 @@ __all__ = []
 RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
-# share of the largest eigenvalue of products above which no column is nearly a sum of others
+# products of columns tell directions whose eigenvalues are above this share of the largest
 _CLEAR = 1e-8
 # rows of a block of a triangular factorization
 _BLOCK = 4096
@@ -74,17 +74,23 @@ def orthonormal(columns, keep=RANK):
     columns = columns[:, norm > 0] / norm[norm > 0]
     if not columns.shape[1]:
         return np.zeros((len(columns), 0))
+    # from the small matrix of products, and once more for what that has rounded
     values, vectors = np.linalg.eigh(columns.T @ columns)
-    if values.min() > _CLEAR * values.max():
-        # from the small matrix of products, and once more for what that has rounded
-        basis = columns @ (vectors / np.sqrt(values))
-        return basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
+    clear = values > _CLEAR * values.max()
+    basis = columns @ (vectors[:, clear] / np.sqrt(values[clear]))
+    basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
+    if clear.all():
+        return basis
     # a calibration is read where there is no scipy
     from scipy.linalg import qr
 
-    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
-    size = np.abs(np.diag(triangle))
-    return basis[:, : len(size)][:, size > keep * size[0]]
+    # what is nearly a sum of other columns the products do not tell
+    rest = columns @ vectors[:, ~clear]
+    rest -= basis @ (basis.T @ rest)
+    rest, triangle, _ = qr(rest, mode="economic", pivoting=True, check_finite=False)
+    rest = rest[:, np.abs(np.diag(triangle)) > keep]
+    rest = np.linalg.qr(rest - basis @ (basis.T @ rest))[0]
+    return np.concatenate([basis, rest], axis=1)
 
 
 class Whitened:
