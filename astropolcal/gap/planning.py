@@ -230,17 +230,21 @@ def _runs(run, train, name):
         return [same]
     # frames that share their brightness stay together
     group = np.unique(run.positions.get(GROUP, np.arange(run.n_angles)), return_inverse=True)[1]
-    n = group.max(initial=-1) + 1
-    # the same for all runs of a length: the proposal can be repeated
-    shuffled, found = np.random.default_rng(n).permutation(n), [same]
-    for rank, what in (
-        (shuffled[group], f"the frames of {name} in shuffled order"),
-        (n - group, f"the run of {name} backwards, from its last frame"),
+    found = [same]
+    for order, what in (
+        (_shuffled(group), f"the frames of {name} in shuffled order"),
+        (np.argsort(-group, kind="stable"), f"the run of {name} backwards, from its last frame"),
     ):
-        order = np.argsort(rank, kind="stable")
         positions = {stage: angles[order] for stage, angles in run.positions.items()}
         found.append(replace(same, positions=positions, what=what))
     return found
+
+
+def _shuffled(group):
+    """Return an order of frames, of which those of a group stay together."""
+    n = group.max(initial=-1) + 1
+    # the same for all runs of a length: the proposal can be repeated
+    return np.argsort(np.random.default_rng(n).permutation(n)[group], kind="stable")
 
 
 # ---- the plan ----------------------------------------------------------------------------------
@@ -254,7 +258,7 @@ def plan(diagnosis, candidates=None):
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
     the standard deviations at which they come apart, or at which a change of that direction by 0.01
     (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
-    ``probability_after``, that the true one is expected to have, None for parameters and courses.
+    ``probability_after``, that the true one is expected to have, None for parameters.
     The questions are in the order of the causes.
     """
     model, groups = diagnosis.improved, _groups(diagnosis)
@@ -332,7 +336,7 @@ def _telling_apart(forecast, group, foreseen):
             purpose = (
                 f"tells {first} from {few} at {_sigmas(gain)} "
                 f"standard deviations; if one of these is the cause, its share should rise from "
-                f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
+                f"{now:.0%} to {_grown(after)}"
             )
             told = [names[0], *(names[j] for j in other)]
             return _line(exposure.words, purpose, "cause", told, float(gain), now, after)
@@ -376,20 +380,34 @@ def _repetitions(diagnosis):
 
 def _moved(diagnosis):
     """Return the line on how to know whether a course follows a stage or happened once."""
+    model = diagnosis.improved
+    if any(stage in _SKY for chain in model.trains for stage in stages(chain)):
+        return []
     for one in diagnosis.courses[:1] if diagnosis.verdict == "unexplained" else ():
         told = [np.sum((wave / std) ** 2) for wave, std in zip(one.wave, one.std, strict=True)]
-        model, gain = diagnosis.improved, np.sqrt(max(one.lowered - one.freedom, 0.0))
-        seen = model.observations[int(np.argmax(told))]
-        if any(stage in _SKY for chain in model.trains for stage in stages(chain)):
-            continue
-        purpose = (
-            "may tell whether the one thing that may be it follows a stage, with whose angles it "
-            f"moves, or what happened in these frames; it stands out at {_sigmas(gain)} standard "
-            "deviations now"
-        )
-        take = f"the frames of {seen.name} in shuffled order"
-        return [_line(take, purpose, "structure", [], float(gain))]
+        i = int(np.argmax(told))
+        seen, wave, var = model.observations[i], one.wave[i], one.std[i] ** 2
+        group = seen.brightness_groups if seen.single_beam else np.arange(len(wave))
+        order = _shuffled(group)
+        # the shuffled run has what comes with the angles, or with the time, or nothing
+        waves = np.stack([wave[order], wave, np.zeros_like(wave)])
+        spread = var + np.stack([var[order], var, np.zeros_like(var)])
+        missed = np.sum((waves[:, None] - waves) ** 2 / spread, axis=-1)
+        now, after = 1 / 3, expected(np.full(3, 1 / 3), missed / 2)
+        gain = float(np.sqrt(np.min(missed[~np.eye(3, dtype=bool)])))
+        if gain > LEAST_GAIN and after - now > _CLEARLY * (1 - now):
+            purpose = (
+                "tells whether the one thing that may be it comes with the angles of a stage, "
+                f"with the time in the run, or came once, at {_sigmas(gain)} standard deviations; "
+                f"if one of these is so, its share should rise from {now:.0%} to {_grown(after)}"
+            )
+            take = f"the frames of {seen.name} in shuffled order"
+            return [_line(take, purpose, "structure", [], gain, now, after)]
     return []
+
+
+def _grown(after):
+    return "over 99%" if after > 0.99 else f"{after:.0%}"
 
 
 def _fixing(forecast, directions, foreseen):
