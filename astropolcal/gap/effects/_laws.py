@@ -96,7 +96,15 @@ def has_law(plate):
     return isinstance(plate, optics.TwoLayerWaveplate)
 
 
-class Fringes(Effect):
+class OfLaw(Effect):
+    """An effect that its law in wavelength alone tells from others of its place and kind."""
+
+    def is_told(self, n_wavelengths):
+        """Return whether the law can be distinguished from other laws."""
+        return n_wavelengths > 4
+
+
+class Fringes(OfLaw):
     """
     Etalon: retardance that oscillates with the wavenumber.
 
@@ -118,10 +126,6 @@ class Fringes(Effect):
             name=stem if thickness == 8 else f"{stem}_{thickness:.3g}_um",
             title=f"{title}, period 1/({thickness:.3g} um)",
         )
-
-    def is_told(self, n_wavelengths):
-        """Return whether a sine and a cosine can be distinguished from other laws."""
-        return n_wavelengths > 4
 
     def law(self, context, chains=()):
         """Return a sine and a cosine in the wavenumber."""

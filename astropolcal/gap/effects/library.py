@@ -234,7 +234,7 @@ _RELAY_EFFECTS = [
         "dichroic_j_band", "retardance of a dichroic that changes steeply with wavelength",
         _RELAY, _RETARDANCE, optics.EllipticalRetarder(), _ANY_AXIS,
         _size(5, 360, u.deg), "pattern in derotator angle, sharp in wavelength", _HARRINGTON_2019,
-        degree=laws.every_wavelength, words="dichroic",
+        degree=laws.every_wavelength, words="dichroic", cls=laws.OfLaw,
     ),
     *(one.of(thickness) for thickness in (8, 4, 12) for one in (_FRINGES, _DRIFTING)),
     _effect(
