@@ -696,7 +696,14 @@ class Fault:
         own = [self.told.get(key) for key in ("place", "kind", "dependence")]
         step = own[2] if own[2] and own[2].startswith("step:") else None
         found = self.bench.shares(residual, fit, step, self.told.get("what") == "fringes")
-        return {**found, "/".join(own): 1.0} if all(own) else found
+        if not all(own):
+            return found
+        # of a large fault its own cell, which is of first order, carries less; others carry as much
+        mine = found.get("/".join(own))
+        return {
+            **{name: 1.0 if share == mine else share for name, share in found.items()},
+            "/".join(own): 1.0,
+        }
 
     # ---- what it does ---------------------------------------------------------------------------
 
