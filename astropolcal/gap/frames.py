@@ -57,7 +57,7 @@ _OF_WAVELENGTH, _OF_FRAME = 0.1, 0.3
 # a datum has to itself
 _LITTLE, _SMOOTH, _SEEN = 0.2, 4, 0.05
 # of very many frames several are taken at once, those nearly as bad as the worst
-_AT_ONCE, _NEARLY = 12, 0.5
+_AT_ONCE, _NEARLY = 6, 0.5
 # as bad frames are found, so little of the excess is left that the noise is measured anew
 _NEARLY_GONE = 0.1
 _STEPS, _SHARE = 20, 1e-5

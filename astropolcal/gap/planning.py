@@ -397,7 +397,7 @@ def _moved(diagnosis):
         gain = float(np.sqrt(np.min(missed[~np.eye(3, dtype=bool)])))
         if gain > LEAST_GAIN and after - now > _CLEARLY * (1 - now):
             purpose = (
-                "tells whether the one thing that may be it comes with the angles of a stage, "
+                "tells whether the one thing that it may be comes with the angles of a stage, "
                 f"with the time in the run, or came once, at {_sigmas(gain)} standard deviations; "
                 f"if one of these is so, its share should rise from {now:.0%} to {_grown(after)}"
             )
