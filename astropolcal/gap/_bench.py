@@ -698,12 +698,11 @@ class Fault:
         found = self.bench.shares(residual, fit, step, self.told.get("what") == "fringes")
         if not all(own):
             return found
-        # of a large fault its own cell, which is of first order, carries less; others carry as much
-        mine = found.get("/".join(own))
-        return {
-            **{name: 1.0 if share == mine else share for name, share in found.items()},
-            "/".join(own): 1.0,
-        }
+        own = "/".join(own)
+        # of a large fault its own cell, which is of first order, carries less; what carries as
+        # much is the same
+        same = [name for name, share in found.items() if share == found.get(own)]
+        return found | dict.fromkeys([*same, own], 1.0)
 
     # ---- what it does ---------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from astropolcal.calibration.identifiability.linearized import inverse_root
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.chain import leaves
 from astropolcal.gap.problem import law_basis
@@ -278,23 +279,16 @@ def _basis(columns, rows):
     gram = basis.T @ basis
     norm = np.sqrt(np.diag(gram))
     unit = np.diag(1 / np.where(norm > 0, norm, 1.0))[:, norm > 0]
-    mix = unit @ _inverse_root(unit.T @ gram @ unit, _SEEN**2)
+    mix = unit @ inverse_root(unit.T @ gram @ unit, _SEEN**2)
     basis = basis @ mix
     # once more for what that has rounded
-    again = _inverse_root(basis.T @ basis, 0.5)
+    again = inverse_root(basis.T @ basis, 0.5)
     basis = basis @ again
     if every:
         return basis, basis
     whole = basis.copy()
     whole[~rows] = columns[~rows] @ (mix @ again)
     return whole, basis
-
-
-def _inverse_root(gram, least):
-    """Return what makes columns with these products orthonormal, without directions that vanish."""
-    values, vectors = np.linalg.eigh(gram)
-    good = values > least * values.max(initial=0.0)
-    return vectors[:, good] / np.sqrt(values[good])
 
 
 @dataclass

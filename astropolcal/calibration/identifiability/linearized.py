@@ -78,7 +78,7 @@ def orthonormal(columns, keep=RANK):
     values, vectors = np.linalg.eigh(columns.T @ columns)
     clear = values > _CLEAR * values.max()
     basis = columns @ (vectors[:, clear] / np.sqrt(values[clear]))
-    basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
+    basis = basis @ inverse_root(basis.T @ basis, 0.5)
     if clear.all():
         return basis
     # a calibration is read where there is no scipy
@@ -91,6 +91,13 @@ def orthonormal(columns, keep=RANK):
     rest = rest[:, np.abs(np.diag(triangle)) > keep]
     rest = np.linalg.qr(rest - basis @ (basis.T @ rest))[0]
     return np.concatenate([basis, rest], axis=1)
+
+
+def inverse_root(products, least):
+    """Return what makes columns orthonormal, by their products; small directions are left out."""
+    values, vectors = np.linalg.eigh(products)
+    good = values > least * values.max(initial=0.0)
+    return vectors[:, good] / np.sqrt(values[good])
 
 
 class Whitened:
