@@ -26,8 +26,8 @@ __all__ = ["outlying_data"]
 
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
-# more data than these are fitted by their triangular factor
-TALL = 20_000
+# more data than these, or than so many times the parameters, are fitted by their triangular factor
+TALL, _TALL = 20_000, 10
 # smallest weight, so that no datum is lost altogether
 _LEAST = 1e-4
 # step of residuals in units of the noise for the slope of their pull
@@ -319,7 +319,7 @@ class Problem:
         def slopes(part):
             return self.jacobian(place(part), weights)[:, live]
 
-        if self.measurement.n_data > TALL:
+        if self.measurement.n_data > _TALL * live.size:
             residuals, slopes = _short(residuals, slopes)
         found = least_squares(
             residuals,
