@@ -328,23 +328,30 @@ class GapProblem:
         take = slice(None) if rows is None else rows
         residual, cost = self._cost(q, take)
         converged, damping, slow = not live.any(), 0.0, False
+        longest = np.zeros(np.count_nonzero(live))
         for _ in range(steps):
             # from where the model is not defined no step leads down
             if converged or not np.isfinite(cost):
                 break
             slopes, *normal = self._normal(q, residual, take, live)
-            growth = 2
             if not np.isfinite(normal[0]).all():
                 # the model has no derivative here
                 break
+            longest, growth = np.maximum(longest, normal[-1]), 2
             while damping < _STUCK:
-                step, promised = self._step(q, live, *normal, damping)
+                damped = damping * (longest / normal[-1]) ** 2
+                step, promised = self._step(q, live, *normal, damped)
                 if damping > 0:
-                    step = self._bent(q, step, (residual, slopes, take, live), *normal, damping)
+                    step = self._bent(q, step, (residual, slopes, take, live), *normal, damped)
                 trial = np.clip(q + step, self.low, self.high)
                 there, new = self._cost(trial, take)
                 if np.isfinite(new) and new <= cost * (1 + 1e-12):
                     break
+                if damping == 0:
+                    # what is short at an extremum, as half a wave is, is long beside it
+                    with np.errstate(all="ignore"):
+                        *_, beside = self._normal(q + _SHORT * step, residual, take, live)
+                    longest = np.maximum(longest, np.where(np.isfinite(beside), beside, 0.0))
                 damping, growth = max(growth * damping, _FIRST_DAMPING), 2 * growth
             else:
                 break
@@ -383,9 +390,9 @@ class GapProblem:
         scale = np.where(scale > 0, scale, 1.0)
         return slopes, gram / np.outer(scale, scale), target / scale, scale
 
-    def _step(self, q, live, gram, target, scale, damping):
+    def _step(self, q, live, gram, target, scale, damped):
         n = len(scale)
-        triangle = _root(gram + (damping + _HOLD**2) * np.eye(n))
+        triangle = _root(gram + np.diag(damped + _HOLD**2))
         wanted = solve_triangular(triangle, target, trans="T", check_finite=False) if n else target
         low = (self.low[live] - q[live]) * scale
         high = (self.high[live] - q[live]) * scale
@@ -400,14 +407,14 @@ class GapProblem:
         step[live] = found / scale
         return step, found @ (2 * target - gram @ found)
 
-    def _bent(self, q, step, seen, gram, _, scale, damping):
+    def _bent(self, q, step, seen, gram, _, scale, damped):
         """Return a damped step that follows the second derivative along it, within all walls."""
         residual, slopes, take, live = seen
         ahead, _ = self._cost(q + _SHORT * step, take)
         curvature = 2 / _SHORT * ((ahead - residual) / _SHORT + slopes @ step[live])
         if not np.isfinite(curvature).all():
             return step
-        root = _root(gram + (damping + _HOLD**2) * np.eye(len(scale)))
+        root = _root(gram + np.diag(damped + _HOLD**2))
         found = cho_solve((root, False), slopes.T @ curvature / scale, check_finite=False)
         if np.linalg.norm(found) > _CURVED * np.linalg.norm(step[live] * scale):
             return step

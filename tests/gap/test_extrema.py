@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from gap_data import WAVELENGTH as DATA_WAVELENGTH
 from gap_data import chain, clean_model, observed
+from gap_setups import cassegrain
 
 from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves
 from astropolcal.gap import diagnose
 from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects import get_effect
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.report import Fitted
@@ -51,6 +53,17 @@ def test_half_a_wave_hides_nothing():
 def test_half_a_wave_that_is_one_is_no_cause():
     data = simulate(plate_chain(), WAVELENGTH, TURN, flux=1e6, seed=2, name="turn")
     assert diagnose(plate_chain(free=True), data).causes == []
+
+
+def test_a_fit_does_not_stay_at_half_a_wave(own_instruments):
+    """There the derivative to the retardance is so short that steps along it lead far astray."""
+    setup = cassegrain()
+    cell = Cell("source", "diattenuation_c", "harmonic:hwp:2")
+    data = setup.observed(setup.with_cell(cell, 0.0228, 0.0114), seed=101)
+    nominal = nominal_model([setup.nominal], [data])
+    # it looks like a gain of one beam
+    better = nominal.with_effect(get_effect("beam_gain"), steps=24, share=1e-3)
+    assert better.fit.chi2 < 0.3 * nominal.fit.chi2
 
 
 @pytest.mark.slow

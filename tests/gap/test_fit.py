@@ -53,6 +53,21 @@ def test_chi_square_is_that_of_the_residuals(plain, fitted):
     assert fitted.chi2 == pytest.approx(plain.n_data - plain.size, rel=0.2)
 
 
+def test_a_curved_valley_takes_few_steps():
+    """A background does to the differences what a lower efficiency does, but for the drift."""
+    lamp = 1 + 0.02 * np.linspace(-1, 1, len(data.frames()))
+    table = data.observed(noise=False, lamp=lamp, flux=1e7).to_table()
+    usual = np.median(table["flux_right"] + table["flux_left"])
+    rng = np.random.default_rng(1)
+    for beam in ("flux_right", "flux_left"):
+        flux = (table[beam] + 0.15 * usual).value
+        table[beam] = (flux + rng.normal(0, np.sqrt(flux))) * table[beam].unit
+    plain = data.fitted(data.Observations.from_table(table, name="lamp"))
+    found = plain.with_effect(get_effect("background"), steps=10)
+    assert found.fit.converged
+    assert found.fit.chi2 < found.problem.n_data
+
+
 def test_the_same_minimum_is_found_from_elsewhere(plain, fitted):
     rng = np.random.default_rng(7)
     start = fitted.coefficients + 0.03 * rng.normal(size=plain.size)
