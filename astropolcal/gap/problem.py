@@ -392,7 +392,7 @@ class GapProblem:
 
     def _step(self, q, live, gram, target, scale, damped):
         n = len(scale)
-        triangle = _root(gram + np.diag(damped + _HOLD**2))
+        triangle = _root(gram + (damped + _HOLD**2) * np.eye(len(gram)))
         wanted = solve_triangular(triangle, target, trans="T", check_finite=False) if n else target
         low = (self.low[live] - q[live]) * scale
         high = (self.high[live] - q[live]) * scale
@@ -414,7 +414,7 @@ class GapProblem:
         curvature = 2 / _SHORT * ((ahead - residual) / _SHORT + slopes @ step[live])
         if not np.isfinite(curvature).all():
             return step
-        root = _root(gram + np.diag(damped + _HOLD**2))
+        root = _root(gram + (damped + _HOLD**2) * np.eye(len(gram)))
         found = cho_solve((root, False), slopes.T @ curvature / scale, check_finite=False)
         if np.linalg.norm(found) > _CURVED * np.linalg.norm(step[live] * scale):
             return step
