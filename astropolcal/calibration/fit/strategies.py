@@ -56,8 +56,9 @@ _MAX_ROUNDS = 4
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
-# after so many evaluations
-_HOPELESS, _GLANCE = 100.0, 15
+# after so many evaluations, or where steps gain less than a share; where sums of squares of all
+# wavelengths differ by no more than a share from those known, it is the minimum that is known
+_HOPELESS, _GLANCE, _GAIN, _KNOWN = 100.0, 15, 1e-4, 0.02
 # below this the sign of the start is as good
 _AS_GOOD = 2.0
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -164,10 +165,12 @@ def joint(measurement, weighting, fitter, search, options=None):
     for start, better in starts:
         # most starts lead to the minimum that is known, or crawl towards one that is no better:
         # a few steps of everything tell
-        start = problem.fit(start, evaluations=_GLANCE)[0]
+        start = problem.fit(start, evaluations=_GLANCE, gain=_GAIN)[0]
+        if np.allclose(problem.costs(start), problem.costs(found), rtol=_KNOWN, atol=0):
+            continue
         start, moved = search_branches(problem, start, origin)
         if moved.any():
-            start = problem.fit(start, evaluations=_GLANCE)[0]
+            start = problem.fit(start, evaluations=_GLANCE, gain=_GAIN)[0]
         if np.sum(problem.residuals(start) ** 2) >= better * least:
             continue
         measurement.stand_at(start)

@@ -291,12 +291,13 @@ class Problem:
         level = (weighting if weighting.is_known else weighting.started(self.measurement)).level
         return level * np.sqrt(np.diag(whitened.covariance())) / whitened.scale
 
-    def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0):
+    def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0, gain=1e-8):
         """Return the vector, chi-square, and what scipy says of the fit.
 
         ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are,
-        ``evaluations`` after how many the fit ends, where it has not arrived, and ``drawn`` the
-        residuals at which priors have their peaks.
+        ``evaluations`` after how many the fit ends, where it has not arrived, ``drawn`` the
+        residuals at which priors have their peaks, and ``gain`` the share of chi-square below which
+        a step is the last.
         """
         # a calibration is read where there is no scipy
         from scipy.optimize import least_squares
@@ -329,6 +330,7 @@ class Problem:
             bounds=(self._low[live], self._high[live]),
             x_scale=1 / np.where(size > 0, size, 1.0),
             max_nfev=evaluations,
+            ftol=gain,
         )
         return place(found.x).copy(), 2 * found.cost, found
 
