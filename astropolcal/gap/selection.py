@@ -525,7 +525,8 @@ def _fitted(grown, temper, instead):
         one = _extended(state, added, instead)
         if one is not None:
             found.append(one)
-            most = max(most, one.evidence(temper))
+            # where it does more than its derivative promised, others may, too
+            most = max(most, min(one.evidence(temper), promised))
     return found
 
 
