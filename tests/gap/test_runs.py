@@ -412,7 +412,9 @@ def test_runs_of_one_name_get_names_of_their_own():
 def tables(tmp_path):
     meta = {"instrument": "CHARIS", "source": "polarized", "yjh50_dichroic": "out",
             "nasmyth_beam_switcher": "not installed"}  # fmt: skip
-    true = (with_cell(GAIN), with_cell(GAIN, BEHIND))
+    # so small that no sign is looked for that may be wrong, which takes half of the time
+    small = (*BEHIND[:3], 0.03)
+    true = (with_cell(GAIN), with_cell(GAIN, small))
     found = []
     for seed, (chain, name) in enumerate(zip(true, ("july", "october"), strict=True), 3):
         found.append(tmp_path / f"{name}.ecsv")
