@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A CHARIS-like truth, away from all bounds, and what it measures."""
 
+from functools import cache
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -142,3 +144,20 @@ def charis_data(shared_data):
         return Observations.read(path)
 
     return read
+
+
+@pytest.fixture(scope="session")
+def charis_fit(charis_data):
+    """
+    Fit one of the real datasets with all its parameters, but those that are named held.
+
+    It is made once, as it serves several files: leave it as it is.
+    """
+
+    @cache
+    def fit(number, *held):
+        data = charis_data(f"dataset{number}_")
+        fix = dict.fromkeys(held) if held else None
+        return calibrate(CHARIS.chains_for([data]), data, instrument="charis", fix=fix)
+
+    return fit

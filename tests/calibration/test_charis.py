@@ -29,13 +29,9 @@ def published(shared_data):
 
 
 @pytest.fixture(scope="module")
-def calibrated(charis_data):
+def calibrated(charis_fit):
     """Joint fits of Datasets 1 and 3 with all 93 parameters."""
-    found = {}
-    for number in (1, 3):
-        data = charis_data(f"dataset{number}_")
-        found[number] = calibrate(CHARIS.chains_for([data]), data, instrument="charis")
-    return found
+    return {number: charis_fit(number) for number in (1, 3)}
 
 
 @pytest.fixture(scope="module")

@@ -242,12 +242,9 @@ def test_calibration_from_a_file_has_no_data(white, tmp_path):
 
 
 @pytest.mark.slow
-def test_errors_of_the_real_fit_are_those_of_the_bootstrap(charis_data, make):
+def test_errors_of_the_real_fit_are_those_of_the_bootstrap(charis_fit):
     """Dataset 3: the residuals are no white noise, and cycles tell by how much, 1.8 times."""
-    data = charis_data("dataset3_")
-    chain = make.charis.chains_for([data])
-    fix = {"hwp.theta": None, "derotator.theta": None}
-    cal = calibrate(chain, data, instrument="charis", fix=fix, cross_validate=False)
+    cal = charis_fit(3, "hwp.theta", "derotator.theta")
     made = bootstrap(cal, n=40, seed=1)
     assert np.nanmedian(made.stds / cal.covariance.stds) == pytest.approx(1.0, abs=0.3)
     white = standard_errors(cal, "white")["std"]

@@ -230,11 +230,9 @@ def test_calibration_from_a_file_has_no_data(few, tmp_path):
 
 
 @pytest.mark.slow
-def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
+def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_fit):
     """Measured: 1.7 times the covariance's, 0.9 times the bootstrap's, in the median."""
-    data = charis_data("dataset3_")
-    fix = {"hwp.theta": None, "derotator.theta": None}
-    cal = calibrate(make.charis.chains_for([data]), data, fix=fix, cross_validate=False)
+    cal = charis_fit(3, "hwp.theta", "derotator.theta")
     robust = robust_covariance(cal).stds
     assert np.nanmedian(robust / standard_errors(cal, "white")["std"]) == pytest.approx(
         1.7, abs=0.2
@@ -244,11 +242,10 @@ def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
 
 
 @pytest.mark.slow
-def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, make):
+def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_fit):
     """Errors of the parameters without an angle, and the scatter of its own data, together."""
-    for name in ["dataset1_", "dataset3_"]:
-        data = charis_data(name)
-        cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
+    for number in (1, 3):
+        cal = charis_fit(number)
         model, weighting = cal.measurement, weighting_of(cal)
         whitened = Problem(model, weighting).around()
         (part,) = Scatter(model, weighting, whitened).parts
@@ -266,4 +263,4 @@ def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, 
             )
             pulls.append(held_out[out] / np.sqrt(variance))
         width = np.sqrt(np.nanmean(np.concatenate(pulls) ** 2))
-        assert 0.8 < width < 1.3, name
+        assert 0.8 < width < 1.3, number

@@ -15,7 +15,7 @@ from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
-WAVELENGTH = CHARIS.wavelength[[2, 6, 10, 14, 18, 20]]
+WAVELENGTH = CHARIS.wavelength[[4, 9, 14, 19]]
 SIZE = 0.012
 FEW = ["--effects", "beam_gain,hwp_diattenuation"]
 

@@ -9,6 +9,7 @@ import sys
 import astropy.units as u
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from astropolcal import Calibration, instruments
 from astropolcal.calibration.posterior.checkpoint import Chain
@@ -62,7 +63,9 @@ def sampled(calibration, table, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sampled")
     outputs = ["-o", folder / "out.asdf", "--json", folder / "out.json", "--plots", folder / "p"]
     argv = ["sample", calibration, table, *LONG, *map(str, outputs)]
-    with contextlib.redirect_stdout(io.StringIO()) as out:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as out:
+        # the figures are made, but not painted, which takes most of the time
+        patch.setattr(Figure, "savefig", lambda self, path, **_: path.write_bytes(b"painted"))
         assert main(argv) == 0
     (folder / "out.txt").write_text(out.getvalue())
     return folder
@@ -238,6 +241,7 @@ def test_info_of_a_file_with_samples(sampled, capsys):
     assert "Calibration of charis from small" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unpainted")
 @pytest.mark.slow
 def test_missing_corner_costs_one_figure(calibration, table, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "corner", None)
