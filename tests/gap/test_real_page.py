@@ -59,6 +59,7 @@ def test_text_is_that_of_the_record():
     assert f"The beam switcher is found ({100 * first['probability']:.0f} %)" in page
 
 
+@pytest.mark.slow
 def test_gaps_without_a_cause_are_those_of_the_code(script, shared_data):
     for number in (1, 3):
         data = script.read(shared_data / "data" / "charis", number)
