@@ -318,10 +318,9 @@ class GapProblem:
         """
         Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
-        Damped steps follow a curved valley to second order (geodesic acceleration, Transtrum &
-        Sethna 2012, arXiv:1201.5885), as where background and efficiency multiply. ``rows`` are
-        those that take part, (n_rows,), ``held`` the coefficients that stay; a step that lowers
-        chi-square by less than ``share`` of it is the last.
+        Damped steps follow valleys to second order (Transtrum & Sethna 2012, arXiv:1201.5885).
+        ``rows`` are those that take part, (n_rows,), ``held`` the coefficients that stay; a step
+        that lowers chi-square by less than ``share`` of it is the last.
         """
         q = self._inside(self.start if start is None else start)
         live = np.ones(self.size, dtype=bool) if held is None else ~held
@@ -387,7 +386,8 @@ class GapProblem:
         gram = slopes.T @ slopes + np.diag(tight**2)
         target = slopes.T @ residual + tight**2 * (self.centre - q)[live]
         scale = np.sqrt(np.diag(gram))
-        scale = np.where(scale > 0, scale, 1.0)
+        # what moves the data by rounding alone has no length
+        scale[scale <= np.finfo(float).eps * scale.max(initial=0.0)] = 1.0
         return slopes, gram / np.outer(scale, scale), target / scale, scale
 
     def _step(self, q, live, gram, target, scale, damped):

@@ -25,6 +25,7 @@ from astropolcal.gap.model import thinned
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations
 
+pytestmark = pytest.mark.long
 CHARIS = instruments.get("charis")
 PARITY = {"mirror_flip", "mirror_flip_before_plate", "beams_swapped"}
 # what the derotator's retardance is taken for where it is held, next to its true name
@@ -49,7 +50,6 @@ def named(diagnosis, least=0.0):
     return [{cause.name, *(other.name for other, _ in cause.aliases)} for cause in causes]
 
 
-@pytest.mark.long
 def test_beam_switcher_that_the_model_lacks_is_a_parity(shared_data):
     data = observed(shared_data, "dataset3_polarized_2025-10-05")
     chains = [remove_optic(chain, "nbs") for chain in CHARIS.chains_for(data)]
@@ -60,7 +60,6 @@ def test_beam_switcher_that_the_model_lacks_is_a_parity(shared_data):
     assert found.gap_after_percent < found.gap_before_percent / 5
 
 
-@pytest.mark.long
 def test_elliptical_retardance_that_the_derotator_lacks(shared_data):
     data = observed(shared_data, "dataset3_polarized_2025-10-05")
     chains = CHARIS.chains_for(data, derotator="linear")
@@ -76,7 +75,6 @@ def test_elliptical_retardance_that_the_derotator_lacks(shared_data):
     assert found.held_out[0].shrinkage(found.held_out[-1])[0] > 80
 
 
-@pytest.mark.long
 def test_what_real_data_lack_is_not_told_with_confidence(shared_data):
     """Nobody knows what Dataset 3 lacks; the tool must not pretend to, but lower its gap."""
     data = observed(shared_data, "dataset3_polarized_2025-10-05")
@@ -86,7 +84,6 @@ def test_what_real_data_lack_is_not_told_with_confidence(shared_data):
     assert found.held_out[0].shrinkage(found.held_out[-1])[0] > 50
 
 
-@pytest.mark.long
 def test_unpolarized_run_misses_its_fold_mirror_and_has_an_unstable_lamp(shared_data):
     data = observed(shared_data, "dataset4_unpolarized_2025-10-05")
     chains = [remove_optic(chain, "fold_mirror") for chain in CHARIS.chains_for(data)]
@@ -100,7 +97,6 @@ def test_unpolarized_run_misses_its_fold_mirror_and_has_an_unstable_lamp(shared_
     assert worst.frame < 8
 
 
-@pytest.mark.long
 def test_star_misses_flat_field_and_mirror(shared_data):
     (lamp,) = observed(shared_data, "dataset3_polarized_2025-10-05")
     (star,) = observed(shared_data, "hd293396_unpolarized_standard_2025-11-03")
@@ -142,7 +138,6 @@ def numbers(shared_data):
     }
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(
     platform.machine().lower() not in ("x86_64", "amd64"),
     reason="the kernels of OpenBLAS that the test compares are those of x86-64",

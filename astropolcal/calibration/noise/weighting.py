@@ -294,10 +294,9 @@ class Problem:
     def fit(self, start, counts=None, held=(), evaluations=_MAX_EVALUATIONS, drawn=0.0, gain=1e-8):
         """Return the vector, chi-square, and what scipy says of the fit.
 
-        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are,
-        ``evaluations`` after how many the fit ends, where it has not arrived, ``drawn`` the
-        residuals at which priors have their peaks, and ``gain`` the share of chi-square below which
-        a step is the last.
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay, ``evaluations``
+        after how many the fit ends, ``drawn`` the residuals at which priors have their peaks, and
+        ``gain`` the share of chi-square below which a step is the last.
         """
         # a calibration is read where there is no scipy
         from scipy.optimize import least_squares
@@ -313,6 +312,8 @@ class Problem:
 
         # a radian, a micrometre and a 1 move the data by very different amounts
         size = np.linalg.norm(self.jacobian(start, weights), axis=0)[live]
+        # what moves them by rounding alone has no length
+        size[size <= np.finfo(float).eps * size.max(initial=0.0)] = 1.0
 
         def residuals(part):
             return self.residuals(place(part), weights, drawn)
@@ -328,7 +329,7 @@ class Problem:
             np.clip(start[live], self._low[live], self._high[live]),
             jac=slopes,
             bounds=(self._low[live], self._high[live]),
-            x_scale=1 / np.where(size > 0, size, 1.0),
+            x_scale=1 / size,
             max_nfev=evaluations,
             ftol=gain,
         )
