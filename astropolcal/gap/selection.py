@@ -707,8 +707,7 @@ def _unlisted(base, best, stable, instead):
     Return the probability that the gap has a cause that no table has.
 
     A remainder of probability p is evidence for it by a Bayes factor of at most -1/(e p ln p)
-    (Sellke, Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger its share
-    is.
+    (Sellke, Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger it is.
     """
     prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
     if len(best.chosen) > 1 and min(stable.values(), default=1.0) < 1:
