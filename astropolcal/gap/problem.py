@@ -36,8 +36,8 @@ _ROUNDED = 1e-9
 # Marquardt's damping, of columns of unit length: where it begins, below what it is dropped,
 # below what it does not count, and above what no step leads down
 _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
-# along a step so long a share is gone for the second derivative, and a correction for it is at
-# most so long a share of the step
+# the second derivative along a step is that of this share of it, and what corrects for it is at
+# most so many times as long as the step
 _SHORT, _CURVED = 0.1, 0.75
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
@@ -392,7 +392,7 @@ class GapProblem:
 
     def _step(self, q, live, gram, target, scale, damped):
         n = len(scale)
-        triangle = _root(gram + (damped + _HOLD**2) * np.eye(len(gram)))
+        triangle = _root(gram + (damped + _HOLD**2) * np.eye(n))
         wanted = solve_triangular(triangle, target, trans="T", check_finite=False) if n else target
         low = (self.low[live] - q[live]) * scale
         high = (self.high[live] - q[live]) * scale

@@ -24,7 +24,7 @@ from astropolcal.simulation import half_wave_plate_cycles
 
 HEADER = {"INSTRUME": "CHARIS", "OBJECT": "HD 1", "FILTNAME": "Broadband", "EXPTIME": 30.0}
 OPTIONS = ("--any-date", "--centre", "5,5", "--size", 7, "--workers", 1)
-N = 3
+N = 4
 
 
 def write_header(path, **changes):

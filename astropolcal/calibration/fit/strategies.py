@@ -33,7 +33,6 @@ from astropolcal.calibration.noise.estimates import (
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.noise.weighting import (
     ROUNDS,
-    TALL,
     Problem,
     Weighting,
     first_weighting,
@@ -56,9 +55,10 @@ _MAX_ROUNDS = 4
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
-# after so many evaluations, or where steps gain less than a share; where sums of squares of all
-# wavelengths differ by no more than a share from those known, it is the minimum that is known
-_HOPELESS, _GLANCE, _GAIN, _KNOWN = 100.0, 15, 1e-4, 0.02
+# after so many evaluations, or where steps gain less than a share
+_HOPELESS, _GLANCE, _GAIN = 100.0, 15, 1e-4
+# more data than these are fitted without astropy's fitter
+_TALL = 20_000
 # below this the sign of the start is as good
 _AS_GOOD = 2.0
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
@@ -108,7 +108,7 @@ def until_settled(measurement, weighting, fitter, updated, rounds, what):
 def fit_once(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     stage(f"fitting {measurement.free.size} parameters")
-    if type(fitter) is TRFLSQFitter and measurement.n_data > TALL:
+    if type(fitter) is TRFLSQFitter and measurement.n_data > _TALL:
         # the same steps by triangular factors, for which the fitter has no place
         vector, _, found = Problem(measurement, weighting).fit(measurement.vector())
         measurement.stand_at(vector)
@@ -166,7 +166,9 @@ def joint(measurement, weighting, fitter, search, options=None):
         # most starts lead to the minimum that is known, or crawl towards one that is no better:
         # a few steps of everything tell
         start = problem.fit(start, evaluations=_GLANCE, gain=_GAIN)[0]
-        if np.allclose(problem.costs(start), problem.costs(found), rtol=_KNOWN, atol=0):
+        known = problem.costs(found)
+        if np.allclose(problem.costs(start), known, rtol=1 - CLEARLY_BETTER, atol=0):
+            # of no wavelength it is clearly better or worse: it is the minimum that is known
             continue
         start, moved = search_branches(problem, start, origin)
         if moved.any():

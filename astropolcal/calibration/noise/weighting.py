@@ -26,8 +26,8 @@ __all__ = ["outlying_data"]
 
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
-# more data than these, or than so many times the parameters, are fitted by their triangular factor
-TALL, _TALL = 20_000, 10
+# so many times as many data as parameters are fitted by their triangular factor
+_TALL = 10
 # smallest weight, so that no datum is lost altogether
 _LEAST = 1e-4
 # step of residuals in units of the noise for the slope of their pull
