@@ -317,7 +317,7 @@ def _waves(dependence, dataset):
         return np.ones((1, observations.n_frames))
     given = dataset._given.get(dependence.driver)
     if given is None:
-        there = observations.frames.colnames
+        there = observations.frame_columns
         known = dependence.driver in COORDINATES or dependence.driver in there
         if not known or (dependence.kind in _MOVED and dependence.parts[1] not in there):
             return np.zeros((dependence.count, observations.n_frames))

@@ -32,6 +32,8 @@ _SAME = 1e-4
 # law is where it has more than a part of its largest value
 _NEARLY, _AS_MUCH, _PART = 0.9, 0.05, 0.5
 _TWO_SIGMA = 4.0
+# by this share of what causes explain the model without them may be off, to first order
+_LINEAR = 0.1
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-6
 
@@ -174,15 +176,17 @@ class Course:
         target = np.concatenate([t @ law for t in reduced.target])[told] / root
         taken = taken[told] / root[:, None]
         self.equations = told, root, taken, target
-        # (1 - t t^T)^-1 of what is left of each direction, nothing of what is taken up whole
-        strength, directions = np.linalg.eigh(taken.T @ taken)
+        # (1 - t t^T)^-1 of what is left of each direction, nothing of what is taken up whole; the
+        # directions are those of the frames or of what takes up, whichever are fewer
+        few = len(taken) < taken.shape[1]
+        strength, directions = np.linalg.eigh(taken @ taken.T if few else taken.T @ taken)
         is_open = 1 - strength > _ABSORBED
         factor = 1 / np.where(is_open, 1 - strength, -strength)
-        taken = taken @ directions
-        solved = target + taken @ (factor * (taken.T @ target))
+        basis = directions * np.sqrt(strength.clip(0)) if few else taken @ directions
+        solved = target + basis @ (factor * (basis.T @ target))
         wave, variance = np.zeros(len(gram)), np.full(len(gram), np.inf)
         wave[told] = solved / root
-        kept = 1 + taken**2 @ factor
+        kept = 1 + basis**2 @ factor
         variance[told] = np.where(kept > _ABSORBED, kept, np.inf) / root**2
         edges = np.cumsum([len(g) for g in reduced.gram])[:-1]
         self.wave, self.std = np.split(wave, edges), np.split(np.sqrt(variance), edges)
@@ -200,14 +204,16 @@ def courses(model, base):
     """
     Return the courses in place of all causes of a fitted model, the best first.
 
-    ``base`` is the model without them. Derivatives are those at the one or at the other, where a
-    course does better: many causes that are not the true ones are far from where it is.
+    ``base`` is the model without them. Derivatives are those at the model, and where its causes are
+    so large that the base is not what they are to first order, also at the base, where a course may
+    do better: many causes that are not the true ones are far from where it is.
     """
     names = [name for name in model.added if name not in base.added]
-    found = []
-    for at, absent in ((model, names), (base, ())) if names else ((base, ()),):
-        without = at.without(absent)
-        found += [(one, without) for one in _fitted(at, absent, without)]
+    without = model.without(names)
+    found = [(one, without) for one in _fitted(model, names, without)]
+    off = abs(without.chi2 - base.fit.chi2)
+    if names and off > _LINEAR * (base.fit.chi2 - model.fit.chi2):
+        found += [(one, base.linear) for one in _fitted(base, (), base.linear)]
     # measured by what the better of the two answers leaves, as alike as that is
     large = max(1.0, model.mean_square)
     temper = max(1.0, min([large, *(_left(without, one) for one, without in found)]))

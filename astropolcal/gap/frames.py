@@ -351,7 +351,7 @@ def _fault(problem, place, trial, evidence, probability):
         stage = trial.what.removesuffix(" angle")
         stood = told = float(np.atleast_1d(dataset._given[stage])[f])
         # where a law turns what the table says into the angle of the optic, its error is added
-        if stage in observations.frames.colnames:
+        if stage in observations.frame_columns:
             told = float(observations.position(stage)[f])
         others = np.rad2deg(told + others - stood)
         value, error, told = np.rad2deg([told + value - stood, error, told]).tolist()

@@ -177,7 +177,7 @@ def _run(i, train, observations):
         states, take = STATES, observations.position(MODULATOR) < 0.5
     # "filter=CLEAR" is a state of the column filter
     names = dict.fromkeys(stage.partition("=")[0] for stage in ("hwp", *stages(train)))
-    known = set(observations.frames.colnames)
+    known = set(observations.frame_columns)
     where = {}
     for name in (name for name in names if name in known and name not in COORDINATES):
         column = np.asarray(observations.frames[name])

@@ -306,7 +306,7 @@ def frame_patterns(observations):
 
     What the angles taken cannot tell from an earlier pattern is left out.
     """
-    found, known = {}, observations.frames.colnames
+    found, known = {}, observations.frame_columns
     for axis, orders in _ORDERS.items():
         if axis in known:
             found |= _harmonics(observations.position(axis), axis, orders)
@@ -367,7 +367,7 @@ def badly_separated(observations):
     of frames where the angles always come in the same one. The dataset with the better angles
     counts.
     """
-    found, mine = {}, [o for o in observations if "hwp" in o.frames.colnames]
+    found, mine = {}, [o for o in observations if "hwp" in o.frame_columns]
     angles = [o.position("hwp") for o in mine]
     for k in _ORDERS["hwp"][2:] if mine else ():
         waves = [np.concatenate([_waves(angle, n) for n in (0, 4, k)]) for angle in angles]
@@ -388,7 +388,7 @@ def _same_order(observations):
 
 def frame_blocks(observations):
     """Return the number of the run of frames at one derotator angle of each frame, (F,), from 0."""
-    if "derotator" not in observations.frames.colnames:
+    if "derotator" not in observations.frame_columns:
         return np.arange(observations.n_frames)
     return derotator_runs(observations)
 
@@ -421,7 +421,7 @@ def places(model):
         yield "dataset", labels(range(len(names))), names, None
     beams = ["the differences of the beams", "the sums of the beams"]
     yield "beam", labels([np.arange(2)[:, None, None]] * len(observations)), beams, None
-    if all("derotator" in o.frames.colnames for o in observations):
+    if all("derotator" in o.frame_columns for o in observations):
         turned = [np.round(o.position("derotator") / SAME_ANGLE) for o in observations]
         kinds = np.unique(np.concatenate(turned))
         if 2 < len(kinds) <= _MOST_BLOCKS:

@@ -115,7 +115,7 @@ def frame_groups(observations):
 
     Fewer than three groups are refused: a derotator angle each, or blocks in time.
     """
-    if all("derotator" in o.frames.colnames for o in observations):
+    if all("derotator" in o.frame_columns for o in observations):
         angle = np.concatenate([o.position("derotator") for o in observations])
         number = clusters(angle)
         count = number.max() + 1

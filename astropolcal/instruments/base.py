@@ -652,7 +652,7 @@ class Instrument(ABC):
             return law.plate_law()
         if stated in law.modes:
             return law.plate_law(stated)
-        if stated is None and "hwp_true" in observations.frames.colnames:
+        if stated is None and "hwp_true" in observations.frame_columns:
             # the law then only tells how the plate moves within an exposure
             return law.plate_law(law.modes[0])
         raise InstrumentError(

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal import instruments
-from astropolcal.chain import Train, check_states, leaves, stages
+from astropolcal.chain import Train, check_states, leaves, stages, states_of
 from astropolcal.exceptions import (
     ChainError,
     InstrumentError,
@@ -245,7 +245,8 @@ def _check_fit(chain, observations, observable):
         raise ObservationError(
             f"{name}: observable {observable.name} of {words[0]} a frame; allowed is {words[1]}"
         )
-    check_states(chain, observations.frames.columns, name, least=1)
+    if states_of(chain):
+        check_states(chain, observations.frames.columns, name, least=1)
 
 
 def _positions(chain, observations, positions):
@@ -271,7 +272,7 @@ def _positions(chain, observations, positions):
 
 def _columns(observations, chain):
     # where the true angle of a stage is known, it is that at which it stands
-    known, true = observations.frames.colnames, {s: f"{s}_true" for s in stages(chain)}
+    known, true = observations.frame_columns, {s: f"{s}_true" for s in stages(chain)}
     return {s: observations.position(t if t in known else s) for s, t in true.items()}
 
 

@@ -541,7 +541,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     They give q without u, or neither. A frame masked at all wavelengths counts as missing. Without
     a half-wave plate all frames stay.
     """
-    if "hwp" not in observations.frames.colnames:
+    if "hwp" not in observations.frame_columns:
         return observations
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)

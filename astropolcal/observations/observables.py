@@ -457,7 +457,7 @@ def default_observable(observations):
     """Return the name of the observable for datasets: what their design allows."""
     if all(one.single_beam for one in observations):
         return Intensity.name
-    if all("hwp" in one.frames.colnames for one in observations):
+    if all("hwp" in one.frame_columns for one in observations):
         return NormalizedDoubleDifference.name
     return NormalizedSingleDifference.name
 

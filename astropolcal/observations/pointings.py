@@ -214,7 +214,7 @@ def sky_angles(observations, location=None):
     ``declination`` (columns or meta, degree) and the `~astropy.coordinates.EarthLocation`.
     """
     names = "altitude", "parallactic"
-    stated = [name in observations.frames.colnames for name in names]
+    stated = [name in observations.frame_columns for name in names]
     angles = [None, None]
     if not all(stated):
         time, target = _times(observations.frames), _target(observations)
@@ -271,7 +271,7 @@ def _target(observations):
 
     found = []
     for key in ("right_ascension", "declination"):
-        if key in observations.frames.colnames:
+        if key in observations.frame_columns:
             angle = numeric_column(observations.frames, key, observations.name, u.deg) * u.deg
         else:
             angle = observations.meta.get(key)
@@ -357,11 +357,11 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     """
     altitude, parallactic = sky_angles(observations, location)
     found = {"altitude": altitude, "parallactic": parallactic}
-    if "derotator" in observations.frames.colnames:
+    if "derotator" in observations.frame_columns:
         found["derotator"] = observations.position("derotator")
     follows = tracked(0.0, parallactic, altitude, law)
     offset = angle_or_zero(observations, "hwp")
-    if "hwp_true" in observations.frames.colnames:
+    if "hwp_true" in observations.frame_columns:
         # what the plate really did differs from the law by a constant offset in each frame
         offset = observations.position("hwp_true") - follows
     if (nodes, when) != (1, "middle"):
@@ -370,7 +370,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
             for stage, angle in found.items()
             for turn in [_TURNS.get(stage, 2 * np.pi)]
         }
-    if not {"hwp", "hwp_true"} & set(observations.frames.colnames):
+    if not {"hwp", "hwp_true"} & set(observations.frame_columns):
         return found
     follows = tracked(0.0, found["parallactic"], found["altitude"], law)
     return found | {"hwp": offset + follows}
@@ -494,7 +494,7 @@ def _place(observations, name):
 
 def angle_or_zero(observations, stage):
     """Return the position of a stage, zero in all frames where the table has no such column."""
-    if stage in observations.frames.colnames:
+    if stage in observations.frame_columns:
         return observations.position(stage)
     return np.zeros(observations.n_frames)
 
@@ -582,8 +582,8 @@ def _courses(observations):
 
     The beams of an exposure, which are frames of a table, are taken at once.
     """
-    times, count = clock(observations.frames), observations.n_frames
-    beams = np.asarray(observations.frames.columns.get("beam", np.zeros(count)))
+    frames, count = observations.frames, observations.n_frames
+    times, beams = clock(frames), np.asarray(frames.columns.get("beam", np.zeros(count)))
     own = [np.flatnonzero(beams == beam) for beam in np.unique(beams)]
     # a date alone is the same in all frames, and says no more than none
     if times is None or not np.ptp(times) > 0:
@@ -593,4 +593,4 @@ def _courses(observations):
             times[i] = times[i - 1] + (beam in seen)
             seen = {beam} if beam in seen else {*seen, beam}
     # stable: frames of one time stay in the order of the table
-    return times, [frames[np.argsort(times[frames], kind="stable")] for frames in own]
+    return times, [some[np.argsort(times[some], kind="stable")] for some in own]

@@ -194,6 +194,11 @@ class Observations:
         return self._grid.frames.copy()
 
     @property
+    def frame_columns(self):
+        """Names of the columns of `frames`."""
+        return self._grid.frames.colnames
+
+    @property
     def n_frames(self):
         """Number of frames, F."""
         return len(self._grid.frames)

@@ -158,6 +158,11 @@ class FrameAngles:
         """One row per frame."""
         return self._table.copy()
 
+    @property
+    def frame_columns(self):
+        """Names of the columns of `frames`."""
+        return self._table.colnames
+
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
         keyword, layout = self._layout.keywords[column], self._layout

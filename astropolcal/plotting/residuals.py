@@ -85,7 +85,7 @@ class DataGrid:
 
     def _turning(self):
         """Return the derotator where there is one, else the stage with the most settings."""
-        if "derotator" in {*self.part.positions, *self.part.observations.frames.colnames}:
+        if "derotator" in {*self.part.positions, *self.part.observations.frame_columns}:
             return "derotator"
         counts = {stage: clusters(self.degrees(stage), SAME_ANGLE).max() for stage in self._still()}
         # of a star the plate makes the series

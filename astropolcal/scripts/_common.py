@@ -537,7 +537,7 @@ def follow_laws(chains, texts, tables):
 
     Time is zero on the first day of the tables where no date is given.
     """
-    dated = [mjd_of(table.frames["time"]) for table in tables if "time" in table.frames.colnames]
+    dated = [mjd_of(table.frames["time"]) for table in tables if "time" in table.frame_columns]
     for text in texts:
         # a time of day has colons too
         match = re.fullmatch(r"([^:]+):(\w+)\((\d{1,2})\):([\w,]+)(?::(.+))?", text, re.ASCII)

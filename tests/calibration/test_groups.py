@@ -19,7 +19,7 @@ class _Table:
         self.name = name
         self.derotator = np.deg2rad(np.repeat(derotator, 2))
         self.cycle = np.repeat(cycle, 2)
-        self.frames = SimpleNamespace(colnames=["derotator"])
+        self.frame_columns = ["derotator"]
 
     def position(self, stage):
         assert stage == "derotator"

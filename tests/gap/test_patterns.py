@@ -23,9 +23,7 @@ def run(**degrees):
     angles = {name: np.deg2rad(np.asarray(values, float)) for name, values in degrees.items()}
     n = len(next(iter(angles.values())))
     positions = angles | {"sequence": np.linspace(0, 1, n) if n > 1 else np.zeros(1)}
-    return SimpleNamespace(
-        n_frames=n, frames=SimpleNamespace(colnames=list(angles)), position=positions.__getitem__
-    )
+    return SimpleNamespace(n_frames=n, frame_columns=list(angles), position=positions.__getitem__)
 
 
 def cycles(derotator, plate=PLATE):

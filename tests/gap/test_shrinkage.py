@@ -27,7 +27,7 @@ def table(n_frames, derotator=None):
     columns = {} if derotator is None else {"derotator": np.deg2rad(derotator)}
     return SimpleNamespace(
         n_frames=n_frames,
-        frames=SimpleNamespace(colnames=list(columns)),
+        frame_columns=list(columns),
         position=lambda name: columns[name],
     )
 

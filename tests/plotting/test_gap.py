@@ -348,7 +348,7 @@ def test_frames_are_named_by_their_derotator_angle():
         known = [] if derotator is None else ["derotator"]
         observations = SimpleNamespace(
             n_frames=n,
-            frames=SimpleNamespace(colnames=known),
+            frame_columns=known,
             position=lambda name, angle=derotator: np.deg2rad(angle),
         )
         axes = Figure().subplots()

@@ -34,9 +34,10 @@ _DEAR, _PULL, _SMOOTH = 1.5, 0.1, 0.1
 COARSE, _OUTSIDE = 4, 1e3
 # phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
 _OTHER_SIGN = 0.2
-# a polish ends when no bin gains a thousandth in a step, or is about to
+# a polish ends when no bin gains a thousandth in a step, or is about to, as one whose step led
+# astray, by more than a little, and is not yet damped so much
 _STILL_GAINING = 0.999
-_STUCK = 1.0
+_HARDLY, _STUCK = 1e-6, 1.0
 # a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
 # many more are taken, until the end is known so well, and an error so many times too small grows
 _STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
@@ -132,28 +133,33 @@ class BinProblem(Problem):
         step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
         return np.clip(here - step[..., 0].T, self._below, self._above)
 
-    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING, kept=()):
+    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING, kept=(), known=np.inf):
         """Improve the per-wavelength parameters by batched Levenberg-Marquardt.
 
         Slots that are ``kept`` stay as they are. Returns the vector, where no bin is worse than at
         the start, and the cost of each bin. It ends when no bin falls below the share
-        ``still_gaining`` of its cost in a step.
+        ``still_gaining`` of its cost in a step, or those that do would end above what is ``known``
+        of the bin if they went on at this rate.
         """
         vector = vector.copy()
         if not self.slots:
             return vector, self.costs(vector)
         costs, damping = self.costs(vector), np.full(self.n_bins, 1e-3)
-        for _ in range(iterations):
+        for left in reversed(range(iterations)):
             trial = vector.copy()
             trial[self.elements] = self._step(vector, damping, kept)
             new = self.costs(trial)
             # each bin has its own damping, and takes or leaves its own step
             better = new < costs
             gaining = new < still_gaining * costs
+            rate = np.divide(new, costs, out=np.ones_like(new), where=gaining)
+            gaining &= rate**left * new < known
+            # what is not better, and hardly worse, is at its minimum
+            astray = (new > (1 + _HARDLY) * costs) & (damping < _STUCK)
             vector[self.elements[:, better]] = trial[self.elements[:, better]]
             costs = np.where(better, new, costs)
             damping = np.where(better, damping / 5, damping * 8)
-            if not np.any(gaining | (~better & (damping < _STUCK))):
+            if not np.any(gaining | astray):
                 break
         return vector, costs
 
@@ -285,7 +291,7 @@ def search_branches(problem, vector, origin=None):
             for values in problem.valleys(base, row, low, high):
                 trial = base.copy()
                 trial[problem.elements[row]] = values
-                trial, new = problem.polish(trial)
+                trial, new = problem.polish(trial, known=CLEARLY_BETTER * costs)
                 better = new < CLEARLY_BETTER * costs
                 best[problem.elements[:, better]] = trial[problem.elements[:, better]]
                 costs = np.where(better, new, costs)

@@ -209,14 +209,7 @@ def calibrate(
     given = weights if strategy == "sequential" else weighting
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
-        # iteratively reweighted least squares, which every fitter can do
-        def updated(_):
-            return robust_weighting(measurement, loss)
-
-        first, what = updated(weighting), "the weights of the robust fit"
-        outcome, weighting = until_settled(
-            measurement, first, fitter, updated, _ROBUST_ROUNDS, what
-        )
+        outcome, weighting = _robust(measurement, loss, fitter)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
@@ -246,6 +239,16 @@ def _by_strategy(strategy, *how):
     outcomes, weighting, stages = (two_step if strategy == "two-step" else sequential)(*how)
     # the first step that did not converge makes the next ones useless
     return next((o for o in outcomes if not o["converged"]), outcomes[-1]), weighting, stages
+
+
+def _robust(measurement, loss, fitter):
+    """Return the outcome of iteratively reweighted least squares, and the weighting."""
+
+    def updated(_):
+        return robust_weighting(measurement, loss)
+
+    first, what = updated(None), "the weights of the robust fit"
+    return until_settled(measurement, first, fitter, updated, _ROBUST_ROUNDS, what)
 
 
 def _fixed(chain, fix):

@@ -216,7 +216,7 @@ def complete(measurement, whitened, level, view):
         # commanded angles repeat in many frames; a microradian is none
         round(float(angle), 6)
         for dataset in measurement.datasets
-        if "hwp" in dataset.observations.frames.colnames
+        if "hwp" in dataset.observations.frame_columns
         for angle in dataset.observations.position("hwp")
     }
     finding.sampling = harmonic_words(np.array(sorted(angles))) if angles else []

@@ -50,7 +50,7 @@ def leave_out_groups(measurement, by="derotator"):
     groups, first = [], 0
     for dataset in measurement.datasets:
         plus, table = dataset.frames[:, 0], dataset.observations
-        turns = "derotator" in table.frames.colnames and "parallactic" not in dataset.positions
+        turns = "derotator" in table.frame_columns and "parallactic" not in dataset.positions
         if by == "dataset":
             number = np.zeros(len(plus), dtype=int)
         elif by == "pair":
