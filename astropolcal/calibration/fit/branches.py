@@ -34,9 +34,9 @@ _DEAR, _PULL, _SMOOTH = 1.5, 0.1, 0.1
 COARSE, _OUTSIDE = 4, 1e3
 # phases of other signs are so far apart (radian); what is nearer to half a wave is nearly the same
 _OTHER_SIGN = 0.2
-# a polish ends when no bin gains a thousandth in a step, or is about to, as one whose step led
+# a polish ends when no bin gains a ten-thousandth in a step, or is about to, as one whose step led
 # astray, by more than a little, and is not yet damped so much
-_STILL_GAINING = 0.999
+_STILL_GAINING = 0.9999
 _HARDLY, _STUCK = 1e-6, 1.0
 # a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
 # many more are taken, until the end is known so well, and an error so many times too small grows
