@@ -333,18 +333,30 @@ def _measured(table, label, beams):
         raise ObservationError(
             f"{label}: column {beams[0]} has unit {flux_unit}, a linear unit such as adu is needed"
         )
-    # of the beams, else of the single differences, or none
+    # of the beams, of the single differences, of both, or none
     errors = ()
     for names in (BEAM_ERRORS, SINGLE_ERRORS) if beams == BEAMS else (("flux_err",),):
         there = [name for name in names if name in table.colnames]
         if 0 < len(there) < len(names):
             (other,) = {*names} - {*there}
             raise ObservationError(f"{label}: missing column {other}; it has {there[0]}")
-        errors = errors or tuple(there)
+        errors += tuple(there)
     # the right beam sets the unit; the left one and the errors are converted
     values = {name: numeric_column(table, name, label, flux_unit) for name in (*beams, *errors)}
     for name in errors:
         first_bad_row(values[name] < 0, name, values[name], label, "errors above zero")
+    if len(errors) > 2:
+        right, left, difference, total = (values[name] ** 2 for name in errors)
+        off = np.abs((difference + total) / (2 * (right + left)) - 1)
+        if np.nanmedian(off) > _AT_ODDS:
+            warnings.warn(
+                f"{label}: the squares of {' and '.join(SINGLE_ERRORS)} add up to "
+                f"{np.nanmedian((difference + total) / (right + left)):.3g} times those of "
+                f"{' and '.join(BEAM_ERRORS)}, not to twice as much; the latter are used alone",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
+            values = {name: v for name, v in values.items() if name not in SINGLE_ERRORS}
     return flux_unit, values
 
 
@@ -352,6 +364,8 @@ def _measured(table, label, beams):
 # A bad cell is masked with a reason, never dropped in silence: when a table is read, one warning a
 # reason says how many cells and where the first is.
 
+# errors of the beams and of their difference and sum that are by more than this share apart
+_AT_ODDS = 0.1
 # beyond this, and below its inverse, squares would overflow
 _HUGE = 1e100
 
@@ -423,23 +437,26 @@ def beam_variances(flux_right, flux_left, errors):
     """
     Return the variances of both beams and their covariance, (F, W) each.
 
-    ``errors`` are standard deviations under the names of `BEAM_ERRORS` or `SINGLE_ERRORS`; none
-    give NaN. With S = R + L and D = R - L, var(S) + var(D) = 2 (var(R) + var(L)) and var(S) -
-    var(D) = 4 cov(R, L). Errors of S and D do not determine how the variance is shared between the
-    beams: it is shared in proportion to their fluxes, as photon noise would be, but never so
-    unevenly that the matrix ceases to be a covariance.
+    ``errors`` are standard deviations under the names of `BEAM_ERRORS`, `SINGLE_ERRORS` or both;
+    none give NaN. With S = R + L and D = R - L, var(S) + var(D) = 2 (var(R) + var(L)) and var(S) -
+    var(D) = 4 cov(R, L). Errors of S and D alone do not determine how the variance is shared
+    between the beams: it is shared in proportion to their fluxes, as photon noise would be, but
+    never so unevenly that the matrix ceases to be a covariance.
     """
     if not errors:
         return tuple(np.full_like(flux_right, np.nan) for _ in range(3))
     if "flux_err" in errors:
         dark = np.where(np.isnan(flux_right), np.nan, 0.0)
         return errors["flux_err"] ** 2, dark, dark
-    if BEAM_ERRORS[0] in errors:
-        right, left = (errors[name] ** 2 for name in BEAM_ERRORS)
-        return right, left, np.where(np.isnan(right), np.nan, 0.0)
-    difference, total = (errors[name] ** 2 for name in SINGLE_ERRORS)
+    known = [errors[name] ** 2 for name in (*BEAM_ERRORS, *SINGLE_ERRORS) if name in errors]
+    if len(known) == 2 and BEAM_ERRORS[0] in errors:
+        return *known, np.where(np.isnan(known[0]), np.nan, 0.0)
+    difference, total = known[-2:]
     # both at once: var(S) - var(D) = 4 cov
     covariance = 0.25 * (total - difference)
+    if len(known) > 2:
+        most = np.sqrt(known[0] * known[1])
+        return *known[:2], np.clip(covariance, -most, most)
     # var(R) + var(L)
     both = 0.5 * (total + difference)
     # var(R) var(L) >= cov^2 bounds the share of the right beam around one half

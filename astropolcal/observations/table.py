@@ -46,9 +46,9 @@ class Observations:
     parallactic, altitude          angle     optional, on sky
     flux_right, flux_left          any, one  ordinary and extraordinary beam; or
     flux, or flux_NAME             any, one  a single beam, or several others
-    flux_right_err, flux_left_err  of flux   optional errors of the beams, or
-    single_difference_err,         of flux   errors of R - L and R + L (used where
-    single_sum_err                           the former are absent)
+    flux_right_err, flux_left_err  of flux   optional errors of the beams, and
+    single_difference_err,         of flux   of R - L and R + L: what the beams share;
+    single_sum_err                           alone, in proportion to the fluxes
     mask_reason                              optional, not empty where unusable
     any other                      any       belongs to the frame (file, time,
                                              flc_state), the same in all its rows

@@ -24,7 +24,7 @@ def reduced_table(frames, instrument, meta):
     Return the observation table of frames in the order they were taken.
 
     Fluxes of a cell that failed are masked, and ``mask_reason`` says why. Errors are those of the
-    beams, or, where the beams share noise, those of their difference and sum.
+    beams, and, where the beams share noise, those of their difference and sum, too.
     """
     table = _frame_columns(frames, instrument)
     if not frames:
@@ -35,14 +35,13 @@ def reduced_table(frames, instrument, meta):
     beams = instrument.files.beams
     names = ["flux"] if len(beams) == 1 else [f"flux_{beam}" for beam in beams]
     columns = dict(zip(names, flux, strict=True))
+    columns |= {f"{n}_err": np.sqrt(v) for n, v in zip(names, variance, strict=True)}
     # errors of the beams alone cannot say what they share
     if (covariance[~failed] != 0).any():
         # var(R -+ L) = var(R) + var(L) -+ 2 cov
         both = variance.sum(axis=0)
         columns["single_difference_err"] = np.sqrt(np.maximum(both - 2 * covariance, 0.0))
         columns["single_sum_err"] = np.sqrt(np.maximum(both + 2 * covariance, 0.0))
-    else:
-        columns |= {f"{n}_err": np.sqrt(v) for n, v in zip(names, variance, strict=True)}
     for name, values in columns.items():
         table[name] = _column(np.where(failed, 0.0, values), failed, u.Unit(frames[0].unit))
     reasons = [reason for frame in frames for reason in frame.photometry.reasons]

@@ -306,10 +306,36 @@ def test_no_errors_at_all(table):
     assert not obs.mask.any()
 
 
-def test_errors_of_the_beams_win(table):
-    table["single_sum_err"] = table["single_difference_err"] = 9 * table["flux_right_err"]
+def test_errors_of_beams_difference_and_sum_tell_what_the_beams_share(table):
+    right, left = (table[f"flux_{beam}_err"] for beam in ("right", "left"))
+    shared = 0.2 * right * left
+    table["single_difference_err"] = np.sqrt(right**2 + left**2 - 2 * shared)
+    table["single_sum_err"] = np.sqrt(right**2 + left**2 + 2 * shared)
     obs = Observations.from_table(table)
+    alone = Observations.from_table(
+        table[
+            "frame",
+            "bin",
+            "wavelength",
+            "hwp",
+            "derotator",
+            "flux_right",
+            "flux_left",
+            "flux_right_err",
+            "flux_left_err",
+        ]
+    )
+    for name in ("variance_right", "variance_left"):
+        np.testing.assert_allclose(getattr(obs, name), getattr(alone, name))
+    np.testing.assert_allclose(
+        obs.covariance, 0.2 * np.sqrt(obs.variance_right * obs.variance_left), rtol=1e-9
+    )
+    # those of the beams win
+    table["single_sum_err"] = table["single_difference_err"] = 9 * right
+    with pytest.warns(AstropolcalWarning, match="single_sum_err add up to .* not to twice as much"):
+        obs = Observations.from_table(table)
     np.testing.assert_allclose(obs.variance_right, obs.flux_right)
+    assert (obs.covariance == 0).all()
 
 
 # ---- rows ------------------------------------------------------------------------------------

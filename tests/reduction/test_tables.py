@@ -45,12 +45,13 @@ def test_one_row_a_frame_and_wavelength(small):
     assert "mask_reason" not in table.colnames
 
 
-def test_shared_noise_turns_errors_into_those_of_difference_and_sum(small):
+def test_shared_noise_is_in_the_errors_of_difference_and_sum(small):
     table = reduced_table([frame(1, covariance=2.0)], small, {})
     # var(R) + var(L) -+ 2 cov
     assert table["single_difference_err"][0] == pytest.approx(np.sqrt(25 - 4))
     assert table["single_sum_err"][0] == pytest.approx(np.sqrt(25 + 4))
-    assert "flux_right_err" not in table.colnames
+    # and how it is divided in those of the beams
+    assert (table["flux_right_err"][0], table["flux_left_err"][0]) == (4.0, 3.0)
     # what the beams share wholly is no noise of their difference
     shared = reduced_table([frame(1, covariance=12.5)], small, {})
     assert shared["single_difference_err"][0] == 0
