@@ -55,7 +55,7 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     for name, angles in (("hwp", hwp), ("derotator", derotator)):
         if not finite_position(angles, name).size:
             raise ParameterError(f"{name} = {angles}; at least one angle is needed")
-    hwp, derotator = np.atleast_1d(u.Quantity(hwp)), np.atleast_1d(u.Quantity(derotator))
+    hwp, derotator = (np.ravel(u.Quantity(angles)) for angles in (hwp, derotator))
     return QTable(
         {"hwp": np.tile(hwp, derotator.size), "derotator": np.repeat(derotator, hwp.size)}
     )

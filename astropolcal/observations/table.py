@@ -88,7 +88,7 @@ class Observations:
         # from the grid and not from the file: a mask set later holds for them as well
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
         # found when they are first asked for, and kept
-        self._groups, self._hash = {}, None
+        self._groups, self._hashes = {}, {}
         self._mask = grid.reason > 0
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
         # groups and hash are kept, so that what they were made of must not change
@@ -281,13 +281,14 @@ class Observations:
         Numbers count to 12 significant digits in canonical units; of ``meta``, only
         the instrument and the source belong to the content.
         """
-        if self._hash is None:
-            grid = self._grid
+        grid, header = self._grid, f"{self.instrument}|{self.source}"
+        # meta may change, the columns may not
+        if header not in self._hashes:
             columns = {name: grid.frames[name] for name in grid.frames.colnames}
             columns |= {"bin": grid.bin, "wavelength": grid.wavelength, "mask": self.mask}
             columns |= {name: array * grid.flux_unit for name, array in self._measured().items()}
-            self._hash = hash_columns(columns, f"{self.instrument}|{self.source}")
-        return self._hash
+            self._hashes[header] = hash_columns(columns, header)
+        return self._hashes[header]
 
     def _measured(self):
         grid = self._grid
@@ -811,7 +812,8 @@ def _canonical(column):
     """Return the unit and the values of a column as text that formats cannot change."""
     unit = getattr(column, "unit", None)
     if isinstance(column, Time):
-        column = column.mjd
+        # one moment is the same in all scales, of which a local one tells no other
+        column = (column if column.scale == "local" else column.utc).mjd
     elif isinstance(column, u.Quantity):
         try:
             unit = canonical_unit(unit)

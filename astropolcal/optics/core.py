@@ -913,6 +913,12 @@ class Chain(OwnUnits, CompoundModel):
             raise ChainError(f"no optics at {index} of a chain of {len(self._leaflist)}")
         return reduce(or_, models)
 
+    def replace_submodel(self, name, model):
+        """Return a chain with another model in place of that of a name."""
+        # the tree that astropy would make is no chain
+        self[name]
+        return reduce(or_, [model if leaf.name == name else leaf for leaf in self])
+
     def _whole(self, index):
         """Return a slice by number; a name as its stop is the last optic, as astropy has it."""
         start, stop = (

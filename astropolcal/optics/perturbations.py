@@ -135,7 +135,8 @@ class Perturbation(_BeamOptic, _Modulated):
     r"""
     A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
 
-    G is a generator of Mueller matrices and the f are functions of the frame.
+    G is a generator of Mueller matrices and the f are functions of the frame. A gain multiplies the
+    flux by :math:`1 \pm (a f_1 + b f_2)`, with the plus for the right beam.
 
     Parameters
     ----------

@@ -5,6 +5,7 @@ import astropy.units as units
 import numpy as np
 from astropy.modeling import Parameter
 
+from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import UNITS, blank
 from astropolcal.optics.core import _LinearOptic
 
@@ -183,7 +184,15 @@ class StarSource(PolarizedSource):
     def _dispersion(self, wavelength):
         return np.asarray(wavelength)
 
+    def _check(self, law):
+        """Refuse wavelengths that have no logarithm; bounds may have been lifted."""
+        for key, value in (("lambda_max", law[1]), ("reference", law[8])):
+            if not np.all(np.asarray(value) > 0):
+                least = 1e3 * np.min(value)
+                raise ParameterError(f"{self._label}.{key} = {least:.6g} nm; allowed is above zero")
+
     def _matrix(self, wavelength, q, u, *law):
+        self._check(law)
         x, (q1, u1, q2, u2) = np.log(wavelength / law[8]), law[4:8]
         degree, along, *_ = _interstellar(wavelength, *law[:4])
         return super()._matrix(
@@ -193,6 +202,7 @@ class StarSource(PolarizedSource):
         )
 
     def _derivatives(self, wavelength, q, u, *law):
+        self._check(law)
         (_, longest, width, rotation), slopes, reference = law[:4], law[4:8], law[8]
         x = np.log(wavelength / reference)
         degree, along, log, shape = _interstellar(wavelength, *law[:4])

@@ -116,6 +116,9 @@ def draw_line(axes, lam, values, **look):
     # a marker is seen at a single wavelength, too
     drawn = (lam, values) if "marker" in look and np.size(lam) == 1 else widened(lam, values)
     (line,) = axes.plot(*drawn, **look)
+    # an axis of wavelengths is one where no value is known, too
+    axes.update_datalim([(x, 0) for x in drawn[0]], updatey=False)
+    axes.autoscale_view(scaley=False)
     return line
 
 

@@ -151,6 +151,11 @@ def test_the_hash_sees_every_number_mask_selection_and_source(obs, table):
     other.meta["source"] = "unpolarized"
     hashes.add(Observations.from_table(other).content_hash)
     assert len(hashes) == 4
+    # which may change after it was asked for
+    again = Observations.from_table(table)
+    assert again.content_hash == obs.content_hash
+    again.meta["source"] = "unpolarized"
+    assert again.content_hash == Observations.from_table(other).content_hash
     for name in ["flux_right", "flux_left_err", "hwp", "wavelength"]:
         where = (table["frame"] == 0) if name == "hwp" else (table["bin"] == 0)
         table[name][where] += 1e-3 * table[name].unit
@@ -164,6 +169,13 @@ def test_the_hash_ignores_how_numbers_are_written(tmp_path, obs):
     (tmp_path / "two.ecsv").write_text(text.replace(" 22.5 ", " 2.2500e+01 "))
     two = Observations.read(tmp_path / "two.ecsv")
     assert two.content_hash == obs.content_hash
+    # nor in which scale moments are
+    table, moments = obs.to_table(), Time(60000 + obs.to_table()["frame"] / 1440, format="mjd")
+    found = []
+    for time in (moments, moments.tai, moments + 37 * u.s):
+        table["time"] = time
+        found.append(Observations.from_table(table).content_hash)
+    assert found[0] == found[1] != found[2]
 
 
 def test_round_trip(tmp_path, obs):

@@ -188,6 +188,17 @@ def test_slices_of_a_chain():
             chain[index]
 
 
+def test_an_optic_is_replaced_in_a_chain():
+    chain, other = relay(), optics.LinearRetarder(retardance=30 * u.deg, name="other")
+    new = chain.replace_submodel("second", other)
+    assert [optic.name for optic in new] == ["first", "other", "third", "fourth"]
+    assert type(new) is type(chain)
+    assert new["other"] is other
+    assert "second" in chain.submodel_names
+    with pytest.raises(ChainError, match="no optic 'secnd' in the chain"):
+        chain.replace_submodel("secnd", other)
+
+
 def test_the_inverse_undoes_a_chain():
     light = (WAVELENGTH, 1, 0.2, 0.3, 0.4)
     for model in (relay(), plate(), relay().inverse.inverse):
@@ -204,6 +215,13 @@ def test_what_forgets_light_has_no_inverse():
         (relay() | optics.LinearPolarizer()).inverse  # noqa: B018
     with pytest.raises(ParameterError, match="has no inverse"):
         optics.StarSource().inverse(1.6 * u.um, 1, 0, 0, 0)
+
+
+def test_a_law_of_no_wavelength_is_refused():
+    for key in ("lambda_max", "reference"):
+        star = optics.StarSource(p_max=0.01, name="star", **{key: -5 * u.nm})
+        with pytest.raises(ParameterError, match=f"star.{key} = -5 nm; allowed is above zero"):
+            star.mueller(1.6 * u.um)
 
 
 def test_chains_are_copied_and_pickled():
