@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration import Calibration
 from astropolcal.calibration.fit.branches import BinProblem, search_branches
+from astropolcal.calibration.fit.calibrate import Fitted, fitted
 from astropolcal.calibration.fit.strategies import few_frames
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.estimates import rms
@@ -81,8 +82,8 @@ class Model:
     fit: object
     #: Effects in the chains, with the parameters that they added.
     added: dict = field(default_factory=dict)
-    #: The calibration that was made for it, None where it began with another one.
-    calibration: Calibration | None = None
+    #: The fit of a calibration that was made for it, None where it began with another one.
+    calibration: Fitted | None = None
     #: Chains with the values from which a nominal model was fitted, None of others.
     start: list | None = None
 
@@ -433,7 +434,7 @@ def nominal_model(chains, observations, calibration=None, other=None):
             "the nominal fit did not converge: nothing can be said of missing effects; "
             "check the angles, the optics in the beam and the starting values"
         )
-    made = calibration if isinstance(calibration, Calibration) else None
+    made = calibration if isinstance(calibration, Fitted) else None
     return Model(problem, found, calibration=made, start=chains)
 
 
@@ -465,9 +466,7 @@ def _lower(problem, vector, found):
 
 
 def nominal_calibration(chains, observations):
-    """
-    Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
-    """
+    """Fit chains as a calibration does, of which the errors are seldom asked for."""
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
         # every parameter is held: the chains as they are
@@ -476,8 +475,7 @@ def nominal_calibration(chains, observations):
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         instrument = next((o.instrument for o in observations if o.instrument), None)
-        options = {"cross_validate": False, "instrument": instrument}
-        return calibrate(list(chains), list(observations), **options)
+        return fitted(measurement, instrument=instrument)
 
 
 def starting_model(calibration, observations, library, say):

@@ -9,8 +9,7 @@ import base64
 import io
 import warnings
 from contextlib import contextmanager, suppress
-from copy import copy, deepcopy
-from dataclasses import replace
+from copy import deepcopy
 from functools import cached_property
 from textwrap import wrap
 
@@ -434,12 +433,10 @@ def accuracies(model, cross_validate=True):
             warnings.simplefilter("ignore", AstropolcalWarning)
             made = model.calibration
             calibration = (
-                with_causes(model, cross_validate=False, instrument=instrument)
+                with_causes(model, cross_validate=cross_validate, instrument=instrument)
                 if made is None
-                else replace(made, fit=dict(made.fit), datasets=list(map(copy, made.datasets)))
+                else made.calibration(cross_validate=cross_validate)
             )
-            if cross_validate:
-                calibration.cross_validate()
             targets = target_accuracies(calibration)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
                 targets = target_accuracies(calibration, open_directions="ignore")

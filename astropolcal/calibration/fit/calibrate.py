@@ -16,6 +16,7 @@ import platform
 import time
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version as installed
 
@@ -71,6 +72,7 @@ STRATEGIES = ("joint", "two-step", "sequential")
 ERRORS = ("scatter", "white")
 GAUGES = ("minimal", None)
 _CHOICES = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS, "gauge": GAUGES}
+DEFAULTS = {key: next(iter(allowed)) for key, allowed in _CHOICES.items()}
 _ROBUST_ROUNDS = 50
 # the optics of this package are tested; step, in degrees, micrometres or percent, for others
 _OWN, _DIFFERENCE, _DIFFERS = __name__.partition(".")[0], 1e-4, 1e-2
@@ -193,8 +195,6 @@ def calibrate(
     for name, value in chosen.items():
         check_choice(name, value, _CHOICES[name], FitError)
     search = strategy != "two-step" if search is None else search
-    started = time.perf_counter()
-    fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
     copies = {}
@@ -202,34 +202,75 @@ def calibrate(
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
         chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
+    how = {"weights": weights, "fitter": fitter, "search": search, "options": options}
+    found = fitted(measurement, chosen, **how, instrument=instrument, held=list(fix or ()))
+    found.settings |= {"own": copies} if copies else {}
+    return found.calibration(cross_validate=cross_validate)
+
+
+@dataclass
+class Fitted:
+    """A measurement that was fitted, of which errors are worked out where they are asked for."""
+
+    measurement: Measurement
+    whitened: object
+    settings: dict
+    fit: dict
+    stages: list
+
+    @property
+    def chains(self):
+        """The fitted chains."""
+        return self.measurement.put_back(self.measurement.vector())
+
+    @property
+    def converged(self):
+        """Whether the fit converged."""
+        return self.fit["converged"]
+
+    def calibration(self, *, cross_validate=False):
+        """Return the calibration, with its errors."""
+        return _result(
+            self.measurement,
+            self.whitened,
+            settings=dict(self.settings),
+            fit=dict(self.fit),
+            stages=self.stages,
+            cross_validate=cross_validate,
+        )
+
+
+def fitted(
+    measurement,
+    chosen=None,
+    *,
+    weights=None,
+    fitter=None,
+    search=True,
+    options=None,
+    instrument=None,
+    held=(),
+):
+    """Fit a measurement as `calibrate` does; ``held`` are the names of what was fixed for it."""
+    started, chosen = time.perf_counter(), DEFAULTS if chosen is None else chosen
+    fitter = TRFLSQFitter() if fitter is None else fitter
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
-    origin = measurement.vector()
+    origin, (strategy, loss) = measurement.vector(), (chosen[k] for k in ("strategy", "loss"))
     given = weights if strategy == "sequential" else weighting
     outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
     if loss != "linear":
         outcome, weighting = _robust(measurement, loss, fitter)
     if not outcome["converged"]:
         warnings.warn(
-            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
+            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=3
         )
-    taken, whitened = _at_gauge(measurement, weighting, origin, gauge)
+    taken, whitened = _at_gauge(measurement, weighting, origin, chosen["gauge"])
+    gauge = describe_gauge(chosen["gauge"], taken, measurement.free, held)
+    settings = {"instrument": instrument, "fitter": type(fitter).__name__, **chosen, "gauge": gauge}
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
-    return _result(
-        measurement,
-        whitened,
-        settings={
-            "instrument": instrument,
-            "fitter": type(fitter).__name__,
-            **chosen,
-            "gauge": describe_gauge(gauge, taken, measurement.free, list(fix or ())),
-            **({"own": copies} if copies else {}),
-        },
-        fit=outcome,
-        stages=stages,
-        cross_validate=cross_validate,
-    )
+    return Fitted(measurement, whitened, settings, outcome, stages)
 
 
 def _by_strategy(strategy, *how):
