@@ -121,9 +121,9 @@ def calibrate(
         differences, of tables without a column ``hwp`` single ones, and of single beams the
         intensity.
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
-        Noise of the data, which sets their weights and the scale of all errors. None: one level for
-        all data, from the residuals (the default, as the errors of real tables are rarely
-        complete). ``"wavelength"``: one level for each wavelength of each dataset, from the
+        Noise of the data, which sets their weights, and with ``errors="white"`` the scale of all
+        errors. None: one level for all data, from the residuals (the default, as the errors of real
+        tables are rarely complete). ``"wavelength"``: one level for each wavelength of each dataset, from the
         residuals, with the fit repeated until both agree. ``"errors"``: the errors of the tables.
         Or the noise itself, its standard deviation as one value, one per wavelength or one per
         datum.

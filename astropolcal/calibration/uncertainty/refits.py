@@ -639,7 +639,8 @@ def robust_covariance(calibration, groups="derotator"):
     prior = problem.weighting.level * whitened.along(whitened.prior_rows)
     # of one array with itself: a product of two copies is symmetric to rounding only
     pulls = np.array(pulls)
-    return sandwich(measurement, whitened, problem.weighting, pulls.T @ pulls + prior.T @ prior)
+    middle = pulls.T @ pulls + prior.T @ prior
+    return sandwich(measurement, whitened, problem.weighting, middle, has_scatter=True)
 
 
 # ---- as published --------------------------------------------------------------------------
