@@ -79,7 +79,10 @@ def changes(diagnosis, causes):
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
             of = "" if _is_told(cell, cause, names) else " of this or what looks the same"
-            entry["words"] = _sentence(cell, entry, names, wavelength, of)
+            # what has a name of its own in each run
+            is_named = str(cause.get("effect")).endswith(f"/dataset:{run}")
+            named = cause["title"].removesuffix(f' in "{run}"') if is_named else ""
+            entry["words"] = _sentence(cell, entry, names, wavelength, of, named)
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
 
@@ -154,11 +157,12 @@ def paragraph(content, names, asked=False):
     return words
 
 
-def _sentence(cell, entry, names, wavelength, of):
+def _sentence(cell, entry, names, wavelength, of, named):
     """Return one change in words."""
     plain = _in_any_run(cell)
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
+    title = named or title
     # the size of a gain is half the difference of the beams
     size = _size(entry["size"], wavelength, 2.0 if cell.kind == "gain" else 1.0)
     chance = f"probability {100 * entry['probability']:.0f} %{of}"

@@ -123,10 +123,10 @@ def calibrate(
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
         Noise of the data, which sets their weights, and with ``errors="white"`` the scale of all
         errors. None: one level for all data, from the residuals (the default, as the errors of real
-        tables are rarely complete). ``"wavelength"``: one level for each wavelength of each dataset, from the
-        residuals, with the fit repeated until both agree. ``"errors"``: the errors of the tables.
-        Or the noise itself, its standard deviation as one value, one per wavelength or one per
-        datum.
+        tables are rarely complete). ``"wavelength"``: one level for each wavelength of each
+        dataset, from the residuals, with the fit repeated until both agree. ``"errors"``: the
+        errors of the tables. Or the noise itself, its standard deviation as one value, one per
+        wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others. They have no priors but those of what they follow.
     own : str or sequence of str, or dict of str to sequence
