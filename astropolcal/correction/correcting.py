@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from astropolcal.correction.frames import ScienceFrames
+from astropolcal.correction.frames import DEROTATOR_LIMIT, ScienceFrames
 from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
@@ -154,7 +154,7 @@ def correct(
     Warns
     -----
     AstropolcalWarning
-        If the frames have no pairs, or some have none, where the calibration fitted pairs; their
+        If the frames have no pairs, or some have none, where pairs are to be fitted; their
         brightness cannot be measured; combinations of Stokes parameters are poorly determined at
         some wavelengths; the calibration does not determine how they change; or it is old.
 
@@ -269,24 +269,28 @@ def _chain_at(calibration, frames, chain, **when):
 def _observable(calibration, frames, observable):
     """Return what is fitted, by default what the calibration has fitted, and doubts in words."""
     fitted = getattr(calibration, "settings", {}).get("observable")
-    if frames.groups is not None and frames.pairs is None:
+    paired, apart = frames.pairs is not None and len(frames.pairs) > 0, "45 deg away"
+    if "derotator" in frames.positions:
+        apart += f" with the derotator within {DEROTATOR_LIMIT:g}"
+    if observable is None and frames.groups is not None and not paired:
         # beams that have no partner with which they could be compared
-        observable = observable or "intensity"
-    if observable is None and fitted in OBSERVABLES:
-        observable = "single" if OBSERVABLES[fitted].frames_per_datum == 1 else "double"
-        if observable == "double" and frames.pairs is None:
+        observable = "intensity"
+    elif observable is None:
+        # of a chain that nobody fitted: what cancels most
+        observable = "intensity" if frames.pairs is None else "double"
+        if fitted in OBSERVABLES:
+            observable = "single" if OBSERVABLES[fitted].frames_per_datum == 1 else "double"
+        if observable == "double" and not paired:
             return "intensity", [
-                "the calibration fitted pairs of frames, and these frames have none (half-wave "
-                "plate angles 45 deg apart, hwp=): their intensities are fitted, so that unequal "
+                "double differences need pairs of frames, and these frames have none (half-wave "
+                f"plate {apart}, hwp=): their intensities are fitted, so that unequal "
                 "gains of the beams, and what the optics downstream of the half-wave plate "
                 "polarize unknown to the calibration, do not cancel"
             ]
-    # of a chain that nobody fitted: what cancels most
-    observable = observable or ("intensity" if frames.pairs is None else "double")
-    if observable != "double" or frames.pairs is None:
+    if observable != "double" or not paired:
         return observable, []
     names, alone = frames.names, set(range(len(frames.names))) - set(np.ravel(frames.pairs))
-    words = f"{len(alone)} of {len(names)} frames have no partner 45 deg away and are left out"
+    words = f"{len(alone)} of {len(names)} frames have no partner {apart} and are left out"
     return observable, [f"{words}; the first is {names[min(alone)]}"] if alone else []
 
 

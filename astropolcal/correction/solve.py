@@ -236,7 +236,7 @@ def _undetermined(channels, labels, weak):
         shown = ", ".join(map(str, list(labels)[:_MAX_NAMED]))
         words += f" ({shown}{', ...' if count > _MAX_NAMED else ''})"
     if channels.observable == "double":
-        words += f" in {len(channels.units)} pairs"
+        words += f" in {len(channels.units)} pairs (observable='intensity' needs none)"
     return (
         f"Q and U are not determined at any wavelength by {words}: poorly determined is {weak}; "
         "frames at half-wave-plate angles such as 0, 22.5, 45 and 67.5 deg are needed"

@@ -52,7 +52,7 @@ def test_disk_comes_back_exactly(disk_frames, sky, charis):
 
 def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
     """A camera that turns between frames; the rows refer to the sky, the images do not."""
-    hwp, positions = track(1)
+    _, positions = track(1)
     stokes = scene(22)
     right, left = seen(sky, positions, charis.wavelength, stokes)
     camera = [0, 90, 180, 270] * u.deg
@@ -60,7 +60,7 @@ def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
         for i, angle in enumerate(camera):
             beam[i] = derotate(beam[i], -angle)
     turned = ScienceFrames.from_arrays(
-        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+        right, left, charis.wavelength, positions, position_angle=camera
     )
     found = correct(sky, turned)
     np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
@@ -73,12 +73,12 @@ def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
 
 def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, track, seen):
     """Corners that turn out of the image must not count as dark."""
-    hwp, positions = track(2)
+    _, positions = track(2)
     stokes = np.ones((3, 22, 11, 11)) * np.array([100.0, 2.0, -1.0])[:, None, None, None]
     right, left = seen(sky, positions, charis.wavelength, stokes)
     camera = np.repeat([0, 45], 4) * u.deg
     frames = ScienceFrames.from_arrays(
-        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+        right, left, charis.wavelength, positions, position_angle=camera
     )
     found = correct(sky, frames)
     np.testing.assert_allclose(found.stokes, stokes, rtol=1e-9)
@@ -86,7 +86,7 @@ def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, trac
 
 @pytest.mark.slow
 def test_any_turn_of_the_field(sky, charis, track, scene, seen):
-    hwp, positions = track(2)
+    _, positions = track(2)
     stokes = scene(22, size=31)
     camera = np.linspace(0, 50, 8) * u.deg
     right, left = seen(sky, positions, charis.wavelength, stokes)
@@ -96,7 +96,7 @@ def test_any_turn_of_the_field(sky, charis, track, scene, seen):
     found = correct(
         sky,
         ScienceFrames.from_arrays(
-            right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera, order=5
+            right, left, charis.wavelength, positions, position_angle=camera, order=5
         ),
     )
     rows, columns = np.indices((31, 31)) - 15
@@ -294,7 +294,8 @@ def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, c
     assert alone.observable == "intensity"
     assert np.abs(alone.q - truth).max() > 1e-3
     n = 15
-    with pytest.warns(AstropolcalWarning, match=r"1 of 15 frames have no partner.*frame 14"):
+    words = r"1 of 15 frames have no partner .* derotator within 2 deg and are left out.*frame 14"
+    with pytest.warns(AstropolcalWarning, match=words):
         assert correct(calibration, frames(hwp=star.hwp[:15])).observable == "double"
     singles = dataclasses.replace(
         calibration, settings=calibration.settings | {"observable": "normalized_single_difference"}
@@ -304,6 +305,8 @@ def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, c
     # a chain that nobody fitted
     assert correct(sky, frames(hwp=star.hwp)).observable == "double"
     assert correct(sky, frames()).observable == "intensity"
+    with pytest.warns(AstropolcalWarning, match="have none .* their intensities are fitted"):
+        assert correct(sky, frames(hwp=np.zeros(16) * u.deg)).observable == "intensity"
 
 
 def test_frames_must_say_when_and_how_they_were_taken(calibration, star, charis):
@@ -435,6 +438,8 @@ def test_bad_choices(star, sky, charis, calibration):
         ScienceFrames.from_arrays(
             star.right, star.left, charis.wavelength, star.positions, variance_right=star.left
         )
+    with pytest.raises(ObservationError, match="one shape .* without a zero is needed"):
+        ScienceFrames.from_arrays(star.right[:0], star.left[:0], charis.wavelength, {})
     frames = ScienceFrames.from_arrays(
         star.right[:, :2], star.left[:, :2], [1.3, 1.4] * u.um, star.positions
     )

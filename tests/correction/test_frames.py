@@ -46,14 +46,21 @@ def test_pairs_by_the_angles_of_the_plate():
     for hwp, pairs in [
         ([0, 45, 22.5, 67.5], [[0, 1], [2, 3]]),
         ([0, 22.5, 45, 67.5], [[0, 2], [1, 3]]),
-        ([0, 22.5, 0, 22.5], None),
-        # an angle that has no partner at all is a hole; a frame left over is none
-        ([0, 45, 22.5, 0], None),
+        ([0, 22.5, 0, 22.5], []),
+        # one angle without any partner leaves the other pairs
+        ([0, 45, 22.5, 0], [[0, 1]]),
+        ([10, 45, 22.5, 0], [[3, 1]]),
+        ([np.nan, 45, 22.5, 0], [[3, 1]]),
         ([0, 45, 0, 45.1], [[0, 1], [2, 3]]),
         ([0, 45, 0, 0], [[0, 1]]),
     ]:
-        found = arrays(hwp=hwp * u.deg).pairs
-        assert (None if found is None else found.tolist()) == pairs, (hwp, pairs)
+        assert arrays(hwp=hwp * u.deg).pairs.tolist() == pairs, (hwp, pairs)
+    for wrong in (3 * u.deg, HWP[:3], np.tile(HWP, 2)):
+        with pytest.raises(ObservationError, match=r"hwp has shape .* each of the 4 frames is"):
+            arrays(hwp=wrong)
+    # positions of another kind than a dict
+    for positions in (None, QTable({"hwp": HWP})):
+        assert arrays(positions=positions, hwp=HWP).pairs.tolist() == [[0, 1], [2, 3]]
 
 
 def test_frames_of_two_derotator_angles_are_no_pair():
