@@ -26,7 +26,7 @@ __all__ = ["ScienceFrames"]
 DEROTATOR_LIMIT = 2 * u.deg
 
 
-@dataclass
+@dataclass(eq=False)
 class ScienceFrames:
     """
     What is to be corrected.
@@ -421,7 +421,8 @@ def _pairs(hwp, positions, names):
     """Return the pairs of frames, of which there may be none."""
     if np.shape(hwp) != (len(names),):
         raise ObservationError(
-            f"hwp has shape {np.shape(hwp)}; one angle for each of the {len(names)} frames is needed"
+            f"hwp has shape {np.shape(hwp)}; one angle for each of the {len(names)} frames is "
+            "needed"
         )
     derotator = positions.get("derotator")
     if derotator is not None:

@@ -399,17 +399,21 @@ def _words(summary, systematic, arguments):
         lines.append(common.wrapped(f"  {line}", indent=4))
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
-    n = len(summary["wavelength_nm"])
-    good = n - len(summary["poorly_determined"])
+    n, poor = len(summary["wavelength_nm"]), summary["poorly_determined"]
+    good = sum(bool(np.isfinite(q)) and str(w) not in poor for w, q in enumerate(star["q"]))
     verdict, advice = "Usable", common.following("info", arguments.output)
-    if not good:
+    if not good and len(poor) < n:
+        verdict = f"NOT USABLE AS IT IS: no light within {star['radius']:g} pixels of the star"
+        advice = "another --centre X,Y or --radius PIXELS"
+    elif not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
         advice = "frames at more angles of the half-wave plate and of the field"
     elif lost:
         verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
     elif good < n:
-        verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
+        what = "poorly determined" if len(poor) == n - good else "without a value"
+        verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"
     written = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
     determined = f"{summary['components']} at {good} of {n} wavelengths"
     accuracy = f"{accuracy} (statistical + systematic)"

@@ -438,7 +438,7 @@ def test_bad_choices(star, sky, charis, calibration):
         ScienceFrames.from_arrays(
             star.right, star.left, charis.wavelength, star.positions, variance_right=star.left
         )
-    with pytest.raises(ObservationError, match="one shape .* without a zero is needed"):
+    with pytest.raises(ObservationError, match=r"one shape .* without a zero is needed"):
         ScienceFrames.from_arrays(star.right[:0], star.left[:0], charis.wavelength, {})
     frames = ScienceFrames.from_arrays(
         star.right[:, :2], star.left[:, :2], [1.3, 1.4] * u.um, star.positions
