@@ -4,6 +4,7 @@
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from numbers import Integral
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -13,7 +14,7 @@ from astropolcal.correction.frames import DEROTATOR_LIMIT, ScienceFrames
 from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
-from astropolcal.correction.systematic import linear_systematic, sampled_systematic
+from astropolcal.correction.systematic import check_choices, linear_systematic, sampled_systematic
 from astropolcal.exceptions import (
     AstropolcalError,
     AstropolcalWarning,
@@ -176,6 +177,7 @@ def correct(
     """
     by_variance = isinstance(weights, str)
     _check(frames, mode, weights)
+    check_choices(open_directions, n_samples, seed)
     if hasattr(calibration, "datasets"):
         chain = _chain_at(calibration, frames, chain, max_age=max_age, dates=not any_date)
     model = RowModel(
@@ -365,8 +367,8 @@ def corrected_planes(
     processes divide the frames, and the range by default is that of all wavelengths.
     """
     for name, value in (("chunk", chunk), ("workers", workers)):
-        if value is not None and not value >= 1:
-            raise ParameterError(f"{name} = {value}; it must be at least 1")
+        if value is not None and not (isinstance(value, Integral) and value >= 1):
+            raise ParameterError(f"{name} = {value!r}; allowed are whole numbers from 1")
     if by_variance and not source.has_variances:
         raise ParameterError("weights by variance need variances of the fluxes, and there are none")
     size, n, in_order = source.n_wavelengths, len(solution.components), map

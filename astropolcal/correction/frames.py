@@ -18,7 +18,7 @@ from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import FLUXES
 from astropolcal.pipeline.headers import describe
-from astropolcal.units import angle_to_rad, wavelengths_of
+from astropolcal.units import angle_to_rad, to_unit, wavelengths_of
 
 __all__ = ["ScienceFrames"]
 
@@ -102,6 +102,13 @@ class ScienceFrames:
                 raise ObservationError(
                     f"{name} has {np.shape(position)[-1]} positions; there are {count} frames"
                 )
+        if self.pairs is not None:
+            pairs = to_unit(self.pairs, None, "pairs")
+            if pairs.size and (pairs.shape[1:] != (2,) or (pairs % 1 != 0).any()):
+                raise ObservationError(
+                    f"pairs has shape {pairs.shape}; whole numbers, (n_pairs, 2), are needed"
+                )
+            self.pairs = pairs.astype(int).reshape(-1, 2)
         if self.groups is not None and np.shape(self.groups) != (count,):
             raise ObservationError(
                 f"groups has shape {np.shape(self.groups)}; one of each of the {count} frames is "

@@ -420,7 +420,18 @@ def test_bad_choices(star, sky, charis, calibration):
         ({"weights": "photon"}, "weights = 'photon'"),
         ({"weights": "variance"}, "need variances"),
         ({"chunk": 0}, "chunk = 0"),
+        ({"chunk": 1.5}, "chunk = 1.5; allowed are whole numbers from 1"),
         ({"workers": -1}, "workers = -1"),
+        ({"workers": "2"}, "workers = '2'; allowed are whole numbers from 1"),
+        ({"max_condition": "x"}, "max_condition = 'x' is not a number"),
+        ({"max_condition": [30]}, "must be one number above 1"),
+        # of a chain, too, which has no systematic errors
+        ({"open_directions": -1.0}, r"open_directions = -1\.0"),
+        ({"open_directions": "maybe"}, "open_directions = 'maybe'"),
+        ({"open_directions": None}, "open_directions = None"),
+        ({"n_samples": 1}, "n_samples = 1; allowed are whole numbers from 2"),
+        ({"n_samples": "x"}, "n_samples = 'x'; allowed are whole numbers from 2"),
+        ({"n_samples": 5, "seed": -1}, "seed = -1; allowed are whole numbers from 0 up"),
     ]:
         frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
         with pytest.raises(ParameterError, match=words):

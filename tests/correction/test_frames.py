@@ -116,6 +116,8 @@ def test_what_does_not_fit():
         ({"wavelength": [1.2] * u.um}, r"wavelength has shape \(1,\); the frames have 2 wave"),
         ({"positions": {"hwp": HWP[:3]}}, r"hwp has 3 positions; there are 4 frames"),
         ({"positions": {"hwp": np.zeros((5, 3)) * u.deg}}, r"hwp has 3 positions; there are 4"),
+        ({"pairs": [[0, 1, 2]]}, r"pairs has shape \(1, 3\); whole numbers, \(n_pairs, 2\)"),
+        ({"pairs": [[0, 1.5]]}, r"pairs has shape \(1, 2\); whole numbers"),
         ({"groups": [0, 0, 0]}, r"groups has shape \(3,\); one of each of the 4 frames"),
     ]:
         good = arrays()
