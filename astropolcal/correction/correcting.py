@@ -35,6 +35,8 @@ MODES = ("stokes", "ip")
 
 # share of V in Q or U, of most wavelengths, that is worth a word
 _LEAKS = 0.3
+# by how much, and how many times its scatter, a frame is brighter at one wavelength than at others
+_UNEVEN, _BEYOND = 0.05, 10.0
 # what a result keeps of the solution and of the frames
 _OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
 _OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
@@ -43,6 +45,11 @@ _WAYS = {
     "date": "ScienceFrames(..., date=) states it, any_date=True takes any",
     "mode": "ScienceFrames(..., mode={})",
 }
+_BIASED = (
+    "weights by variance: the variances follow the noisy fluxes themselves, so that low fluxes "
+    "count too much and I is too small (by 5 % at 20 photons per pixel, 0.5 % at 200); equal "
+    "weights are not biased"
+)
 _OPEN = (
     "the calibration does not determine how Q and U turn: their systematic errors are infinite. "
     "Ways out: a calibration with priors on what is open (calibrate --prior), or open_directions "
@@ -100,7 +107,8 @@ def correct(
         Without V it is taken as zero. With V it is solved for where the frames determine it.
     weights : array_like or "variance", optional
         Inverse variances of the fluxes, (n_frames,), (n_wavelengths, n_frames) or (2,
-        n_wavelengths, n_frames); or by the variances of each pixel.
+        n_wavelengths, n_frames); or by the variances of each pixel. Those that follow the noisy
+        flux itself make I of faint light too small.
     max_condition : float
         A combination of Stokes parameters is left out if its singular value is smaller than the
         largest by more than this.
@@ -156,8 +164,9 @@ def correct(
     -----
     AstropolcalWarning
         If the frames have no pairs, or some have none, where pairs are to be fitted; their
-        brightness cannot be measured; combinations of Stokes parameters are poorly determined at
-        some wavelengths; the calibration does not determine how they change; or it is old.
+        brightness cannot be measured, or differs at one wavelength from others; variances as
+        weights follow the measured fluxes; combinations of Stokes parameters are poorly determined
+        at some wavelengths; the calibration does not determine how they change; or it is old.
 
     Examples
     --------
@@ -196,6 +205,8 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
+    if by_variance and getattr(frames.source, "estimated", False):
+        unmeasured.append(_BIASED)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -319,12 +330,35 @@ def _with_brightness(frames, rows, brightness, how):
     if brightness == "given" or (brightness is None and frames.scale is not None):
         return frames, []
     try:
-        return frames.with_brightness(rows, **how), []
+        found = frames.with_brightness(rows, **how)
+        return found, _uneven(found)
     except ObservationError as error:
         known = "all the same" if frames.scale is None else "as given"
         return frames, [
             f"the frames' brightness cannot be measured and is taken as {known}: {error}"
         ]
+
+
+def _uneven(frames):
+    """Say which frame has light at one wavelength that it lacks at others, as a cosmic ray is."""
+    if len(frames.wavelength) < 3:
+        return []
+    ratio = frames.scale / np.median(frames.scale, axis=0)
+    apart = ratio / np.median(ratio, axis=1, keepdims=True) - 1
+    # without light it is one
+    size = np.where(frames.scale == 1, 0.0, np.abs(apart))
+    # the usual scatter at this wavelength, and of this frame
+    usual = np.maximum(np.median(size, axis=1, keepdims=True), np.median(size, axis=0))
+    size[size < np.maximum(_UNEVEN, _BEYOND * usual)] = 0.0
+    if not size.any():
+        return []
+    w, f = np.unravel_index(np.argmax(size), size.shape)
+    return [
+        f"brightness: {np.count_nonzero(size)} of {size.size} frames and wavelengths differ from "
+        f"the others, most {frames.names[f]} at {frames.wavelength[w]:.6g}, by "
+        f"{100 * apart[w, f]:+.2g} %, which changes q and u of all pixels there; mask cosmic rays "
+        "and bad pixels (NaN)"
+    ]
 
 
 def _rows(model, rows, frames, mode):

@@ -165,6 +165,8 @@ class CubeFiles(TurnedSource):
 
     def __init__(self, files, centres, size, *, position_angle=None, mirrored=False, **options):
         source = _WholeCubes([str(path) for path in files], **options)
+        #: Whether variances are those of the measured flux, and not told by the files.
+        self.estimated = source.has_variances and not source._has_errors
         height, width = source.image_shape
         most = _MOST_SIZE * max(height, width)
         if not 1 <= size <= most:

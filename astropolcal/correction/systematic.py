@@ -117,7 +117,7 @@ class Systematic:
 
 
 def check_choices(open_directions, n_samples, seed):
-    """Refuse what is no choice of how systematic errors are found."""
+    """Refuse a wrong choice of how systematic errors are found."""
     number = isinstance(open_directions, Real) and 0 <= open_directions < np.inf
     if not number and open_directions not in ("infinite", "ignore"):
         raise ParameterError(

@@ -4,6 +4,7 @@
 import argparse
 import copy
 import os
+import warnings
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
+    AstropolcalWarning,
     CalibrationFileError,
     ObservationError,
     ParameterError,
@@ -26,7 +28,8 @@ from astropolcal.words import counted
 HELP = "correct science cubes with a calibration and write Stokes parameters"
 DESCRIPTION = """\
 Solve for the Stokes parameters of the light that entered the telescope, by
-least squares over all frames, and write them with their errors."""
+least squares over all frames, and write them with their errors. The cubes must
+be without sky background: it is not subtracted."""
 EXAMPLES = """\
 examples:
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
@@ -84,6 +87,8 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 [whole archives]
 @ archive gap cycles target retry timeout
 """
+# share of the light in the aperture that the edge of the images may have on its area
+_MOST_SKY = 0.01
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -187,6 +192,7 @@ def work(arguments):
     )
     # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
+    _warn_of_sky(result["I"], star["I"], _radius(arguments))
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
     result.write(arguments.output, overwrite=True)
@@ -241,6 +247,29 @@ def _check_options(arguments):
 def _radius(arguments):
     """Return the radius of the aperture; the usual one, as far as it is in the images."""
     return min(10.0, arguments.size / 2) if arguments.radius is None else arguments.radius
+
+
+def _warn_of_sky(images, light, radius):
+    """Warn of light at the edge of the images that counts among that in the aperture."""
+    if min(images.shape[1:]) < 3 * radius:
+        # it is the star itself
+        return
+    edge = np.ones(images.shape[1:], dtype=bool)
+    edge[1:-1, 1:-1] = False
+    pixels = images[:, edge]
+    good = np.isfinite(pixels).any(axis=1) & (light > 0)
+    level, noise = (f(pixels[good], axis=1) for f in (np.nanmedian, np.nanstd))
+    noise = 5 * noise / np.sqrt(np.isfinite(pixels[good]).sum(axis=1))
+    share = np.where(np.abs(level) > noise, level * np.pi * radius**2 / light[good], 0.0)
+    worst = max(share, key=abs, default=0.0)
+    if abs(worst) > _MOST_SKY:
+        warnings.warn(
+            f"the edge of the images has {100 * worst:.2g} % of the light within {radius:g} pixels "
+            "of the star, on the same area: a sky background changes I, and so q and u, and must "
+            "be subtracted from the cubes before",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
 
 
 # ---- the calibration ------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from astropolcal import Observations, calibrate, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.correcting import _uneven
 from astropolcal.correction.geometry import derotate
 from astropolcal.correction.rows import sky_chain
 from astropolcal.exceptions import (
@@ -274,6 +275,24 @@ def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen):
         clear = frames.with_brightness(measurement_rows(sky, positions, charis.wavelength))
         np.testing.assert_allclose(clear.scale, clouds.T, rtol=1e-10)
         np.testing.assert_allclose(correct(sky, clear).q, stokes[1] / stokes[0], atol=1e-10)
+
+
+def test_light_in_one_frame_at_one_wavelength_is_named(sky, charis, track, scene, seen):
+    """A cosmic ray that nobody masked; neither noise nor coloured clouds are one."""
+    _, positions = track()
+    beams = seen(sky, positions, charis.wavelength, scene(22, size=9))
+    rng = np.random.default_rng(1)
+    clouds = np.linspace(0.6, 1.4, 16)[:, None] ** np.linspace(0.8, 1.2, 22)
+    beams *= (clouds * rng.normal(1, 0.002, clouds.shape))[:, :, None, None]
+    correct(sky, ScienceFrames.from_arrays(*beams, charis.wavelength, positions))
+    beams[1, 5, 7, 2, 3] += 0.2 * beams[:, 5, 7].sum()
+    frames = ScienceFrames.from_arrays(*beams, charis.wavelength, positions)
+    words = rf"1 of 352 frames .*, most frame 5 at {frames.wavelength[7]:.6g}, by \+23 %"
+    with pytest.warns(AstropolcalWarning, match=words):
+        correct(sky, frames)
+    # two wavelengths do not tell which of them it is
+    two = ScienceFrames.from_arrays(*beams[:, :, 6:8], charis.wavelength[6:8], positions)
+    assert _uneven(dataclasses.replace(two, scale=np.eye(2, 16) + 1)) == []
 
 
 def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, charis, seen):

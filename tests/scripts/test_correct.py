@@ -489,6 +489,23 @@ def test_report_has_units():
         assert f"IQU at {np.isfinite(q).sum()} of 2 wavelengths" in " ".join(lines)
 
 
+def test_light_at_the_edge_is_told():
+    images = np.zeros((2, 21, 21))
+    images[:, 10, 10] = 1e4
+    light = images[:, 10, 10] + [0, 100]
+    noise = np.random.default_rng(1).normal(0, 3, images.shape)
+    # noise and what no wavelength has are no sky
+    _correct._warn_of_sky(images + noise, light, 5)
+    _correct._warn_of_sky(np.full_like(images, np.nan), light * np.nan, 5)
+    images[1] += 2
+    # so near to the star the edge has light of its own
+    _correct._warn_of_sky(images, light, 8)
+    with pytest.warns(
+        AstropolcalWarning, match=r"has 1\.6 % of the light within 5 pixels .* subtr"
+    ):
+        _correct._warn_of_sky(images, light, 5)
+
+
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"
 
 
