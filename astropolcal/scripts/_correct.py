@@ -250,19 +250,22 @@ def _radius(arguments):
 
 
 def _warn_of_sky(images, light, radius):
-    """Warn of light at the edge of the images that counts among that in the aperture."""
-    if min(images.shape[1:]) < 3 * radius:
+    """Warn of light at the edge of the images, more than a halo has, that the aperture has too."""
+    size = min(images.shape[1:])
+    if size < 3 * radius:
         # it is the star itself
         return
-    edge = np.ones(images.shape[1:], dtype=bool)
-    edge[1:-1, 1:-1] = False
-    pixels = images[:, edge]
-    good = np.isfinite(pixels).any(axis=1) & (light > 0)
-    level, noise = (f(pixels[good], axis=1) for f in (np.nanmedian, np.nanstd))
-    noise = 5 * noise / np.sqrt(np.isfinite(pixels[good]).sum(axis=1))
-    share = np.where(np.abs(level) > noise, level * np.pi * radius**2 / light[good], 0.0)
-    worst = max(share, key=abs, default=0.0)
-    if abs(worst) > _MOST_SKY:
+    places = np.indices(images.shape[1:])
+    depth = np.minimum(places, np.subtract(images.shape[1:], 1)[:, None, None] - places).min(axis=0)
+    edge, inner = (images[:, depth == place] for place in (0, size // 6))
+    good = np.isfinite(edge).any(axis=1) & np.isfinite(inner).any(axis=1) & (light > 0)
+    level, inside = (np.nanmedian(ring[good], axis=1) for ring in (edge, inner))
+    noise = 5 * np.nanstd(edge[good], axis=1) / np.sqrt(np.isfinite(edge[good]).sum(axis=1))
+    # a halo falls by 1 / r or faster, to 2 / 3 from the inner ring to the edge
+    sky = 3 * level - 2 * inside
+    share = np.where(level > noise, sky * np.pi * radius**2 / light[good], 0.0)
+    worst = max(share, default=0.0)
+    if worst > _MOST_SKY:
         warnings.warn(
             f"the edge of the images has {100 * worst:.2g} % of the light within {radius:g} pixels "
             "of the star, on the same area: a sky background changes I, and so q and u, and must "
