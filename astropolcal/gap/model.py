@@ -594,11 +594,13 @@ def _fitting(chains, before, after, whole, order, misfit):
 
 
 def _set_apart(chains):
-    """Return chains in which what an earlier diagnosis found leaves its names to this one."""
+    """Return chains in which what an earlier diagnosis found is held, and leaves its names."""
     found = [[leaf.copy() for leaf in leaves(chain)] for chain in chains]
     known = [leaf for one in found for leaf in one if (leaf.name or "").startswith("gap_")]
     for leaf in known:
         leaf.name = f"gap_earlier_{leaf.name.removeprefix('gap_')}"
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = True
     return [join(optics) for optics in found] if known else chains
 
 

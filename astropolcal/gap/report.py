@@ -28,7 +28,7 @@ from astropolcal.gap.planning import plan
 from astropolcal.gap.problem import TOUCHES
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.measurement import Measurement
+from astropolcal.measurement import Measurement, Normal
 from astropolcal.observations.observables import default_observable
 from astropolcal.optics import Perturbation
 
@@ -276,21 +276,24 @@ class Fitted:
         """
         found = {}
         for parameter in self.model.added.get(name) or ():
-            slot = self.problem.free.by_name[parameter.name]
-            where = self.problem.slices[parameter.name]
             unit, factor = self.unit_of(parameter.name)
-            block = parameter.basis if slot.per_wavelength else None
-            block = np.eye(where.stop - where.start) if block is None else block
-            value = self.problem.vector(self.model.fit.coefficients)[slot.slice] / factor
-            std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
-            # one open coefficient leaves every value of a law open
-            std = np.where(self.is_open[where].any(), np.nan, std / factor)
-            size = {"value": _number(value), "std": _number(std), "unit": unit}
+            value, std, block = self.values(parameter)
+            size = {"value": _number(value / factor), "std": _number(std / factor), "unit": unit}
             size |= {"limit": float(parameter.canonical_limit / factor)}
             # the errors hold if the law has no more freedom than that
             degree = block.shape[1] - 1 if block.shape[1] < len(block) else None
             found[parameter.name] = size | {"degree": degree}
         return found
+
+    def values(self, parameter):
+        """Return values and errors of an added parameter, canonical, and the basis of its law."""
+        slot, where = self.problem.free.by_name[parameter.name], self.problem.slices[parameter.name]
+        block = parameter.basis if slot.per_wavelength else None
+        block = np.eye(where.stop - where.start) if block is None else block
+        value = self.problem.vector(self.model.fit.coefficients)[slot.slice]
+        std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
+        # one open coefficient leaves every value of a law open
+        return value, np.where(self.is_open[where].any(), np.nan, std), block
 
     def unit_of(self, name):
         """Return the unit of a parameter in words, and how much of it is canonical."""
@@ -414,7 +417,7 @@ def _number(values):
 
 def accuracies(model, cross_validate=True):
     """
-    Return what `calibrate` says of a model, with the sizes of its causes held, ready for JSON.
+    Return what `calibrate` says of a model, with the sizes of its causes as found, ready for JSON.
 
     ``rms_percent`` is the root mean square of the double differences over all data: of left-out
     frames that others foresee, or of the fit where there is no cross-validation. Where such a
@@ -432,14 +435,17 @@ def accuracies(model, cross_validate=True):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AstropolcalWarning)
             made = model.calibration
+            how = {"cross_validate": cross_validate, "instrument": instrument}
             calibration = (
-                with_causes(model, cross_validate=cross_validate, instrument=instrument)
+                with_causes(model, held=True, **how)
                 if made is None
                 else made.calibration(cross_validate=cross_validate)
             )
-            targets = target_accuracies(calibration)
+            # what is not known of the causes is not known on sky
+            seen = with_causes(model, **how) if model.added else calibration
+            targets = target_accuracies(seen)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
-                targets = target_accuracies(calibration, open_directions="ignore")
+                targets = target_accuracies(seen, open_directions="ignore")
     except AstropolcalError:
         return found
     tables = [record.accuracy for record in calibration.datasets]
@@ -467,20 +473,34 @@ def accuracies(model, cross_validate=True):
     }
 
 
-def with_causes(model, **options):
+def with_causes(model, *, held=False, **options):
     """
-    Calibrate the chains of a model, the sizes of its causes held.
+    Calibrate the chains of a model, with what was found of its causes as priors of their sizes.
 
-    Their sizes are what was found: fitting them again, to double differences, could move them, and
-    so could another mirror branch.
+    Double differences, which are fitted, may not show them, and what is not known of them is not
+    known of the other parameters either. Another mirror branch could move them. Their sizes may
+    also be ``held``, for what the model leaves of the data.
     """
-    held = {p.name for parameters in model.added.values() for p in parameters}
+    found, chains = Fitted(model), [chain.copy() for chain in model.chains]
+    added = {p.name: p for parameters in model.added.values() for p in parameters}
     ties = model.problem.ties
-    held |= {name for name, tie in ties.items() if tie.source in held}
+    options |= {"search": False} if added else {}
     if held:
-        options |= {"fix": dict.fromkeys(sorted(held)), "search": False}
-    free = {name: tie for name, tie in ties.items() if name not in held}
-    return calibrate(model.chains, model.observations, ties=free, **options)
+        # and what follows them
+        fix = {*added, *(name for name, tie in ties.items() if tie.source in added)}
+        ties = {name: tie for name, tie in ties.items() if name not in fix}
+        return calibrate(chains, model.observations, ties=ties, fix=sorted(fix), **options)
+    for name, parameter in added.items():
+        slot = model.problem.free.by_name[name]
+        optic, key = name.split(".")
+        value, std, _ = (one / slot.factor for one in found.values(parameter))
+        # errors of all wavelengths may be one and the same, which priors of each do not know
+        std = np.where(std > 0, std * np.sqrt(std.size), parameter.canonical_limit / slot.factor)
+        for leaf in (leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic):
+            size, own = np.shape(getattr(leaf, key).value), getattr(leaf, key)
+            mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
+            own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
+    return calibrate(chains, model.observations, ties=ties, **options)
 
 
 def _median(values):

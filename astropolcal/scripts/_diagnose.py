@@ -96,7 +96,7 @@ def run(arguments):
     fitted = diagnosis.nominal.calibration
     # a fit that lacks something shows a change of the parameters that need be none
     is_known = None not in (earlier, fitted) and content["verdict"] == "none"
-    since = _since(earlier, fitted) if is_known else []
+    since = _since(earlier, fitted.calibration()) if is_known else []
     ends = [*since, f"{'Next':<12}{told[0]}"]
     ends = [line for end in ends for line in common.wrapped(end, indent=12).split("\n")]
     ends += common.written_lines([arguments.json, arguments.report, saved])

@@ -104,11 +104,12 @@ def check_improved(saved, content):
     assert improved.instrument == "charis"
     for chain in improved.chains:
         gain = chain["gap_beam_gain"].imbalance
-        assert gain.fixed
+        # what is known of it is what the diagnosis says
+        assert gain.prior is not None
         np.testing.assert_allclose(gain.value, SIZE, rtol=0.05)
         assert list(leaves(chain))[-1].name in ("gap_beam_gain", "wollaston")
     (entry,) = content["causes"][0]["size"].values()
-    np.testing.assert_allclose(gain.value, entry["value"], rtol=1e-6)
+    assert np.all(np.abs(np.subtract(gain.value, entry["value"])) < entry["std"])
 
 
 @pytest.mark.slow
