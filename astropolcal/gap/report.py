@@ -318,6 +318,7 @@ class Fitted:
         lost = problem.residual(without) - problem.residual(full)
         slopes = self.model.jacobian[:, others]
         without[others] += np.linalg.lstsq(slopes, lost, rcond=_TINY)[0]
+        without = np.clip(without, problem.low, problem.high)
         pairs = zip(problem.differences(without), problem.differences(full), strict=True)
         single = self._in_pairs([one[0] - other[0] for one, other in pairs])
         double = np.subtract(*(self.doubles.residuals(problem.vector(q)) for q in (without, full)))

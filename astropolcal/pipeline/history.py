@@ -682,7 +682,11 @@ def restart(calibration, observations, free, *, chain=None, **options):
     ties = ties_among(old.ties, table := parameter_table(chains))
     start["ties"] = {n: tie for n, tie in ties.items() if not table[tie.source][0].fixed}
     new = calibrate(chains, datasets, **(start | options))
+    # what is held has no error, though it was not known
+    known, fitted = old.parameter_values(), {n.partition("[")[0] for n in new.covariance.names}
+    open_ = [n for n in known if n in table and n not in fitted and "open" in known[n]["status"]]
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
+    new.settings["restarted"] |= {"open": open_} if open_ else {}
     return new
 
 

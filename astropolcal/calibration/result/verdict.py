@@ -112,6 +112,9 @@ def verdict(calibration, targets=TARGETS):
         _misfit(calibration),
     ]
     unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), _hanging(free)]
+    held = calibration.settings.get("restarted", {}).get("open")
+    unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
+    unknown += [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
     stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
     reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
     # what is not known runs to its bounds, too
@@ -137,11 +140,14 @@ def verdict(calibration, targets=TARGETS):
     advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
-        "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
+        _UNKNOWN_ON_SKY if wrong or held else _accuracy(tables, sky),
         *_determined(calibration, free),
         f"Next        {advice}",
     ]
     return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words], advice)
+
+
+_UNKNOWN_ON_SKY = "On sky      unknown, as something is wrong"
 
 
 def _first(reasons, cautions):
