@@ -277,7 +277,7 @@ def _of_one_beam(probes):
     problem, found = probes.problem, {}
     for i, slope in probes.slopes.get(("detector", "gain"), {}).items():
         channel = problem.channels[i]
-        for sign, beam in ((1, "right"), (-1, "left")) if channel.groups is None else ():
+        for sign, beam in ((1, "right"), (-1, "left")):
             both = np.stack([slope[0], slope[1] + sign * channel.valid]) / 2
             found.setdefault(("detector", f"gain_of_{beam}_beam"), {})[i] = both
     return found

@@ -183,8 +183,8 @@ class Diagnosis:
 
     @property
     def noise_floor_percent(self):
-        """Noise of a normalized single difference, or a single beam, rms, in percent."""
-        parts = [c.sigma[c.told][c.valid] for c in self.nominal.problem.channels]
+        """Noise of a single difference, or of an intensity over the mean of its group, rms."""
+        parts = [c.noise[c.valid] for c in self.nominal.problem.channels]
         return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     @property

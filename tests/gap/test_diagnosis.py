@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Verdicts: on planted effects and cells, on none, on wrong frames and on bad input."""
 
+import json
 import warnings
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
+from astropy.table import QTable
 from gap_setups import SETUPS
 from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
@@ -325,6 +327,39 @@ def test_an_alternative_beside_which_much_is_left_is_not_sure():
     assert found.verdict == "unexplained"
     assert found.causes[0].effect.kind == "discrete"
     assert found.causes[0].probability < 0.9
+
+
+def _one_beam(drift, retardance):
+    """Return a chain of one beam with extinction, and data that lack a retarder or a calm lamp."""
+    wavelength = [1.0, 1.3, 1.7] * u.um
+    plate = optics.LinearRetarder(retardance=[120, 128, 135] * u.deg, mount="plate", name="plate")
+    plate.retardance.bounds = (100, 150)
+    first = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    chain = first | plate | optics.LinearPolarizer(name="analyser")
+    window = optics.LinearRetarder(retardance=retardance, theta=45 * u.deg, name="window")
+    frames = QTable({"calibrator": np.repeat([0, 45, 80, 130], 16) * u.deg})
+    frames["plate"] = np.tile(3 + np.arange(16) * 22.5, 4) * u.deg
+    frames["group"] = np.repeat(np.arange(4), 16)
+    lamp = 1 + drift * np.linspace(-1, 1, len(frames))
+    truth = insert_optic(chain, window, before="analyser")
+    return chain, simulate(truth, wavelength, frames, flux=1e7, seed=1, lamp=lamp, name="lamp")
+
+
+def test_one_beam_has_intensities_and_no_gain_between_beams():
+    for drift, retardance in ((0.02, 0 * u.deg), (0, 2 * u.deg)):
+        chain, seen = _one_beam(drift, retardance)
+        found = diagnose(chain, seen)
+        content = to_dict(found)
+        (cause,) = content["causes"]
+        assert cause["probability"] > 0.9
+        said = json.dumps([content[key] for key in ("sentences", "causes", "where", "scores")])
+        assert "beam" not in said
+        assert ("brightness of the source, or gain" in said) == bool(drift)
+        assert "percent of the mean of their group" in said
+        # shot noise: of that the frames that are nearly dark have the least
+        noise = found.noise_floor_percent
+        assert noise == pytest.approx(100 / np.sqrt(seen.flux_right.mean()), rel=0.1)
+        assert found.gap_after_percent < 1.1 * noise < 0.3 * found.gap_before_percent
 
 
 def test_a_wavelength_that_has_the_gap_alone_comes_first():

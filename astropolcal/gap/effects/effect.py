@@ -690,7 +690,8 @@ class CellEffect(Effect):
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
-        super().__init__(cell.name, cell.title, place, cell.kind, dependence, degree, **settings)
+        kind = "gain" if cell.kind == "brightness" else cell.kind
+        super().__init__(cell.name, cell.title, place, kind, dependence, degree, **settings)
         self._cell = cell
 
     def cells(self, chains):
