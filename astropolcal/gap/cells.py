@@ -275,7 +275,7 @@ def dependences(problem):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"state:{stage}" for stage in given if "=" in stage]
-    names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
+    names += [f"{what}:{s}" for s in stages for what in _MOVED]
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
     n = min(d.observations.n_frames for d in problem.datasets)

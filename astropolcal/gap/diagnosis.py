@@ -27,7 +27,7 @@ from astropolcal.gap.frames import (
     unknown_angles,
     without_frames,
 )
-from astropolcal.gap.model import Model, nominal_model, starting_model
+from astropolcal.gap.model import Model, chains_of, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
@@ -283,8 +283,8 @@ def diagnose(
     ------
     GapError
         If the nominal fit does not converge, there are too few groups of frames
-        to leave out, an effect is unknown, the same data are given twice, or changes
-        are asked for where no two datasets have the same source.
+        to leave out, an effect is unknown, or is given and has no place in the chains, the same
+        data are given twice, or changes are asked for where no two datasets have the same source.
     ObservationError
         If the observations are not tables of fluxes.
 
@@ -313,6 +313,8 @@ def diagnose(
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
+    for effect in library if effects != "all" else ():
+        effect.check_for(chains_of(calibration, observations), observations)
     if cross_validate:
         # too few frames are refused before anything is fitted
         frame_groups(observations)

@@ -486,10 +486,7 @@ def starting_model(calibration, observations, library, say):
     alternative is followed by its aliases. The fourth says up to or from which frame the model does
     not fit, though it fits all others, where that is so.
     """
-    chains = calibration.chains if isinstance(calibration, Calibration) else calibration
-    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
-    if len(chains) != len(observations):
-        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    chains = chains_of(calibration, observations)
     chains = [_at_data(chain, observations) for chain in _set_apart(chains)]
     # of a calibration too: in other data a wavelength may be in another branch
     made, where = nominal_calibration(chains, observations), ""
@@ -506,6 +503,15 @@ def starting_model(calibration, observations, library, say):
                 return *_with_alternative(*read, given, best, found), where
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, [], where
+
+
+def chains_of(calibration, observations):
+    """Return the chain of each dataset, of a calibration, one for all, or given."""
+    chains = calibration.chains if isinstance(calibration, Calibration) else calibration
+    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    if len(chains) != len(observations):
+        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    return chains
 
 
 def _at_data(chain, observations):

@@ -17,7 +17,7 @@ from star_data import WAVELENGTH, observe_star, star_chain
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap import EFFECTS, diagnose, model, problem
+from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
 from astropolcal.gap.report import to_dict, with_causes
@@ -464,6 +464,17 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         "no effect 'beam_gian'.*'beam_gain'": (chain, observed, {"effects": ["beam_gian"]}),
         "too few frames to leave out in groups: 1 in the shortest": (chain, one, {}),
     }
+    # of one's own, or of the library, which no chain has a place for
+    for message, place, dependence in (
+        ("e: optic of its place = 'hpw'; allowed are .*did you mean 'hwp'", "in:hpw", "time"),
+        ("e: place = 'telescope'; allowed are source, in:hwp", "telescope", "time"),
+        ("e: stage of its dependence move:x = 'x'; allowed are hwp", "in:hwp", "move:x"),
+        ("e: dependence = 'step:32'; frames are 0 to 31", "in:hwp", "step:32"),
+        ("e: dataset of its dependence = 'x'; allowed are lamp", "in:hwp", "time/dataset:x"),
+    ):
+        one = Effect("e", "e", place, "rotation", dependence)
+        cases[f"effect {message}"] = (chain, observed, {"effects": [one]})
+    cases["effect altitude_sign: "] = (chain, observed, {"effects": ["altitude_sign"]})
     for message, (chains, observations, options) in cases.items():
         with pytest.raises(GapError, match=message) as refused:
             diagnose(chains, observations, **options)
