@@ -320,6 +320,7 @@ def diagnose(
         frame_groups(observations)
     how = {"cells": cells, "changes": changes, "cross_validate": cross_validate, "nested": nested}
     found = _diagnosed(calibration, observations, library, say, how)
+    found.settings["names"] = [o.name for o in observations]
     found.seconds = time.perf_counter() - started
     return found
 
