@@ -23,6 +23,7 @@ from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.instruments import SkyLaw
 from astropolcal.observations.pointings import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
+from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import beams_of_frames, stage_positions
 from astropolcal.units import (
@@ -30,6 +31,7 @@ from astropolcal.units import (
     canonical_factor,
     check_seed,
     length_to_um,
+    to_unit,
     wavelengths_of,
 )
 from astropolcal.words import check_choice, counted
@@ -165,9 +167,14 @@ def polarimetric_efficiency(
             "the chain has no cycle of a half-wave plate with two beams (stage hwp); "
             "astropolcal.efficiency.demodulation gives the efficiencies of its frames"
         )
+    _check_shapes(derotator=derotator, altitude=altitude, parallactic=parallactic)
     if law is None:
         # it only counts on sky
         law = _law_of(instrument).plate_law(mode) if _SKY & set(stages(path)) else (0.0, 0.0)
+    elif to_unit(law, None, "law").shape != (2,):
+        raise ParameterError(
+            f"law = {law}; two factors, of parallactic angle and altitude, are needed"
+        )
     positions = _positions(path, derotator, altitude, parallactic, law)
     lam = np.atleast_1d(wavelengths_of(wavelength))
     shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
@@ -177,6 +184,15 @@ def polarimetric_efficiency(
         )
     flat = {stage: np.broadcast_to(a, shape).ravel() * u.rad for stage, a in positions.items()}
     return _measured(_cycle(path, lam, flat), aolp).reshape(*shape, lam.size)
+
+
+def _check_shapes(**angles):
+    shapes = {name: np.shape(angle) for name, angle in angles.items() if angle is not None}
+    try:
+        np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        words = ", ".join(f"{name} has shape {shape}" for name, shape in shapes.items())
+        raise ParameterError(f"{words}; they must broadcast against each other") from None
 
 
 def _cycle(path, lam, positions):
@@ -232,7 +248,9 @@ def _positions(path, derotator, altitude, parallactic, law):
 def _measured(rows, aolp):
     """Return the degree of polarization of a cycle, from rows I and Q at its four angles."""
     if aolp is not None:
-        angle = 2 * float(angle_to_rad(aolp, "aolp"))
+        if np.ndim(aolp):
+            raise ParameterError(f"aolp has shape {np.shape(aolp)}; one angle is needed")
+        angle = 2 * finite_position(aolp, "aolp")
         total, difference = np.moveaxis(
             rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
         )
@@ -321,7 +339,7 @@ def best_derotator(
     Raises
     ------
     ParameterError
-        If a choice is unknown.
+        If a choice is unknown, or offsets or times are none, or in more than one row.
     ChainError
         If the chain, or the instrument, has no derotator.
     ObservationError
@@ -345,8 +363,13 @@ def best_derotator(
     if law not in sky_law.derotator or by not in ("least", "mean"):
         allowed = ", ".join(sky_law.derotator)
         raise ParameterError(f"law = {law!r}, by = {by!r}; allowed are {allowed}, and least, mean")
-    offsets = np.arange(180) * u.deg if offsets is None else np.atleast_1d(u.Quantity(offsets))
+    offsets = np.atleast_1d(np.arange(180) * u.deg if offsets is None else offsets)
+    finite_position(offsets, "offsets")
+    _check_shapes(altitude=altitude, parallactic=parallactic)
     a, p = (np.atleast_1d(angle) * u.rad for angle in horizontal(altitude, parallactic))
+    for name, angle in (("offsets", offsets), ("altitude", a), ("parallactic", p)):
+        if angle.ndim != 1 or not angle.size:
+            raise ParameterError(f"{name} has shape {angle.shape}; some in one row are needed")
     f, g = sky_law.derotator_law(law)
     efficiency = polarimetric_efficiency(
         chain,

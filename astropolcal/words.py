@@ -9,6 +9,7 @@ import difflib
 import re
 from collections.abc import Hashable
 from html import escape
+from numbers import Integral
 
 __all__ = []
 
@@ -46,6 +47,11 @@ def check_choice(what, value, allowed, error):
         known = [str(one) for one in allowed]
         message = f"{what} = {value!r}; allowed are {', '.join(known) or 'none'}"
         raise error(message + did_you_mean(value, known))
+
+
+def is_whole(value):
+    """Return whether a value is a whole number, Python's or numpy's."""
+    return isinstance(value, Integral)
 
 
 def check_type(what, value, kinds, wanted, error):

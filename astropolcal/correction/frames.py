@@ -18,12 +18,15 @@ from astropolcal.observations.observables import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import FLUXES
 from astropolcal.pipeline.headers import describe
-from astropolcal.units import angle_to_rad, wavelengths_of
+from astropolcal.units import angle_to_rad, to_unit, wavelengths_of
 
 __all__ = ["ScienceFrames"]
 
+#: Frames of a pair are closer; on sky it follows the field, so it turns more than inside.
+DEROTATOR_LIMIT = 2 * u.deg
 
-@dataclass
+
+@dataclass(eq=False)
 class ScienceFrames:
     """
     What is to be corrected.
@@ -39,7 +42,7 @@ class ScienceFrames:
         Gauss-Legendre nodes of the exposures; without a unit in radian. Of a device with states
         the state in each frame, under the name of its column.
     pairs : `~numpy.ndarray` or None
-        Frames of the pairs of double differences.
+        Frames of the pairs of double differences, (n_pairs, 2); None if none were looked for.
     scale : `~numpy.ndarray` or None
         Relative brightness of the frames.
     groups : `~numpy.ndarray` or None
@@ -99,6 +102,13 @@ class ScienceFrames:
                 raise ObservationError(
                     f"{name} has {np.shape(position)[-1]} positions; there are {count} frames"
                 )
+        if self.pairs is not None:
+            pairs = to_unit(self.pairs, None, "pairs")
+            if pairs.size and (pairs.shape[1:] != (2,) or (pairs % 1 != 0).any()):
+                raise ObservationError(
+                    f"pairs has shape {pairs.shape}; whole numbers, (n_pairs, 2), are needed"
+                )
+            self.pairs = pairs.astype(int).reshape(-1, 2)
         if self.groups is not None and np.shape(self.groups) != (count,):
             raise ObservationError(
                 f"groups has shape {np.shape(self.groups)}; one of each of the {count} frames is "
@@ -235,7 +245,8 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
-        for name, value in (positions or {}).items():
+        positions = {} if positions is None else dict(positions)
+        for name, value in positions.items():
             if name not in COORDINATES and np.asarray(value).dtype.kind in "iuf":
                 angle_to_rad(value, name)
         if left is None:
@@ -414,22 +425,22 @@ def _circle(shape):
 
 
 def _pairs(hwp, positions, names):
-    """Return the pairs of frames, or None where there are none; only some corrections need them."""
+    """Return the pairs of frames, of which there may be none."""
+    if np.shape(hwp) != (len(names),):
+        raise ObservationError(
+            f"hwp has shape {np.shape(hwp)}; one angle for each of the {len(names)} frames is "
+            "needed"
+        )
     derotator = positions.get("derotator")
     if derotator is not None:
         derotator = np.atleast_2d(u.Quantity(derotator, getattr(derotator, "unit", u.rad)))
         # the middle of an exposure, of which there may be several nodes
         derotator = np.broadcast_to(derotator.mean(axis=0), hwp.shape, subok=True)
-    # on sky it follows the field, so more than at the internal source
-    options = {"derotator_tolerance": 2 * u.deg, "labels": names}
-    try:
-        with warnings.catch_warnings():
-            # that frames are left over matters only where pairs are used
-            warnings.simplefilter("ignore")
-            found = pair_frames(hwp, derotator, positions.get("flc_state"), **options)
-    except ObservationError:
-        return None
-    return found if len(found) else None
+    options = {"derotator_tolerance": DEROTATOR_LIMIT, "labels": names, "lonely": True}
+    with warnings.catch_warnings():
+        # that frames are left over matters only where pairs are used
+        warnings.simplefilter("ignore")
+        return pair_frames(hwp, derotator, positions.get("flc_state"), **options)
 
 
 def _centres(centres, layout):

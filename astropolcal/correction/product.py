@@ -75,6 +75,9 @@ def _header(corrected):
     for key, (keyword, comment) in _KEYWORDS.items():
         if corrected.provenance.get(key):
             value = _printable(corrected.provenance[key])
+            if keyword == "DATE":
+                # in FITS it is UTC, and has no zone
+                value = value.removesuffix("+00:00")
             # a card holds 80 characters
             header[keyword] = (value, comment) if len(value) + len(comment) < 60 else value
     if corrected.star is not None:

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Corrected Stokes parameters with what is known of their errors."""
 
+import warnings
 from dataclasses import dataclass, field, replace
 
 import astropy.units as u
@@ -12,7 +13,7 @@ from astropolcal.correction.geometry import azimuthal, azimuthal_variances
 from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.star import measured_star, stated_star, without_star
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ParameterError
 from astropolcal.stokes import debias_dolp, polarization_angle, polarization_errors
 from astropolcal.words import check_choice
 
@@ -21,7 +22,7 @@ __all__ = ["Corrected"]
 _KINDS = ("statistical", "systematic")
 
 
-@dataclass
+@dataclass(eq=False)
 class Corrected:
     """
     Stokes parameters of the light that entered, `correct` makes it.
@@ -231,12 +232,30 @@ class Corrected:
         Corrected
             Of shape (n_components, n_wavelengths). The statistical errors take the pixels as
             independent before they were resampled; of few pixels they are then too large.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If pixels inside have no value; they are left out of all Stokes parameters.
         """
         inside = self._circle(radius, centre, inner)
-        stokes, covariance = self.stokes[..., inside].sum(axis=-1), self.covariance
+        pixels, covariance = self.stokes[..., inside], self.covariance
+        # a component that is not determined has no value in any pixel
+        known = np.isfinite(pixels)
+        known = (known | ~known.any(axis=-1, keepdims=True)).all(axis=0)
+        if lost := (~known).sum(axis=1).max():
+            warnings.warn(
+                f"up to {lost} of {inside.sum()} pixels of the aperture have no value, at "
+                f"{(~known).any(axis=1).sum()} of {len(known)} wavelengths; they are left out of "
+                "all Stokes parameters, and I lacks their light",
+                AstropolcalWarning,
+                stacklevel=2,
+            )
+        stokes = np.where(known, pixels, 0.0).sum(axis=-1)
         if covariance is not None:
+            covariance = np.where(known, covariance[..., inside], 0.0).sum(axis=-1)
             # what the spline took from each pixel is what it has in common with its neighbours
-            covariance = covariance[..., inside].sum(axis=-1) / self.resampling
+            covariance /= self.resampling
         return replace(self, stokes=stokes, covariance=covariance, resampling=1.0)
 
     def _circle(self, radius, centre=None, inner=0.0):

@@ -152,8 +152,8 @@ def estimator(
     settings |= {"weights": weights, "max_condition": max_condition}
     rows = np.asarray(rows, dtype=float)
     check_choice("components", components, COMPONENTS, ParameterError)
-    if not max_condition > 1:
-        raise ParameterError(f"max_condition = {max_condition}; it must be above 1")
+    if np.ndim(max_condition) or not to_unit(max_condition, None, "max_condition") > 1:
+        raise ParameterError(f"max_condition = {max_condition}; it must be one number above 1")
     shape = rows.shape[1:3]
     channels = Channels(observable, shape[1], pairs)
     weights = 1.0 if weights is None else _positive("weights", weights, shape, beams=True)
@@ -236,7 +236,7 @@ def _undetermined(channels, labels, weak):
         shown = ", ".join(map(str, list(labels)[:_MAX_NAMED]))
         words += f" ({shown}{', ...' if count > _MAX_NAMED else ''})"
     if channels.observable == "double":
-        words += f" in {len(channels.units)} pairs"
+        words += f" in {len(channels.units)} pairs (observable='intensity' needs none)"
     return (
         f"Q and U are not determined at any wavelength by {words}: poorly determined is {weak}; "
         "frames at half-wave-plate angles such as 0, 22.5, 45 and 67.5 deg are needed"

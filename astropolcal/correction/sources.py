@@ -43,10 +43,10 @@ class ArraySource:
         self.has_variances = bool(given)
         self._variances = [_array(value, name, unit**2) for name, value in given.items()]
         shapes = {array.shape for array in [*self._beams, *self._variances]}
-        if len(shapes) > 1 or len(next(iter(shapes))) < 2:
+        if len(shapes) > 1 or len(next(iter(shapes))) < 2 or 0 in next(iter(shapes)):
             raise ObservationError(
                 f"the beams and their variances have shapes {sorted(shapes)}; one shape "
-                "(n_frames, n_wavelengths, ...) is needed"
+                "(n_frames, n_wavelengths, ...) without a zero is needed"
             )
         self.n_frames, self.n_wavelengths, *image = self._beams[0].shape
         self.image_shape = tuple(image)
@@ -165,6 +165,8 @@ class CubeFiles(TurnedSource):
 
     def __init__(self, files, centres, size, *, position_angle=None, mirrored=False, **options):
         source = _WholeCubes([str(path) for path in files], **options)
+        #: Whether variances are those of the measured flux, and not told by the files.
+        self.estimated = source.has_variances and not source._has_errors
         height, width = source.image_shape
         most = _MOST_SIZE * max(height, width)
         if not 1 <= size <= most:

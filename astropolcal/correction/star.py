@@ -20,7 +20,7 @@ from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.stokes import polarization_angle
-from astropolcal.units import angle_to_rad
+from astropolcal.units import angle_to_rad, to_unit
 
 __all__ = []
 
@@ -49,12 +49,7 @@ def measured_star(corrected, annulus):
                 f"{words}: {missing} of its {inside.sum()} pixels have no value at "
                 f"{corrected.wavelength[w]:.6g}; at least half are needed"
             )
-    covariance = corrected.covariance
-    if covariance is not None:
-        covariance = np.where(known, covariance, 0.0)
-    stokes = np.where(known, corrected.stokes, 0.0)
-    star = replace(corrected, stokes=stokes, covariance=covariance).aperture(outer, inner=inner)
-    star.stokes[:, ~known.any(axis=(1, 2))] = np.nan
+    star = corrected.aperture(outer, inner=inner)
     dark = star["I"] <= 0
     if dark.any():
         raise ObservationError(
@@ -74,11 +69,18 @@ def stated_star(corrected, dolp, aolp, errors):
     """Return light of a degree and an angle of polarization, with their errors, as a spectrum."""
     n, size = len(corrected.components), len(corrected.wavelength)
     errors = (0.0, 0 * u.deg) if errors is None else errors
-    degree, s_degree = (u.Quantity(x).to_value(u.one) for x in (dolp, errors[0]))
+    if not (isinstance(errors, tuple | list) and len(errors) == 2):
+        raise ParameterError(f"errors = {errors!r}; two are needed, of dolp and of aolp")
+    degree, s_degree = (to_unit(x, None, "dolp") for x in (dolp, errors[0]))
     angle, s_angle = (angle_to_rad(x, "aolp") for x in (aolp, errors[1]))
-    if not (np.all((degree >= 0) & (degree <= 1)) and np.all(np.isfinite(angle))):
+    if shapes := [np.shape(x) for x in (degree, angle, s_degree, s_angle) if np.shape(x)]:
         raise ParameterError(
-            f"polarization of the star: {100 * np.max(degree):g} % at {np.rad2deg(angle):g} deg; "
+            f"polarization of the star has shape {shapes[0]}; dolp, aolp and their errors must be "
+            "single numbers"
+        )
+    if not (0 <= degree <= 1 and np.isfinite(angle)):
+        raise ParameterError(
+            f"polarization of the star: {100 * degree:g} % at {np.rad2deg(angle):g} deg; "
             "allowed are 0 to 100 %, and a finite angle"
         )
     if not (0 <= s_degree < np.inf and 0 <= s_angle < np.inf):

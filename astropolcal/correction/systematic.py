@@ -10,6 +10,7 @@ of the instrument lacks (``model_error`` in the ``fit`` of a calibration) is a f
 
 import warnings
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 
 import astropy.units as u
 import numpy as np
@@ -115,6 +116,19 @@ class Systematic:
         return bool(self.open.any())
 
 
+def check_choices(open_directions, n_samples, seed):
+    """Refuse a wrong choice of how systematic errors are found."""
+    number = isinstance(open_directions, Real) and 0 <= open_directions < np.inf
+    if not number and open_directions not in ("infinite", "ignore"):
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
+            "from zero"
+        )
+    if n_samples and not (isinstance(n_samples, Integral) and n_samples >= 2):
+        raise ParameterError(f"n_samples = {n_samples!r}; allowed are whole numbers from 2, and 0")
+    check_seed(seed)
+
+
 def linear_systematic(model, solution, *, mode="stokes", open_directions="infinite"):
     """
     Return the systematic errors by the exact derivatives of the rows.
@@ -137,9 +151,7 @@ def sampled_systematic(
     not determine, whose errors are those of `linear_systematic`. There is a warning if a posterior
     is narrower than the scatter of the residuals allows.
     """
-    if n_samples < 2:
-        raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
-    rng = np.random.default_rng(check_seed(seed))
+    rng = np.random.default_rng(seed)
     n = len(solution.components)
     found = np.empty((n_samples, len(solution.gain), n, n))
     for i, vector in enumerate(_draws(model, n_samples, rng)):
@@ -163,12 +175,6 @@ def sampled_systematic(
 
 def _moved(model, solution, light, open_directions):
     """Return changes for one sigma along each known and open direction, and what is open."""
-    known = open_directions in ("infinite", "ignore")
-    if not known and (isinstance(open_directions, str) or not 0 <= open_directions < np.inf):
-        raise ParameterError(
-            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
-            "from zero"
-        )
     n = len(light)
     gain = np.nan_to_num(solution.gain)
     shape = (len(gain), n, n)
@@ -181,7 +187,7 @@ def _moved(model, solution, light, open_directions):
     along = np.zeros((0, *shape))
     if open_directions != "infinite":
         is_open = np.zeros_like(is_open)
-    if not known:
+    if not isinstance(open_directions, str):
         axes = covariance._axes()
         # rows in which the leading parameter moves by one step: degree, micrometre, percent
         steps = np.array([row for row, _ in led(model.free, axes.open)])

@@ -17,8 +17,10 @@ from scipy.special import expit
 from astropolcal import instruments
 from astropolcal.exceptions import GapError, InstrumentError
 from astropolcal.gap.attribution import ENOUGH, Candidate
+from astropolcal.gap.cells import count_runs
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.effect import CellEffect
+from astropolcal.gap.effects.library import OF_RUNS
 from astropolcal.gap.frames import (
     lamp_faults,
     not_off,
@@ -367,7 +369,8 @@ def _diagnosed(calibration, observations, library, say, how):
 
 def _continuous(library, base):
     """Return the effects that a model may lack, and which so many wavelengths can tell."""
-    found = (e for e in adapted(library, base.chains) if e.kind != "discrete")
+    runs = [o.name for o in base.observations] if count_runs(base.problem) > 1 else ()
+    found = (e for e in adapted(library, base.chains, runs) if e.kind != "discrete")
     return [e for e in found if e.is_told(len(base.problem.wavelength))]
 
 
@@ -466,7 +469,7 @@ def _nested(base, smooth, say, cells):
 
 def _library(effects):
     if isinstance(effects, str) and effects == "all":
-        return list(EFFECTS.values())
+        return [*EFFECTS.values(), *OF_RUNS]
     names = [effects] if isinstance(effects, str) else list(effects)
     if not names:
         raise GapError("no effects to ask for; give names, or 'all'")

@@ -80,8 +80,11 @@ def changes(diagnosis, causes):
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
             of = "" if _is_told(cell, cause, names) else " of this or what looks the same"
+            # what has a name of its own in each run
+            is_named = str(cause.get("effect")).endswith(f"/dataset:{run}")
+            named = cause["title"].removesuffix(f' in "{run}"') if is_named else ""
             if cell:
-                entry["words"] = _sentence(cell, entry, names, wavelength, of)
+                entry["words"] = _sentence(cell, entry, names, wavelength, of, named)
             else:
                 entry["words"] = f"What changed: {cause['title']} ({_chance(entry, of)})."
             found.append(entry)
@@ -162,11 +165,12 @@ def _chance(entry, of):
     return f"probability {100 * entry['probability']:.0f} %{of}"
 
 
-def _sentence(cell, entry, names, wavelength, of):
+def _sentence(cell, entry, names, wavelength, of, named):
     """Return one change in words."""
     plain = _in_any_run(cell)
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
+    title = named or title
     # the size of a gain is half the difference of the beams
     size = _size(entry["size"], wavelength, 2.0 if cell.kind == "gain" else 1.0)
     chance = _chance(entry, of)

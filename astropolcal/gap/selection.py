@@ -51,6 +51,8 @@ _WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 _PROMISING = 0.8
 # but this, where the freedom of the best costs more (log evidence): two simple ones may do better
 _HALF, _DEAR = 0.5, 30.0
+# as much freedom as two functions of the frame with a smooth law
+_FREE = 6
 # and this of a name with one number, where no derivative explains the gap down to noise
 _FAR_PROMISE = 0.3
 # the evidence ranks sets of at most so many causes, if these leave more than noise
@@ -541,9 +543,10 @@ def _far(state, found, fitted, instead):
 
 
 def _simple(state, found, fitted, instead):
-    """Return sets of one cause of little freedom, where one of much freedom explains all."""
-    # two of them may be what is there
-    if not (fitted and fitted[0].is_dear and fitted[0].model.p_value > REMAINDER):
+    """Return sets of one cause of little freedom, where one of more freedom explains all."""
+    # two of them may be what is there, or one whose derivative promises less than it does
+    free = fitted and (fitted[0].is_dear or fitted[0].chosen[0].rank >= _FREE)
+    if not (free and fitted[0].model.p_value > REMAINDER):
         return []
     best, most = found.best.evidence, _HALF * fitted[0].chosen[0].rank
     few = [one for one in found.candidates if one.rank <= most]
@@ -629,7 +632,7 @@ def _exchanged(task, best, first):
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
-    scans, like = {}, None
+    scans, like, start = {}, None, best
     task.say("each cause beside all the others")
     for one in progress.steps(best.chosen[::-1], "causes"):
         others = [other for other in best.chosen if other is not one]
@@ -661,7 +664,9 @@ def _exchanged(task, best, first):
                 scans[fresh.name], like = scans.pop(one.name), None
                 best = new
                 break
-    return best, scans
+    needed = best.chosen if best is start else _needed(best.model, best.chosen)
+    # an exchange may do what another cause did
+    return best if len(needed) == len(best.chosen) else task.quickly(needed, best.model), scans
 
 
 def _beside(task, best, one, like):

@@ -27,7 +27,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import check_choice, counted
+from astropolcal.words import check_choice, check_type, counted
 
 __all__ = ["Normal", "Tie", "parameter_table"]
 
@@ -49,14 +49,14 @@ class Tie:
     source : str
         Free parameter that leads, ``"optic.parameter"``.
     factor : float
-        Factor between values in canonical units (radian, micrometre, 1).
+        Factor between values in canonical units (radian, micrometre, 1), not 0.
     offset : `~astropy.units.Quantity` or float
         Constant part, in the target's unit.
 
     Raises
     ------
     ParameterError
-        If the factor is not a finite number.
+        If the factor is not a finite number, or 0.
 
     Examples
     --------
@@ -70,8 +70,10 @@ class Tie:
     offset: object = 0.0
 
     def __post_init__(self):
-        if not (isinstance(self.factor, Real) and np.isfinite(self.factor)):
-            raise ParameterError(f"tie to {self.source}: factor = {self.factor!r}, not a number")
+        if not (isinstance(self.factor, Real) and np.isfinite(self.factor) and self.factor):
+            raise ParameterError(
+                f"tie to {self.source}: factor = {self.factor!r}; allowed are finite numbers but 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -207,8 +209,9 @@ def with_own(chains, names, own, ties=None):
     names that it has in the groups.
     """
     names = names if len(set(names)) == len(names) else range(1, len(names) + 1)
-    own = own if isinstance(own, Mapping) else dict.fromkeys(own, names)
-    table, ties, optics = parameter_table(chains), dict(ties or {}), {}
+    if not isinstance(own, Mapping):
+        own = dict.fromkeys([own] if isinstance(own, str) else own, names)
+    table, ties, optics = parameter_table(chains), checked_ties(ties), {}
     for name, groups in own.items():
         groups = list(map(str, groups))
         check_choice("own", name, table, ParameterError)
@@ -239,6 +242,14 @@ def with_own(chains, names, own, ties=None):
     return [join(train) for train in trains], ties, copies
 
 
+def checked_ties(ties):
+    """Return ties as a dictionary, refused where something else is among them."""
+    ties = dict(ties or {})
+    for name, tie in ties.items():
+        check_type(f"ties: what {name} follows", tie, Tie, "a Tie is needed", ParameterError)
+    return ties
+
+
 def ties_among(ties, names):
     """Return the ties of which both ends are among some parameters."""
     return {name: tie for name, tie in ties.items() if {name, tie.source} <= set(names)}
@@ -254,7 +265,7 @@ class FreeParameters:
     """
 
     def __init__(self, chains, n_wavelengths, ties=None):
-        self.ties = dict(ties or {})
+        self.ties = checked_ties(ties)
         self._table = parameter_table(chains)
         for parameter in (p for parameters in self._table.values() for p in parameters):
             # as `Normal`, which an ASDF file can hold where scipy's frozen distribution cannot

@@ -500,6 +500,7 @@ def pair_frames(
     tolerance=0.3 * u.deg,
     derotator_tolerance=0.5 * u.deg,
     share=False,
+    lonely=False,
     labels=None,
     rows=None,
     name="table",
@@ -510,8 +511,8 @@ def pair_frames(
     All arguments are one per frame, angles as quantities; frames of a pair agree in derotator and
     state. The plus frame, whose angle modulo 90 deg lies in [0, 45), comes first; that of the same
     exposure and then the nearest in time (else in the table) wins. ``share`` lets a frame left over
-    use one that is used already; ``labels``, ``rows`` and ``name`` are for messages. An angle
-    without any partner in the table is an error, frames left over a warning.
+    use one that is used already; ``labels``, ``rows`` and ``name`` are for messages. Frames left
+    over are a warning, an angle without any partner in the table an error unless ``lonely``.
     """
     hwp = np.atleast_1d(angle_to_rad(hwp, "hwp"))
     n_frames, tolerance = len(hwp), float(angle_to_rad(tolerance, "tolerance"))
@@ -522,9 +523,9 @@ def pair_frames(
     there = np.concatenate([there - _HALF, there, there + _HALF])
     wanted = np.mod(hwp + _QUARTER, _HALF)
     place = np.searchsorted(there, wanted)
-    lonely = np.minimum(wanted - there[place - 1], there[place] - wanted) > tolerance
-    if lonely.any():
-        frame = int(np.argmax(lonely))
+    alone = np.minimum(wanted - there[place - 1], there[place] - wanted) > tolerance
+    if alone.any() and not lonely:
+        frame = int(np.argmax(alone))
         raise ObservationError(
             f"{name}, {_where(frame, rows)}: hwp = {np.rad2deg(hwp[frame]):g} deg has no partner; "
             "a frame with the half-wave plate 45 deg from it (modulo 180 deg) is needed"

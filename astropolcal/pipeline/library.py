@@ -17,6 +17,7 @@ import os
 import re
 import stat
 import time
+import warnings
 from collections.abc import Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -41,7 +42,7 @@ from astropolcal.calibration.result.calibration import (
 )
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
-from astropolcal.exceptions import CalibrationFileError, InstrumentError
+from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, InstrumentError
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
@@ -451,7 +452,12 @@ class Library:
         Returns
         -------
         `~pathlib.Path`
-            The file. A calibration that is there already is not written again.
+            The file. A calibration that is there already is not written again, nor renamed.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If it is there already under another name than the one given.
 
         Raises
         ------
@@ -472,6 +478,13 @@ class Library:
                 lambda: next((e for e in self.entries if e.content_hash == digest), None)
             )
             if same is not None:
+                if name not in (None, same.name):
+                    warnings.warn(
+                        f"name = {name!r}: the calibration is there already, as {same.name}; "
+                        "nothing is written",
+                        AstropolcalWarning,
+                        stacklevel=2,
+                    )
                 return self.source / same.name
             others = [entry for entry in self._in_force() if entry.content_hash not in gone]
             for pair in (sorted([entry, new], key=_order) for entry in others):

@@ -4,6 +4,7 @@
 import argparse
 import copy
 import os
+import warnings
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
+    AstropolcalWarning,
     CalibrationFileError,
     ObservationError,
     ParameterError,
@@ -26,7 +28,8 @@ from astropolcal.words import counted
 HELP = "correct science cubes with a calibration and write Stokes parameters"
 DESCRIPTION = """\
 Solve for the Stokes parameters of the light that entered the telescope, by
-least squares over all frames, and write them with their errors."""
+least squares over all frames, and write them with their errors. The cubes must
+be without sky background: it is not subtracted."""
 EXAMPLES = """\
 examples:
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
@@ -84,6 +87,8 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 [whole archives]
 @ archive gap cycles target retry timeout
 """
+# share of the light in the aperture that the edge of the images may have on its area
+_MOST_SKY = 0.01
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -187,6 +192,7 @@ def work(arguments):
     )
     # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
+    _warn_of_sky(result["I"], star["I"], _radius(arguments))
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
     result.write(arguments.output, overwrite=True)
@@ -241,6 +247,32 @@ def _check_options(arguments):
 def _radius(arguments):
     """Return the radius of the aperture; the usual one, as far as it is in the images."""
     return min(10.0, arguments.size / 2) if arguments.radius is None else arguments.radius
+
+
+def _warn_of_sky(images, light, radius):
+    """Warn of light at the edge of the images, more than a halo has, that the aperture has too."""
+    size = min(images.shape[1:])
+    if size < 3 * radius:
+        # it is the star itself
+        return
+    places = np.indices(images.shape[1:])
+    depth = np.minimum(places, np.subtract(images.shape[1:], 1)[:, None, None] - places).min(axis=0)
+    edge, inner = (images[:, depth == place] for place in (0, size // 6))
+    good = np.isfinite(edge).any(axis=1) & np.isfinite(inner).any(axis=1) & (light > 0)
+    level, inside = (np.nanmedian(ring[good], axis=1) for ring in (edge, inner))
+    noise = 5 * np.nanstd(edge[good], axis=1) / np.sqrt(np.isfinite(edge[good]).sum(axis=1))
+    # a halo falls by 1 / r or faster, to 2 / 3 from the inner ring to the edge
+    sky = 3 * level - 2 * inside
+    share = np.where(level > noise, sky * np.pi * radius**2 / light[good], 0.0)
+    worst = max(share, default=0.0)
+    if worst > _MOST_SKY:
+        warnings.warn(
+            f"the edge of the images has {100 * worst:.2g} % of the light within {radius:g} pixels "
+            "of the star, on the same area: a sky background changes I, and so q and u, and must "
+            "be subtracted from the cubes before",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
 
 
 # ---- the calibration ------------------------------------------------------------------------
@@ -399,17 +431,21 @@ def _words(summary, systematic, arguments):
         lines.append(common.wrapped(f"  {line}", indent=4))
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
-    n = len(summary["wavelength_nm"])
-    good = n - len(summary["poorly_determined"])
+    n, poor = len(summary["wavelength_nm"]), summary["poorly_determined"]
+    good = sum(bool(np.isfinite(q)) and str(w) not in poor for w, q in enumerate(star["q"]))
     verdict, advice = "Usable", common.following("info", arguments.output)
-    if not good:
+    if not good and len(poor) < n:
+        verdict = f"NOT USABLE AS IT IS: no light within {star['radius']:g} pixels of the star"
+        advice = "another --centre X,Y or --radius PIXELS"
+    elif not good:
         verdict = "NOT USABLE AS IT IS: the frames determine the Stokes parameters nowhere"
         advice = "frames at more angles of the half-wave plate and of the field"
     elif lost:
         verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
     elif good < n:
-        verdict = f"Usable: poorly determined at {counted(n - good, 'wavelength')}"
+        what = "poorly determined" if len(poor) == n - good else "without a value"
+        verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"
     written = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
     determined = f"{summary['components']} at {good} of {n} wavelengths"
     accuracy = f"{accuracy} (statistical + systematic)"

@@ -46,6 +46,9 @@ _NO_BAND = 0.05
 # of the effective wavelength of a band: other filters, detectors and colours of stars
 _BAND_ERROR = 0.02
 _BOUNDS = ([1e-5, 0.3, 0.1], [1.0, 1.3, 3.0])
+# Beyond so many um the degree falls slower than the law (Martin & Whittet 1990, ApJ 357, 113): so
+# much per factor of e makes H and K of the catalogue as far from the laws as their errors say.
+_LONG, _DEPARTURE = 1.5, 0.25
 _UNITS = {"lambda_max": u.um, "theta": u.deg, "rotation": u.deg / u.um}
 _PARAMETERS = ("p_max", "lambda_max", "K", "theta", "rotation")
 
@@ -377,8 +380,9 @@ class StandardStar:
         Returns
         -------
         LinearStokes
-            Of a polarized star those of `interstellar`, with its covariance; of an
-            unpolarized star q = u = 0, with the error of `unpolarized_error`.
+            Of a polarized star those of `interstellar`, with its covariance and, beyond 1.5 um,
+            an error of the law itself; of an unpolarized star q = u = 0, with the error of
+            `unpolarized_error`.
 
         Raises
         ------
@@ -400,7 +404,10 @@ class StandardStar:
             variance = np.full(zero.shape, self.unpolarized_error().value ** 2)
             return LinearStokes(zero, zero.copy(), variance[..., None, None] * np.eye(2))
         known = self._interstellar
-        return known.law.stokes(wavelength, known.covariance)
+        q, u_, covariance = known.law.stokes(wavelength, known.covariance)
+        beyond = _DEPARTURE * np.log(np.maximum(length_to_um(wavelength) / _LONG, 1.0))
+        away = np.stack([q, u_], axis=-1) * beyond[..., None]
+        return LinearStokes(q, u_, covariance + away[..., :, None] * away[..., None, :])
 
     def interstellar(self):
         """

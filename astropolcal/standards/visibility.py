@@ -396,6 +396,8 @@ def observability(
     place = location(site)
     limit, dark, step = checked(min_altitude, twilight, step)
     if isinstance(star, SkyCoord):
+        if not star.isscalar:
+            raise ParameterError(f"star has {star.size} positions; one is needed")
         name, coord = star.to_string("hmsdms", precision=0), star
     else:
         star = star if isinstance(star, StandardStar) else get(star)

@@ -5,10 +5,11 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import Calibration
+from astropolcal import Calibration, optics
 from astropolcal.calibration import calibrate, profile
 from astropolcal.calibration.uncertainty.covariance import STATUSES, status_of
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
 POLARIZER = "calibration_polarizer.theta"
@@ -52,6 +53,29 @@ def test_one_sided_error_is_where_the_profile_has_risen_by_one(make):
                 ends = [abs(getattr(end, "value", end) - best) for end in made.interval()]
                 assert min(ends) == pytest.approx(row["std_inward"], rel=0.02), weights
                 assert max(ends) == np.inf, weights
+
+
+def test_few_data_tell_the_noise_badly_at_a_bound_and_with_stated_noise_too():
+    chain = (
+        optics.LinearPolarizer(name="polarizer", fixed={"theta": False})
+        | optics.LinearRetarder(retardance=173 * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(retardance=100 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=0.95, name="wollaston")
+    )
+    frames = half_wave_plate_cycles([0, 45, 22.5, 67.5] * u.deg, [45, 80, 115] * u.deg)
+    seen = simulate(chain, [1.6] * u.um, frames, flux=1e5, seed=1)
+    free = calibrate(chain, seen, cross_validate=False)
+    # six data and four parameters: of residuals, whatever the noise of the data is said to be
+    stated = calibrate(chain, seen, weights=0.01, cross_validate=False)
+    np.testing.assert_allclose(stated.covariance.stds, free.covariance.stds, rtol=1e-4)
+    value, std = (free.parameter_values()["wollaston.efficiency"][key] for key in ("value", "std"))
+    bounded = chain.copy()
+    bounded["wollaston"].efficiency = value - 0.02 * std
+    bounded["wollaston"].efficiency.bounds = (0.5, value - 0.01 * std)
+    bounded = calibrate(bounded, seen, cross_validate=False)
+    inward = bounded.parameter_values()["wollaston.efficiency"]["std_inward"]
+    # the noise is measured with one parameter less
+    assert 0.7 * std < inward < std
 
 
 def test_correlated_residuals_count_at_a_bound_too(make):

@@ -130,6 +130,29 @@ def test_impossible_requests_are_errors(sky):
     chain = optics.LinearRetarder(mount="other", name="x") | bench(90)
     with pytest.raises(ChainError, match="no position of the stages other"):
         polarimetric_efficiency(chain, LAM, derotator=0 * u.deg)
+    kwargs["altitude"] = 60 * u.deg
+    for wrong, words in [
+        ({"aolp": [0, 90] * u.deg}, r"aolp has shape \(2,\); one angle is needed"),
+        ({"aolp": np.nan * u.deg}, "aolp = nan deg must be finite"),
+        ({"law": (1,)}, r"law = \(1,\); two factors"),
+        ({"law": "pupil"}, "law = 'pupil' is not a number"),
+        ({"parallactic": [0, 1] * u.deg, "altitude": [50, 60, 70] * u.deg}, "must broadcast"),
+        ({"parallactic": [0, 1] * u.deg, "derotator": [50, 60, 70] * u.deg}, "must broadcast"),
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            polarimetric_efficiency(sky, CHARIS.wavelength, **kwargs | wrong)
+    for altitude, offsets, words in [
+        ([50, 60], [] * u.deg, r"offsets has shape \(0,\); some in one row"),
+        ([50, 60], [[1, 2]] * u.deg, r"offsets has shape \(1, 2\); some in one row"),
+        ([50, 60], [1, 2], "offsets = .* needs a unit"),
+        ([50, 60], [1, np.nan] * u.deg, "offsets = .* must be finite"),
+        ([50, 60, 70], None, r"altitude has shape \(3,\), parallactic has shape \(2,\)"),
+        ([[50, 60]], None, r"altitude has shape \(1, 2\); some in one row"),
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            best_derotator(sky, LAM, altitude * u.deg, [0, 1] * u.deg, offsets=offsets)
+    with pytest.raises(ParameterError, match=r"altitude has shape \(0,\); some in one row"):
+        best_derotator(sky, LAM, [] * u.deg, [] * u.deg)
 
 
 # --- other instruments ------------------------------------------------------------------------

@@ -99,6 +99,10 @@ def test_fixing_is_a_gauge_and_gives_errors(observations):
     assert "the data determine every free parameter" in fixed.settings["gauge"]
     assert np.all(np.isfinite(fixed.covariance.stds))
     assert fixed.identifiability.rank == len(fixed.covariance)
+    for one in ("hwp.theta", ["hwp.theta"]):
+        assert (
+            _fit(_chain(), observations, fix=one).settings["gauge"].startswith("held: hwp.theta;")
+        )
 
 
 def test_a_prior_is_a_gauge_and_gives_errors(observations):
@@ -272,6 +276,16 @@ def test_nonsense_is_refused(observations):
         ({"fix": {"hwp.tilt": None}}, FitError, "no parameter 'hwp.tilt'"),
         ({"fix": {"hwp.theta": 1 * u.mm}}, ParameterError, "not convertible"),
         ({"fix": {"hwp.theta": 1}}, ParameterError, "needs a unit"),
+        ({"fix": {"hwp.theta": [1, 2] * u.deg}}, FitError, r"\[1. 2.\] deg; allowed is one value$"),
+        (
+            {"fix": {"derotator.diagonal": [1, 2] * u.deg}},
+            FitError,
+            "allowed is one value or 4, one per wavelength",
+        ),
+        ({"ties": {"hwp.theta": "derotator.theta"}}, ParameterError, "of type str; a Tie is"),
+        ({"ties": {"hwp.theta": "x"}, "own": "derotator.theta"}, ParameterError, "a Tie is"),
+        ({"fitter": "TRF"}, FitError, "fitter = 'TRF'; allowed are astropy's"),
+        ({"fitter": TRFLSQFitter}, FitError, "fitter = .*TRFLSQFitter.*; allowed are astropy's"),
     ]:
         with pytest.raises(error, match=complaint):
             _fit(_chain(), observations, **options)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration.result.calibration import Validity, validity_of, with_validity
 from astropolcal.converters.calibration import content_hash
-from astropolcal.exceptions import CalibrationFileError
+from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError
 from astropolcal.pipeline import fetch, health, import_context, parameter_history
 from astropolcal.pipeline import library as module
 from astropolcal.pipeline.library import Entry, Library
@@ -180,6 +180,11 @@ def test_overlap_names_both(calibration, library):
 def test_two_of_one_start_are_an_overlap_and_copies_are_not(calibration, library):
     path = library.add(calibration)
     assert library.add(calibration) == path
+    assert library.add(calibration, name=path.name) == path
+    with pytest.warns(
+        AstropolcalWarning, match=f"name = 'other.asdf': .* there .*, as {path.name}"
+    ):
+        assert library.add(calibration, name="other.asdf") == path
     (library.source / "copy.asdf").write_bytes(path.read_bytes())
     again = Library(library.source)
     assert len(again) == 2

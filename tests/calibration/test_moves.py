@@ -160,6 +160,9 @@ def test_snooker_steps_of_a_biased_emcee_are_refused(calibration):
     if emcee.__version__ == "3.1.6":
         with pytest.raises(FitError, match="too narrow"):
             sample(calibration, moves=moves, n_steps=40, progress=False)
+    for wrong in ("stretch", ["stretch"], [("stretch", 1.0)]):
+        with pytest.raises(FitError, match="moves: 'stretch'; allowed are moves of emcee"):
+            sample(calibration, moves=wrong, n_steps=40, progress=False)
 
 
 def test_walkers_start_with_the_covariance(calibration):

@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,10 +13,11 @@ from astropolcal.calibration.noise import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
+    noise_from_roughness,
 )
 from astropolcal.calibration.noise.estimates import data_by_wavelength, equal_axes
 from astropolcal.chain import join
-from astropolcal.exceptions import FitError
+from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.simulation import simulate
@@ -87,9 +89,18 @@ def test_gain_of_the_table_reproduces_the_errors_of_the_simulation(make, chain):
     np.testing.assert_allclose(noise.sigma_of_data, measurement.sigma, rtol=1e-12)
 
 
+def test_gain_may_have_its_unit(faint):
+    plain = noise_from_errors(faint, gain=2.0, read_noise=100.0)
+    gain, read_noise = 2 * u.electron / u.adu, 100 * u.electron
+    noise = noise_from_errors(faint, gain=gain, read_noise=read_noise)
+    np.testing.assert_array_equal(noise.sigma_of_data, plain.sigma_of_data)
+    assert noise.words == plain.words
+
+
 def test_impossible_gain_is_refused(faint):
-    for settings in [{"gain": 0.0}, {"gain": np.nan}, {"gain": -1.0}]:
-        with pytest.raises(FitError, match="gain = "):
+    wrong = 0.0, np.nan, -1.0, [1, 2], "a", 1 * u.adu
+    for settings in [{"gain": gain} for gain in wrong]:
+        with pytest.raises((FitError, ParameterError), match=r"gain (= |has unit adu)"):
             noise_from_errors(faint, **settings)
         with pytest.raises(FitError, match="read_noise = -1"):
             noise_from_errors(faint, gain=1.0, read_noise=-1.0)
@@ -147,12 +158,51 @@ def test_small_differences_of_position_are_modelled(make, strong):
 def test_nothing_repeated_is_said(faint, make, chain):
     with pytest.raises(FitError, match="simulated: no two data at the same settings"):
         noise_from_replicates(faint)
-    # other states of a modulator are no replicates
-    frames = make.frames(TWICE)
-    frames["flc_state"] = np.tile(np.repeat(["A", "B"], 8), 8)
-    data = simulate(chain, LAM, frames, seed=1, **FAINT)
-    with pytest.raises(FitError, match="no two data"):
-        noise_from_replicates(Measurement(chain, data))
+    # nor are other states of a modulator, or of what else the chain knows
+    cells = [optics.StateRetarder(mount=f"lcvr={state}", name=f"lc_{state}") for state in "AB"]
+    left = []
+    for column, own in (("flc_state", chain), ("lcvr", join([*cells, chain])), ("set", chain)):
+        frames = make.frames(TWICE)
+        frames[column] = np.tile(np.repeat(["A", "B"], 8), 8)
+        measurement = Measurement(own, simulate(own, LAM, frames, seed=1, **FAINT))
+        left.append(noise_from_null_channel(measurement).dof[0])
+        if column == "set":
+            # what it does not know changes nothing
+            assert noise_from_replicates(measurement).dof[0] == 32
+            continue
+        with pytest.raises(FitError, match="no two data"):
+            noise_from_replicates(measurement)
+    # of each state the null has a constant of its own at each of the 8 derotator angles
+    assert left[0] == left[1] == left[2] - 8
+
+
+def test_states_of_a_single_beam_are_no_replicates():
+    wheel = [
+        optics.StateAnalyser(efficiency=0.95, theta=a * u.deg, mount=f"filter=P{a}", name=f"p{a}")
+        for a in (0, 60, 120)
+    ]
+    lamp = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    chain = join([lamp, optics.LinearRetarder(retardance=90 * u.deg, name="mirror"), *wheel])
+    angle = np.arange(0, 180, 15.0)
+    for turns, freedom in ((1, 0), (2, 24)):
+        frames = QTable({"calibrator": np.tile(np.repeat(angle, 3), turns) * u.deg})
+        frames["group"] = np.repeat(np.arange(12 * turns), 3)
+        frames["filter"] = np.tile(["P0", "P60", "P120"], 12 * turns)
+        measurement = Measurement(chain, simulate(chain, LAM, frames, noise=False))
+        if freedom:
+            assert (noise_from_replicates(measurement).dof == freedom).all()
+            continue
+        with pytest.raises(FitError, match="no two data"):
+            noise_from_replicates(measurement)
+
+
+def test_settings_of_replicates_that_cannot_be(repeated):
+    for tolerance in ([1, 2] * u.deg, *([np.nan, -1, 91, 200] * u.deg)):
+        with pytest.raises(ParameterError, match=r"tolerance = .*one angle from 0 to 90 deg"):
+            noise_from_replicates(repeated, tolerance=tolerance)
+    for estimate in (noise_from_replicates, noise_from_null_channel, noise_from_roughness):
+        with pytest.raises(ParameterError, match=r"vector of shape \(2,\); allowed is"):
+            estimate(repeated, [1, 2])
 
 
 def test_masked_data_do_not_count(repeated):

@@ -367,7 +367,8 @@ def test_bad_thinning(posterior):
 
 
 def test_bad_quantile(posterior):
-    with pytest.raises(ParameterError, match="numbers from 0 to 1"):
-        posterior.quantile("hwp.theta", 16)
+    for q in (16, np.nan, [0.5, np.nan]):
+        with pytest.raises(ParameterError, match="numbers from 0 to 1"):
+            posterior.quantile("hwp.theta", q)
     with pytest.raises(ParameterError, match=r"no parameter 'hwp\.w_sio2'"):
         posterior.quantile("hwp.w_sio2", 0.5)

@@ -191,6 +191,7 @@ def test_bad_input_is_refused(cal):
         ({"name": "hwp.phase"}, ParameterError, "no free parameter 'hwp.phase'; there are cal"),
         ({"name": "hwp.theta"}, ParameterError, "no free parameter"),
         ({"name": "hwp.w_sio2", "n": 2}, FitError, "n = 2"),
+        ({"name": "hwp.w_sio2", "n": 7.0}, FitError, "n = 7.0; .* whole number"),
         ({"name": "hwp.w_sio2", "values": [1.6]}, ParameterError, "needs a unit"),
         ({"name": "hwp.w_sio2", "values": [1.6] * u.deg}, ParameterError, "not convertible"),
         ({"name": "hwp.w_sio2", "values": [-1] * u.mm}, ParameterError, "outside its bounds"),

@@ -210,6 +210,7 @@ def test_bad_options_are_refused(white):
     for options, message in [
         ({"block": "night"}, "block = 'night'; allowed are derotator, pair"),
         ({"n": 1}, "n = 1"),
+        ({"n": np.nan}, "n = nan; .* whole number"),
     ]:
         with pytest.raises(FitError, match=message):
             bootstrap(white, **options)

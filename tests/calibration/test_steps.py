@@ -9,10 +9,11 @@ import pytest
 from astropy.table import QTable
 from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
-from astropolcal import Calibration, calibrate
+from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration.noise import outlying_data
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.noise.weighting import LOSSES
+from astropolcal.chain import replace_optic
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -140,6 +141,18 @@ def test_fits_in_steps_say_how_far_off_the_minimum_they_are(data):
     cautions = "; ".join(steps.verdict().cautions)
     assert (f"{told['parameter']} is {told['errors']:.2g} errors off" in cautions) == (off[i] > 0.5)
     assert "off the minimum" not in str(joint.verdict().cautions)
+
+
+def test_two_steps_of_one_wavelength_are_those_that_have_parameters():
+    start = CHARIS.chain(derotator="linear", wavelength=[1.6] * u.um)
+    plate = optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+    start = replace_optic(start, "hwp", plate)
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    table = simulate(start, [1.6] * u.um, frames, seed=1)
+    found = [calibrate(start, table, strategy=s, search=False, cross_validate=False)
+             for s in ("joint", "two-step")]  # fmt: skip
+    np.testing.assert_allclose(*(cal.measurement.vector() for cal in found), rtol=1e-6)
+    assert [len(stage["parameters"]) > 0 for stage in found[1].stages] == [False, True, False]
 
 
 def test_order_of_the_datasets_does_not_matter(data, fitted):

@@ -88,8 +88,8 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
 
 @pytest.mark.slow
 def test_exchanged_beams_are_asked_about_where_little_else_shows_them(example):
-    """With the polarizer held, the other angles make up for all but 1.1 % of polarization."""
-    table, fix = example.to_table(), {"calibration_polarizer.theta": None}
+    """With polarizer and plate held, the other angles make up for all but 1.2 % of polarization."""
+    table, fix = example.to_table(), ["calibration_polarizer.theta", "hwp.theta"]
     for right, left in (("flux_right", "flux_left"), ("flux_right_err", "flux_left_err")):
         table[right], table[left] = table[left].copy(), table[right].copy()
     for data, asked in ((example, False), (Observations.from_table(table), True)):

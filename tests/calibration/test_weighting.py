@@ -17,6 +17,7 @@ from astropolcal.calibration.noise.weighting import (
 )
 from astropolcal.calibration.posterior import LogPosterior
 from astropolcal.calibration.validation import lack_of_fit
+from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -317,6 +318,23 @@ def test_choice_is_written_and_read(fitted, tmp_path):
         assert again.settings == cal.settings
         with pytest.raises(CalibrationFileError, match="holds no observations"):
             weighting_of(again)
+
+
+def test_noise_given_for_every_datum_is_read_again(truth, data, tmp_path):
+    errors = noise_from_errors(Measurement(truth, data))
+    uneven = 0.002 * np.exp(np.random.default_rng(1).normal(size=errors.sigma_of_data.size))
+    for noise, kept in ((uneven, True), (errors, True), (0.002, False), (LEVELS, False)):
+        cal = fit(truth, data, noise, errors="white")
+        assert ("sigma_of_data" in cal.settings["noise"][0]) is kept
+        cal.write(tmp_path / "cal.asdf", overwrite=True)
+        read = Calibration.read(tmp_path / "cal.asdf")
+        assert content_hash(read) == content_hash(cal)
+        again = weighting_of(read.with_observations(data))
+        assert again.choice == "given"
+        np.testing.assert_allclose(again.sigma, weighting_of(cal).sigma, rtol=0 if kept else 1e-12)
+    # of a robust fit it follows from the residuals
+    robust = fit(truth, data, noise, loss="huber")
+    assert "sigma_of_data" not in robust.settings["noise"][0]
 
 
 def test_same_data_give_the_same_noise_again(truth, data, fitted):

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from astropolcal import Observations, calibrate, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.correcting import _uneven
 from astropolcal.correction.geometry import derotate
 from astropolcal.correction.rows import sky_chain
 from astropolcal.exceptions import (
@@ -52,7 +53,7 @@ def test_disk_comes_back_exactly(disk_frames, sky, charis):
 
 def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
     """A camera that turns between frames; the rows refer to the sky, the images do not."""
-    hwp, positions = track(1)
+    _, positions = track(1)
     stokes = scene(22)
     right, left = seen(sky, positions, charis.wavelength, stokes)
     camera = [0, 90, 180, 270] * u.deg
@@ -60,7 +61,7 @@ def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
         for i, angle in enumerate(camera):
             beam[i] = derotate(beam[i], -angle)
     turned = ScienceFrames.from_arrays(
-        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+        right, left, charis.wavelength, positions, position_angle=camera
     )
     found = correct(sky, turned)
     np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
@@ -73,12 +74,12 @@ def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
 
 def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, track, seen):
     """Corners that turn out of the image must not count as dark."""
-    hwp, positions = track(2)
+    _, positions = track(2)
     stokes = np.ones((3, 22, 11, 11)) * np.array([100.0, 2.0, -1.0])[:, None, None, None]
     right, left = seen(sky, positions, charis.wavelength, stokes)
     camera = np.repeat([0, 45], 4) * u.deg
     frames = ScienceFrames.from_arrays(
-        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+        right, left, charis.wavelength, positions, position_angle=camera
     )
     found = correct(sky, frames)
     np.testing.assert_allclose(found.stokes, stokes, rtol=1e-9)
@@ -86,7 +87,7 @@ def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, trac
 
 @pytest.mark.slow
 def test_any_turn_of_the_field(sky, charis, track, scene, seen):
-    hwp, positions = track(2)
+    _, positions = track(2)
     stokes = scene(22, size=31)
     camera = np.linspace(0, 50, 8) * u.deg
     right, left = seen(sky, positions, charis.wavelength, stokes)
@@ -96,7 +97,7 @@ def test_any_turn_of_the_field(sky, charis, track, scene, seen):
     found = correct(
         sky,
         ScienceFrames.from_arrays(
-            right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera, order=5
+            right, left, charis.wavelength, positions, position_angle=camera, order=5
         ),
     )
     rows, columns = np.indices((31, 31)) - 15
@@ -276,6 +277,24 @@ def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen):
         np.testing.assert_allclose(correct(sky, clear).q, stokes[1] / stokes[0], atol=1e-10)
 
 
+def test_light_in_one_frame_at_one_wavelength_is_named(sky, charis, track, scene, seen):
+    """A cosmic ray that nobody masked; neither noise nor coloured clouds are one."""
+    _, positions = track()
+    beams = seen(sky, positions, charis.wavelength, scene(22, size=9))
+    rng = np.random.default_rng(1)
+    clouds = np.linspace(0.6, 1.4, 16)[:, None] ** np.linspace(0.8, 1.2, 22)
+    beams *= (clouds * rng.normal(1, 0.002, clouds.shape))[:, :, None, None]
+    correct(sky, ScienceFrames.from_arrays(*beams, charis.wavelength, positions))
+    beams[1, 5, 7, 2, 3] += 0.2 * beams[:, 5, 7].sum()
+    frames = ScienceFrames.from_arrays(*beams, charis.wavelength, positions)
+    words = rf"1 of 352 frames .*, most frame 5 at {frames.wavelength[7]:.6g}, by \+23 %"
+    with pytest.warns(AstropolcalWarning, match=words):
+        correct(sky, frames)
+    # two wavelengths do not tell which of them it is
+    two = ScienceFrames.from_arrays(*beams[:, :, 6:8], charis.wavelength[6:8], positions)
+    assert _uneven(dataclasses.replace(two, scale=np.eye(2, 16) + 1)) == []
+
+
 def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, charis, seen):
     right, left = seen(calibration, star.positions, charis.wavelength, star.stokes)
 
@@ -294,7 +313,8 @@ def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, c
     assert alone.observable == "intensity"
     assert np.abs(alone.q - truth).max() > 1e-3
     n = 15
-    with pytest.warns(AstropolcalWarning, match=r"1 of 15 frames have no partner.*frame 14"):
+    words = r"1 of 15 frames have no partner .* derotator within 2 deg and are left out.*frame 14"
+    with pytest.warns(AstropolcalWarning, match=words):
         assert correct(calibration, frames(hwp=star.hwp[:15])).observable == "double"
     singles = dataclasses.replace(
         calibration, settings=calibration.settings | {"observable": "normalized_single_difference"}
@@ -304,6 +324,8 @@ def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, c
     # a chain that nobody fitted
     assert correct(sky, frames(hwp=star.hwp)).observable == "double"
     assert correct(sky, frames()).observable == "intensity"
+    with pytest.warns(AstropolcalWarning, match="have none .* their intensities are fitted"):
+        assert correct(sky, frames(hwp=np.zeros(16) * u.deg)).observable == "intensity"
 
 
 def test_frames_must_say_when_and_how_they_were_taken(calibration, star, charis):
@@ -417,7 +439,18 @@ def test_bad_choices(star, sky, charis, calibration):
         ({"weights": "photon"}, "weights = 'photon'"),
         ({"weights": "variance"}, "need variances"),
         ({"chunk": 0}, "chunk = 0"),
+        ({"chunk": 1.5}, "chunk = 1.5; allowed are whole numbers from 1"),
         ({"workers": -1}, "workers = -1"),
+        ({"workers": "2"}, "workers = '2'; allowed are whole numbers from 1"),
+        ({"max_condition": "x"}, "max_condition = 'x' is not a number"),
+        ({"max_condition": [30]}, "must be one number above 1"),
+        # of a chain, too, which has no systematic errors
+        ({"open_directions": -1.0}, r"open_directions = -1\.0"),
+        ({"open_directions": "maybe"}, "open_directions = 'maybe'"),
+        ({"open_directions": None}, "open_directions = None"),
+        ({"n_samples": 1}, "n_samples = 1; allowed are whole numbers from 2"),
+        ({"n_samples": "x"}, "n_samples = 'x'; allowed are whole numbers from 2"),
+        ({"n_samples": 5, "seed": -1}, "seed = -1; allowed are whole numbers from 0 up"),
     ]:
         frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
         with pytest.raises(ParameterError, match=words):
@@ -435,6 +468,8 @@ def test_bad_choices(star, sky, charis, calibration):
         ScienceFrames.from_arrays(
             star.right, star.left, charis.wavelength, star.positions, variance_right=star.left
         )
+    with pytest.raises(ObservationError, match=r"one shape .* without a zero is needed"):
+        ScienceFrames.from_arrays(star.right[:0], star.left[:0], charis.wavelength, {})
     frames = ScienceFrames.from_arrays(
         star.right[:, :2], star.left[:, :2], [1.3, 1.4] * u.um, star.positions
     )

@@ -46,14 +46,21 @@ def test_pairs_by_the_angles_of_the_plate():
     for hwp, pairs in [
         ([0, 45, 22.5, 67.5], [[0, 1], [2, 3]]),
         ([0, 22.5, 45, 67.5], [[0, 2], [1, 3]]),
-        ([0, 22.5, 0, 22.5], None),
-        # an angle that has no partner at all is a hole; a frame left over is none
-        ([0, 45, 22.5, 0], None),
+        ([0, 22.5, 0, 22.5], []),
+        # one angle without any partner leaves the other pairs
+        ([0, 45, 22.5, 0], [[0, 1]]),
+        ([10, 45, 22.5, 0], [[3, 1]]),
+        ([np.nan, 45, 22.5, 0], [[3, 1]]),
         ([0, 45, 0, 45.1], [[0, 1], [2, 3]]),
         ([0, 45, 0, 0], [[0, 1]]),
     ]:
-        found = arrays(hwp=hwp * u.deg).pairs
-        assert (None if found is None else found.tolist()) == pairs, (hwp, pairs)
+        assert arrays(hwp=hwp * u.deg).pairs.tolist() == pairs, (hwp, pairs)
+    for wrong in (3 * u.deg, HWP[:3], np.tile(HWP, 2)):
+        with pytest.raises(ObservationError, match=r"hwp has shape .* each of the 4 frames is"):
+            arrays(hwp=wrong)
+    # positions of another kind than a dict
+    for positions in (None, QTable({"hwp": HWP})):
+        assert arrays(positions=positions, hwp=HWP).pairs.tolist() == [[0, 1], [2, 3]]
 
 
 def test_frames_of_two_derotator_angles_are_no_pair():
@@ -109,6 +116,8 @@ def test_what_does_not_fit():
         ({"wavelength": [1.2] * u.um}, r"wavelength has shape \(1,\); the frames have 2 wave"),
         ({"positions": {"hwp": HWP[:3]}}, r"hwp has 3 positions; there are 4 frames"),
         ({"positions": {"hwp": np.zeros((5, 3)) * u.deg}}, r"hwp has 3 positions; there are 4"),
+        ({"pairs": [[0, 1, 2]]}, r"pairs has shape \(1, 3\); whole numbers, \(n_pairs, 2\)"),
+        ({"pairs": [[0, 1.5]]}, r"pairs has shape \(1, 2\); whole numbers"),
         ({"groups": [0, 0, 0]}, r"groups has shape \(3,\); one of each of the 4 frames"),
     ]:
         good = arrays()
@@ -212,6 +221,9 @@ def test_files_without_errors_have_those_of_the_detectors(cubes):
     )
     found = frames.source.variances(1, slice(0, 4), slice(0, 2))
     np.testing.assert_allclose(found, 0.25 * 3.0 * values[:, :, 7:10, 9:12])
+    # as weights they would follow the noise
+    with pytest.warns(AstropolcalWarning, match="variances follow the noisy fluxes themselves"):
+        correct(CHAIN, frames, weights="variance", observable="intensity")
 
 
 def test_places_of_the_beams(cubes):

@@ -2,6 +2,7 @@
 """FITS products: what the header states, what comes back, what is refused."""
 
 import dataclasses
+import re
 from contextlib import suppress
 
 import astropy.units as u
@@ -52,6 +53,8 @@ def test_the_header_states_its_conventions(path, corrected):
     assert header["CALFILE"] == "charis.asdf"
     assert header["CALHASH"] == "ab" * 32
     assert header["CRPIX1"] == 5
+    # FITS has UTC without a zone
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d", header["DATE"])
     for keyword in ("APCVERS", "APYVERS", "NPYVERS", "DATE", "INSTRUME"):
         assert header[keyword]
     assert any("m3." in line for line in header["HISTORY"])

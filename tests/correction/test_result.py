@@ -8,7 +8,7 @@ import pytest
 from astropolcal.correction import Corrected, Systematic
 from astropolcal.correction.correcting import covariance_index
 from astropolcal.correction.geometry import azimuthal
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ParameterError
 
 LAM = [1.2, 1.6] * u.um
 
@@ -137,6 +137,25 @@ def test_an_aperture_is_a_sum_over_pixels(images):
     assert cross.unit == u.electron
     # an aperture without a centre is in the middle
     np.testing.assert_array_equal(images.aperture(0.5).stokes, images.stokes[:, :, 3, 4])
+    # pixels that lack one component are left out of all, wavelength by wavelength
+    holes = make((7, 9), centre=(5.0, 3.0))
+    holes.stokes[1, 0, 3, 4] = np.nan
+    words = "up to 1 of 5 pixels of the aperture have no value, at 1 of 2 wavelengths"
+    with pytest.warns(AstropolcalWarning, match=words):
+        part = holes.aperture(1.0)
+    np.testing.assert_allclose(part.stokes[:, 1], cross.stokes[:, 1])
+    for one, all_ in ((part.stokes, found.stokes), (part.covariance, found.covariance)):
+        np.testing.assert_allclose(
+            one[:, 0], sum(all_[:, 0, y, x] for y, x in pixels[:3] + pixels[4:])
+        )
+    # a component that is nowhere determined, or a wavelength, leaves the others
+    holes.stokes[:, 0], holes.stokes[1, 1] = np.nan, np.nan
+    part = holes.aperture(1.0)
+    assert np.isnan(part.stokes).tolist() == [[True, False], [True, True], [True, False]]
+    np.testing.assert_allclose(part["I"][1], cross["I"][1])
+    # they can be compared like any object
+    assert found == found
+    assert found != holes
     # an aperture without errors
     images.covariance = None
     assert images.aperture(2).covariance is None

@@ -159,6 +159,15 @@ def test_what_is_refused_is_one_line(scene_with_star):
             "0 and above",
         ),
         (stokes, {"dolp": 0.1, "aolp": 4.0}, ParameterError, "needs a unit"),
+        *(
+            (stokes, {"dolp": 0.1, "aolp": 4 * u.deg} | given, ParameterError, words)
+            for given, words in (
+                ({"dolp": [0.1, 0.2]}, r"has shape \(2,\); .* must be single numbers"),
+                ({"aolp": [4, 5, 6] * u.deg}, r"has shape \(3,\); .* must be single numbers"),
+                ({"errors": ([0.1], 1 * u.deg)}, r"has shape \(1,\); .* must be single numbers"),
+                ({"errors": 0.1}, "errors = 0.1; two are needed"),
+            )
+        ),
         (stokes, {}, ParameterError, "either annulus, or dolp"),
         (stokes, {"dolp": 0.1}, ParameterError, "either annulus, or dolp"),
         (stokes, {"dolp": 0.1, "annulus": RING}, ParameterError, "either annulus, or dolp"),

@@ -45,6 +45,7 @@ from astropolcal.units import canonical_factor
 WAVELENGTH = np.geomspace(1.16, 2.3, 6) * u.um
 FRAMES = half_wave_plate_cycles(derotator=[45, 62, 77, 98] * u.deg)
 LONG = half_wave_plate_cycles(np.arange(0, 360, 33.75) * u.deg, [45, 62, 77, 98] * u.deg)
+BACK_AND_FORTH = half_wave_plate_cycles(derotator=[45, 77, 62, 98, 52, 85] * u.deg)
 SKY = sky_track(12, parallactic=(-50, 70), altitude=(50, 75))
 #: Photons of a beam, at first.
 FLUX = 1e8
@@ -145,6 +146,7 @@ CASES = {
     "beams_swapped": Case(),
     "derotator_45_retardance": Case(),
     "derotator_angle_bound": Case(_ONE_SIGN, _bounded("derotator", "theta", -5, 0)),
+    "derotator_backlash": Case(frames=BACK_AND_FORTH),
     "derotator_band_average": Case((-1.0, -2.0)),
     "derotator_circular_retardance": Case(),
     "derotator_diattenuation": Case(),
@@ -171,6 +173,7 @@ CASES = {
     "fringes_drift_4_um": Case(),
     "hwp_angle_bound": Case(_ONE_SIGN, _bounded("hwp", "theta", -5, 0)),
     "hwp_axis_dispersion": Case(),
+    "hwp_backlash": Case(),
     "hwp_beam_wander": Case(frames=LONG),
     "hwp_diattenuation": Case(),
     "hwp_doubled": Case(),

@@ -78,6 +78,18 @@ def test_a_fault_of_one_of_two_runs_at_other_wavelengths():
 
 
 @pytest.mark.slow
+def test_a_stage_with_another_zero_is_one_change():
+    second = data.chain()
+    second["hwp"].theta = second["hwp"].theta.quantity + 0.4 * u.deg
+    runs = [data.observed(data.chain(), seed=3, name=JULY), data.observed(second, name=OCTOBER)]
+    found = diagnose(data.chain(), runs, changes=True)
+    assert [cause.name for cause in found.causes] == [f"hwp_zero/dataset:{OCTOBER}"]
+    (change,) = to_dict(found)["changes"]
+    assert "the zero of the angle of the half-wave plate changed by 0.4" in change["words"]
+    assert change["cell"]["place"] == "in:hwp"
+
+
+@pytest.mark.slow
 def test_a_change_is_found_with_its_run_cell_and_size():
     found = diagnose(data.chain(), pair([GAIN], [GAIN, BEHIND]), changes=True)
     content = to_dict(found)

@@ -455,6 +455,7 @@ def test_report_has_units():
         aperture = {"radius": 10.0, "dolp": np.array([0.0099]), "aolp": np.array([30.0])}
         aperture |= {"s_p_statistical": np.array([0.0012]), "s_chi_statistical": np.array([2.0])}
         aperture |= {"s_p_systematic": np.array([np.nan]), "s_chi_systematic": np.array([np.inf])}
+        aperture["q"] = np.array([0.005])
         summary = {
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
@@ -476,6 +477,34 @@ def test_report_has_units():
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
         assert verdict == (told if is_open else "Usable"), (systematic, words)
         assert lines[-1] == "Written:    o.fits", (systematic, words)
+    # wavelengths at which the aperture has no value are not usable, whatever the frames determine
+    summary["wavelength_nm"] = [1200.0, 1600.0]
+    for q, told in (
+        ([0.005, np.nan], "Usable: without a value at 1 wavelength"),
+        ([np.nan, np.nan], "NOT USABLE AS IT IS: no light within 10 pixels of the star"),
+    ):
+        aperture["q"] = np.array(q)
+        lines = _correct._words(summary, None, SimpleNamespace(**outputs))
+        assert lines[lines.index("") + 1] == told
+        assert f"IQU at {np.isfinite(q).sum()} of 2 wavelengths" in " ".join(lines)
+
+
+def test_light_at_the_edge_is_told():
+    images = np.zeros((2, 21, 21))
+    images[:, 10, 10] = 1e4
+    light = images[:, 10, 10] + [0, 100]
+    noise = np.random.default_rng(1).normal(0, 0.5, images.shape)
+    halo = 20 / np.hypot(*(np.indices((21, 21)) - 10.001))
+    # noise, a halo and what no wavelength has are no sky
+    for known in (noise, halo, halo**2, np.nan):
+        _correct._warn_of_sky(images + known, light, 5)
+    images[1] += 2
+    # so near to the star the edge has light of its own
+    _correct._warn_of_sky(images, light, 8)
+    for known in (0, noise / 50):
+        words = r"has 1\.6 % of the light within 5 pixels .* must be subtracted"
+        with pytest.warns(AstropolcalWarning, match=words):
+            _correct._warn_of_sky(images + known, light, 5)
 
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"

@@ -431,3 +431,8 @@ def test_parameter_just_below_zero_is_printed_without_a_sign():
     entry = {"value": -1e-7, "std": 1e-3, "unit": "deg", "tied": None, "status": "determined"}
     assert number(entry).strip() == "0.00000 +- 0.00100 deg"
     assert number(entry | {"value": -0.1}).strip() == "-0.10000 +- 0.00100 deg"
+
+
+def test_the_package_is_the_command():
+    words = [sys.executable, "-m", "astropolcal", "--version"]
+    assert subprocess.run(words, capture_output=True, text=True).stdout.startswith("astropolcal ")

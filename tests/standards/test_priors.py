@@ -178,7 +178,7 @@ def test_the_table_of_the_page():
     assert {group: len(rows) for group, rows in found.items()} == {
         "published": 94, "three": 11, "one or two": 41
     }  # fmt: skip
-    expected = {"published": (3, 4, 8), "three": (5, 10, 15), "one or two": (15, 18, 23)}
+    expected = {"published": (3, 5, 12), "three": (5, 10, 18), "one or two": (15, 18, 24)}
     for group, rows in found.items():
         np.testing.assert_allclose(np.median(rows, axis=0), expected[group], atol=0.6)
 

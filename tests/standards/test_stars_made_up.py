@@ -142,13 +142,24 @@ def test_degree_in_the_band_measured_or_nearest_to_v():
 def test_degree_of_a_law_has_the_error_along_the_polarization():
     """An error of the angle leaves the degree certain; one of p_max is its share of it."""
     law = SerkowskiLaw(p_max=0.04, lambda_max=0.5 * u.um, K=1.0, theta=70 * u.deg)
-    shape = np.exp(-(np.log(0.5 / 1.65) ** 2))
+    shape = np.exp(-(np.log(0.5 / 1.25) ** 2))
     errors = {"p_max": 0.2 * u.percent, "lambda_max": 0 * u.um, "K": 0.0}
     errors |= {"theta": 5 * u.deg, "rotation": 0 * u.deg / u.um}
     star = _star("polarized", _measured("U"), law=law, law_errors=errors)
-    assert _degree(star, "H") == pytest.approx((4 * shape, 0.2 * shape), rel=1e-9)
+    assert _degree(star, "J") == pytest.approx((4 * shape, 0.2 * shape), rel=1e-9)
     star = _star("polarized", _measured("U"), law=law, law_errors=errors | {"p_max": 0 * u.percent})
-    assert _degree(star, "H") == pytest.approx((4 * shape, 0), abs=1e-9)
+    assert _degree(star, "J") == pytest.approx((4 * shape, 0), abs=1e-9)
+    # beyond 1.5 um the law itself errs, the more the farther
+    for wavelength, share in (
+        (1.5, 0.0),
+        (1.65, 0.25 * np.log(1.1)),
+        (2.2, 0.25 * np.log(2.2 / 1.5)),
+    ):
+        q, stokes_u, covariance = star.stokes(wavelength * u.um)
+        known = np.array([q, stokes_u])
+        np.testing.assert_allclose(
+            known @ covariance @ known, share**2 * (known @ known) ** 2, atol=1e-20
+        )
 
 
 def test_a_star_is_known_in_a_band():

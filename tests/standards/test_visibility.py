@@ -166,6 +166,8 @@ def test_bad_options_are_refused():
     ]:
         with pytest.raises(ParameterError, match=words):
             standards.observability("HD 293396", "subaru", NIGHT, **options)
+    with pytest.raises(ParameterError, match="star has 2 positions; one is needed"):
+        standards.observability(SkyCoord([1, 2], [3, 4], unit="deg"), "subaru", NIGHT)
 
 
 def test_unknown_site_gets_a_suggestion():

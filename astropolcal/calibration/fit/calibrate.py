@@ -121,15 +121,15 @@ def calibrate(
         differences, of tables without a column ``hwp`` single ones, and of single beams the
         intensity.
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
-        Noise of the data, which sets their weights and the scale of all errors. None: one level for
-        all data, from the residuals (the default, as the errors of real tables are rarely
-        complete). ``"wavelength"``: one level for each wavelength of each dataset, from the
-        residuals, with the fit repeated until both agree. ``"errors"``: the errors of the tables.
-        Or the noise itself, its standard deviation as one value, one per wavelength or one per
-        datum.
+        Noise of the data, which sets their weights, and with ``errors="white"`` the scale of all
+        errors. None: one level for all data, from the residuals (the default, as the errors of real
+        tables are rarely complete). ``"wavelength"``: one level for each wavelength of each
+        dataset, from the residuals, with the fit repeated until both agree. ``"errors"``: the
+        errors of the tables. Or the noise itself, its standard deviation as one value, one per
+        wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others. They have no priors but those of what they follow.
-    own : sequence of str, or dict of str to sequence
+    own : str or sequence of str, or dict of str to sequence
         Parameters, ``"optic.parameter"``, with a value of their own in each dataset; in a dict with
         the group of each dataset, such as its night, in which they have the same. All others are
         shared. In all groups but the first the name of the group is added to that of the optic. The
@@ -151,7 +151,7 @@ def calibrate(
         from the model count less. It sets the noise of each datum, so ``weights`` counts for the
         first fit only. Errors of parameters allow for weights that follow the residuals; a profile,
         a bootstrap and samples take them as known, and may be a third narrower.
-    fix : dict of str to `~astropy.units.Quantity` or None, or sequence of str, optional
+    fix : str or sequence of str, or dict of str to `~astropy.units.Quantity` or None, optional
         Parameters to hold, ``"optic.parameter"``, at a value or (None, or a name alone) at
         that of the chain: another way to choose a gauge.
     instrument : str, optional
@@ -196,14 +196,16 @@ def calibrate(
         check_choice(name, value, _CHOICES[name], FitError)
     search = strategy != "two-step" if search is None else search
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
-    chain = chain if fix is None else _fixed(chain, fix)
+    if not isinstance(fix, Mapping):
+        fix = dict.fromkeys([fix] if isinstance(fix, str) else fix or ())
+    chain = _fixed(chain, fix) if fix else chain
     copies = {}
     if own:
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
         chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
     how = {"weights": weights, "fitter": fitter, "search": search, "options": options}
-    found = fitted(measurement, chosen, **how, instrument=instrument, held=list(fix or ()))
+    found = fitted(measurement, chosen, **how, instrument=instrument, held=list(fix))
     found.settings |= {"own": copies} if copies else {}
     return found.calibration(cross_validate=cross_validate)
 
@@ -254,6 +256,8 @@ def fitted(
     """Fit a measurement as `calibrate` does; ``held`` are the names of what was fixed for it."""
     started, chosen = time.perf_counter(), DEFAULTS if chosen is None else chosen
     fitter = TRFLSQFitter() if fitter is None else fitter
+    if isinstance(fitter, type) or not callable(fitter):
+        raise FitError(f"fitter = {fitter!r}; allowed are astropy's, such as TRFLSQFitter()")
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
@@ -297,7 +301,6 @@ def _fixed(chain, fix):
     single = isinstance(chain, Model)
     copies = [item.copy() for item in ([chain] if single else chain)]
     table = parameter_table(copies)
-    fix = fix if isinstance(fix, Mapping) else dict.fromkeys([fix] if isinstance(fix, str) else fix)
     for name, value in fix.items():
         if name not in table:
             known, near = ", ".join(table), did_you_mean(name, table)
@@ -305,8 +308,11 @@ def _fixed(chain, fix):
         for parameter in table[name]:
             if value is not None:
                 # every dataset's chain has its own Parameter object of the name
-                number = to_unit(value, parameter.unit, name)
-                parameter.value = np.broadcast_to(number, np.shape(parameter.value)).copy()
+                number, shape = to_unit(value, parameter.unit, name), np.shape(parameter.value)
+                if number.shape not in ((), shape):
+                    words = f" or {shape[0]}, one per wavelength" if shape else ""
+                    raise FitError(f"fix: {name} = {value}; allowed is one value{words}")
+                parameter.value = np.broadcast_to(number, shape).copy()
             parameter.fixed = True
     return copies[0] if single else copies
 

@@ -325,11 +325,10 @@ def two_step(measurement, weighting, fitter, search, options):
     ):
         chains = measurement.put_back() if stages else loose
         step = _step_of(measurement, chains, held, options)
-        if not stages:
-            outcome, weighting = joint(step, weighting, fitter, search)
-        elif step.free.size:
-            outcome, weighting = run(step, weighting, fitter)
-        outcomes.append(outcome)
+        if step.free.size:
+            how = (fitter,) if outcomes else (fitter, search)
+            outcome, weighting = (run if outcomes else joint)(step, weighting, *how)
+            outcomes.append(outcome)
         stages.append(_taken(title, step, measurement))
     return outcomes, weighting, stages
 

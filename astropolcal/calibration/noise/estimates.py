@@ -14,11 +14,12 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
-from astropolcal.exceptions import FitError
+from astropolcal.chain import states_of
+from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.units import angle_to_rad
+from astropolcal.units import angle_to_rad, to_unit
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -164,10 +165,10 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     ----------
     measurement : Measurement
         The measurement.
-    gain : float, optional
-        Electrons per unit of flux. With it the errors of the table, if any, are
-        left aside: the variance of a flux F is F / gain + (read_noise / gain)^2.
-    read_noise : float
+    gain : float or `~astropy.units.Quantity`, optional
+        Electrons per unit of flux, also in electron / adu. With it the errors of the table, if any,
+        are left aside: the variance of a flux F is F / gain + (read_noise / gain)^2.
+    read_noise : float or `~astropy.units.Quantity`
         Standard deviation per beam and frame in electrons, all pixels of the aperture together.
 
     Returns
@@ -177,7 +178,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 
     Raises
     ------
-    FitError
+    FitError, ParameterError
         If the tables give no errors and no gain is given, or the gain or read
         noise is not a possible one.
 
@@ -199,7 +200,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     if gain is None:
         sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
-        gain, read_noise = _number("gain", gain, False), _number("read_noise", read_noise, True)
+        gain = _number("gain", gain, u.electron / u.adu, False)
+        read_noise = _number("read_noise", read_noise, u.electron, True)
         parts = []
         for part in measurement.datasets:
             beams = part.observations.flux_right, part.observations.flux_left
@@ -220,10 +222,13 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     return _of_data(measurement, sigma.copy(), np.inf, "errors", words)
 
 
-def _number(name, value, closed):
-    if not (np.isfinite(value) and (value > 0 or (closed and value == 0))):
-        raise FitError(f"{name} = {value}; allowed are numbers {'from' if closed else 'above'} 0")
-    return float(value)
+def _number(name, value, unit, closed):
+    # a plain number is one in the unit
+    number = to_unit(value, unit if str(getattr(value, "unit", "")) else None, name)
+    if number.ndim or not (np.isfinite(number) and (number > 0 or (closed and number == 0))):
+        what = f"one number {'from' if closed else 'above'} 0"
+        raise FitError(f"{name} = {value}; allowed is {what}")
+    return float(number)
 
 
 # ---- replicates ---------------------------------------------------------------------------
@@ -233,8 +238,8 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     r"""
     Return the noise from the scatter among data taken at the same settings.
 
-    Same are all stages of the chain, modulo 180 deg, and the state of a
-    modulator (column ``flc_state``). The scatter is that of the *residuals*, so
+    Same are all stages of the chain, modulo 180 deg, the states that it knows, that of a modulator
+    (column ``flc_state``), and the beam. The scatter is that of the *residuals*, so
     that differences of position within ``tolerance`` count to second order only:
     with :math:`\bar r` the mean residual of a group of replicates,
     :math:`\sigma^2 = \sum (r - \bar r)^2 / \sum (m - 1)` over groups of m
@@ -248,7 +253,7 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     vector : array_like, optional
         Parameters for the residuals, by default the current ones; shape (n_free,).
     tolerance : `~astropy.units.Quantity`
-        Largest difference of a position among replicates.
+        Largest difference of a position among replicates, 0 to 90 deg.
 
     Returns
     -------
@@ -260,6 +265,8 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     ------
     FitError
         If nothing was repeated.
+    ParameterError
+        If the tolerance or the number of parameters is not a possible one.
 
     Examples
     --------
@@ -274,10 +281,12 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     >>> int(noise_from_replicates(Measurement(charis.chain(), observations)).dof[0])
     8
     """
-    residuals = measurement.residuals(vector)
-    limit = float(angle_to_rad(tolerance, "tolerance"))
-    datasets = zip(measurement.datasets, measurement.segments, strict=True)
-    parts = [_replicate_scatter(part, residuals[where], limit) for part, where in datasets]
+    residuals = measurement.residuals(_vector(measurement, vector))
+    limit = angle_to_rad(tolerance, "tolerance")
+    if limit.ndim or not 0 <= limit <= np.pi / 2:
+        raise ParameterError(f"tolerance = {tolerance}; allowed is one angle from 0 to 90 deg")
+    datasets = zip(measurement.datasets, measurement.chains, measurement.segments, strict=True)
+    parts = [_replicate_scatter(part, c, residuals[where], limit) for part, c, where in datasets]
     if not any(freedom.any() for _, freedom in parts):
         names = ", ".join(part.observations.name for part in measurement.datasets)
         raise FitError(
@@ -291,11 +300,11 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     return _of_deviations(measurement, parts, "replicates", words)
 
 
-def _replicate_scatter(part, residuals, tolerance):
+def _replicate_scatter(part, chain, residuals, tolerance):
     """Return deviations from the mean of the same settings, and freedom at each wavelength."""
     dense, present = np.zeros(part.valid.shape), part.valid.T.astype(float)
     dense[part.valid] = residuals
-    columns = [_states(part.observations)[part.frames[:, 0]]]
+    columns = [*_states(part.observations, chain)[part.frames.T]]
     columns += [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
     # a number for the settings of every group of frames
     setting = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
@@ -306,10 +315,26 @@ def _replicate_scatter(part, residuals, tolerance):
     return off, (present.sum(axis=0) - (count > 0).sum(axis=0)).astype(int)
 
 
-def _states(observations):
-    """Return the number of the state of a modulator of every frame, zero without one."""
-    column = observations.frames.columns.get("flc_state", np.zeros(observations.n_frames))
-    return np.unique(np.asarray(column), return_inverse=True)[1]
+def _states(observations, chain):
+    """Number what the states that the chain knows, of a modulator, and the beam are together."""
+    columns = observations.frames.columns
+    names = sorted({"flc_state", "beam", *states_of(chain)} & set(columns))
+    # states are known as text
+    told = [[str(value).strip() for value in columns[name]] for name in names]
+    told = np.array([*told, [""] * observations.n_frames])
+    return np.unique(told, axis=1, return_inverse=True)[1].ravel()
+
+
+def _vector(measurement, vector):
+    """Return a vector of free parameters, by default the current ones; refuse one of others."""
+    if vector is None:
+        return measurement.vector()
+    vector, size = to_unit(vector, None, "vector"), measurement.free.size
+    if vector.shape != (size,):
+        raise ParameterError(
+            f"vector of shape {vector.shape}; allowed is ({size},), one number a free parameter"
+        )
+    return vector
 
 
 def equal_axes(angle, tolerance):
@@ -389,8 +414,9 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     """
     check_choice("null_model", null_model, _NULL_MODELS, FitError)
     _need_two_beams(measurement, "the null channel")
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
+    vector = _vector(measurement, vector)
+    datasets = zip(measurement.datasets, measurement.chains, strict=True)
+    parts = [_null_scatter(part, chain, vector, null_model) for part, chain in datasets]
     if not any(freedom.any() for _, freedom in parts):
         raise FitError(
             f"the null channel has no degree of freedom left by the {null_model} null model; "
@@ -411,7 +437,7 @@ def _need_two_beams(measurement, what):
             raise FitError(f"{name}: {what} needs two beams per frame, it has one")
 
 
-def _null_scatter(part, vector, null_model):
+def _null_scatter(part, chain, vector, null_model):
     """Return the null's residuals, as noise of a datum, and freedom at each wavelength."""
     obs = part.observations
     right, left = obs.flux_right, obs.flux_left
@@ -420,7 +446,7 @@ def _null_scatter(part, vector, null_model):
     # (n_pairs, n_wavelengths)
     null = 0.5 * ((right - left) / (right + left) - predicted)[pairs].sum(axis=1)
     signal = 0.5 * (predicted[pairs[:, 0]] - predicted[pairs[:, 1]])
-    design = _null_design(obs, pairs[:, 0], null_model)
+    design = _null_design(obs, chain, pairs[:, 0], null_model)
     off, dof = np.zeros(null.shape), np.zeros(obs.n_bins, dtype=int)
     # z is a mean of two frames: its variance is half that of a frame, as is that of a double
     # difference; an observable of m frames has 2 / m of the null's
@@ -447,9 +473,9 @@ def _predicted_differences(part, vector):
     return result
 
 
-def _null_design(observations, frames, null_model):
+def _null_design(observations, chain, frames, null_model):
     angle = angle_or_zero(observations, "derotator")[frames]
-    state = _states(observations)[frames]
+    state = _states(observations, chain)[frames]
     if null_model == "constant":
         curves, setting = np.ones((1, len(angle))), equal_axes(angle, _SAME_DEROTATOR)
     else:
@@ -519,7 +545,7 @@ def noise_from_roughness(measurement, vector=None):
     ('roughness', True)
     """
     _need_two_beams(measurement, "roughness of differences")
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
+    vector = _vector(measurement, vector)
     sigmas, freedom = [], []
     for part in measurement.datasets:
         obs = part.observations

@@ -437,10 +437,13 @@ def weighting_of(calibration):
         if noise == GIVEN and settings.get("loss", "linear") != "linear":
             noise = robust_weighting(measurement, settings["loss"])
         elif noise == GIVEN:
-            # as far as `describe` has kept it
+            # as `describe` has kept it
             kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
             sizes = [row.size for row in data_by_wavelength(measurement)[2]]
-            noise = Weighting(GIVEN, np.repeat(np.array(kept, dtype=float) / 100, sizes))
+            sigma = np.repeat(np.array(kept, dtype=float) / 100, sizes)
+            for part, where in zip(settings["noise"], measurement.segments, strict=True):
+                sigma[where] = part.get("sigma_of_data", sigma[where])
+            noise = Weighting(GIVEN, sigma)
         measurement.weighting = noise_of(measurement, noise)
     return measurement.weighting
 
@@ -457,16 +460,24 @@ def _told(measurement, weighting):
 
 
 def describe(measurement):
-    """Return the noise of each dataset and wavelength as plain lists, for the settings."""
+    """Return the noise of each dataset and wavelength as plain lists, for the settings.
+
+    Where a noise given differs within a wavelength, that of every datum is an array beside them.
+    """
     numbers, wavelength, rows = data_by_wavelength(measurement)
-    sizes = [rms(measurement.weighting.sigma[row]) for row in rows]
+    weighting = measurement.weighting
+    sizes = [rms(weighting.sigma[row]) for row in rows]
     nm = wavelength.to_value(u.nm)
+    # that of a robust fit follows from its residuals
+    given = weighting.choice == GIVEN and weighting.follows is None
+    uneven = given and any(np.ptp(weighting.sigma[row]) > 0 for row in rows if row.size)
     return [
         {
             "dataset": part.observations.name,
             "wavelength_nm": [float(w) for w in nm[numbers == i]],
             "sigma_percent": [100 * sizes[j] for j in np.flatnonzero(numbers == i)],
         }
+        | ({"sigma_of_data": weighting.sigma[measurement.segments[i]]} if uneven else {})
         for i, part in enumerate(measurement.datasets)
     ]
 

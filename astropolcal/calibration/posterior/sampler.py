@@ -29,7 +29,7 @@ from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement.parameters import told_prior
 from astropolcal.progress import in_one_thread, shown, steps
 from astropolcal.units import check_seed
-from astropolcal.words import check_type, did_you_mean
+from astropolcal.words import check_type, did_you_mean, is_whole
 
 __all__ = ["LogPosterior", "sample"]
 
@@ -312,11 +312,15 @@ def move_names(moves):
     """Return the name of each move, and its share."""
     weighted = moves if isinstance(moves, list) else [moves]
     parts = [move if isinstance(move, tuple) else (move, 1.0) for move in weighted]
+    for move, *_ in parts:
+        if not hasattr(move, "propose"):
+            allowed = "allowed are moves of emcee, such as emcee.moves.StretchMove()"
+            raise FitError(f"moves: {move!r}; {allowed}", argument="moves")
     return [[type(move).__name__, float(weight)] for move, weight in parts]
 
 
 def refuse_biased(moves, version):
-    """Raise FitError if emcee samples wrongly with a move."""
+    """Raise FitError if emcee samples wrongly with a move, or it is none."""
     numbers = tuple(int(part) for part in version.split(".")[:3] if part.isdigit())
     if "DESnookerMove" in dict(move_names(moves)) and numbers <= _BIASED_SNOOKER:
         raise FitError(
@@ -500,24 +504,20 @@ def _narrow(calibration, log_posterior):
 
 def _check(n, n_walkers, n_steps, thin, every, burn_in):
     for name, value in (("n_steps", n_steps), ("thin", thin), ("checkpoint_every", every)):
-        if not _is_whole(value) or value < 1:
+        if not is_whole(value) or value < 1:
             raise _refused(name, value, "allowed are whole numbers from 1 up")
     if n_steps < 2 * thin:
         kept = f", as one in {thin} is kept" if thin > 1 else ""
         raise _refused("n_steps", n_steps, f"allowed are whole numbers from {2 * thin} up{kept}")
     fewest = max(2 * n, 4)
-    if not _is_whole(n_walkers) or n_walkers < fewest:
+    if not is_whole(n_walkers) or n_walkers < fewest:
         reason = f"{n} parameters need a whole number from {fewest} up"
         raise _refused("n_walkers", n_walkers, reason)
     # two kept steps at least must be left, for a standard deviation
     most = (n_steps // thin - 2) * thin
-    if burn_in is not None and (not _is_whole(burn_in) or not 0 <= burn_in <= most):
+    if burn_in is not None and (not is_whole(burn_in) or not 0 <= burn_in <= most):
         allowed = f"{n_steps} steps allow whole numbers from 0 to {most}"
         raise _refused("burn_in", burn_in, allowed)
-
-
-def _is_whole(value):
-    return isinstance(value, (int, np.integer))
 
 
 def _refused(name, value, reason):

@@ -490,7 +490,8 @@ class Posterior:
             If there is no such parameter or q is out of range.
         """
         i = self.index(name)
-        if np.any((np.asarray(q) < 0) | (np.asarray(q) > 1)):
+        # written so that NaN is refused, too
+        if not np.all((np.asarray(q) >= 0) & (np.asarray(q) <= 1)):
             raise ParameterError(f"q = {q}; allowed are numbers from 0 to 1")
         value = np.quantile(self.chain[self.burn_in :, :, i], q)
         return value if self.units[i] is None else value * self.units[i]

@@ -354,7 +354,7 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
         return white_covariance(measurement, whitened, weighting)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
     slack = _inward(measurement, whitened, scatter)[-1] if whitened.held.any() else None
-    return sandwich(measurement, whitened, weighting, middle, slack)
+    return sandwich(measurement, whitened, weighting, middle, slack, has_scatter=True)
 
 
 def _middle(scatter, level, data, priors):
@@ -376,13 +376,15 @@ def widening(problem, with_scatter):
     measurement, whitened, weighting = problem.measurement, problem.around(), problem.weighting
     scatter = Scatter(measurement, weighting, whitened) if with_scatter else None
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
-    stated = sandwich(measurement, whitened, weighting, middle).stds * measurement.free.factors()
+    known = scatter is not None and scatter.is_known
+    found = sandwich(measurement, whitened, weighting, middle, has_scatter=known)
+    stated = found.stds * measurement.free.factors()
     plain = weighting.level * np.sqrt(np.diag(whitened.covariance()))
     with np.errstate(invalid="ignore", divide="ignore"):
         times = stated / plain
     if whitened.held.any():
         held, columns, *_ = _inward(measurement, whitened, scatter)
-        times[held] = _levels(measurement, scatter, columns) / weighting.level
+        times[held] = _levels(measurement, whitened, scatter, columns) / weighting.level
     return np.where(np.isfinite(times) & (times > 0), times, 1.0)
 
 
@@ -396,7 +398,7 @@ def white_covariance(measurement, whitened, weighting):
     return Covariance(free.names, free.units, unknown, null=null / free.factors())
 
 
-def sandwich(measurement, whitened, weighting, middle, slack=None):
+def sandwich(measurement, whitened, weighting, middle, slack=None, *, has_scatter=False):
     """Return the covariance from that of the pulls on the determined directions.
 
     ``slack`` has further directions, each one standard error long, in the steps of the problem.
@@ -408,7 +410,8 @@ def sandwich(measurement, whitened, weighting, middle, slack=None):
         back = (axes / np.maximum(stiff, _STIFF)) @ axes.T
         middle = back @ middle @ back
     variances, vectors = np.linalg.eigh(middle)
-    stds = np.sqrt(variances.clip(0)) * _of_few(measurement, whitened, weighting)
+    few = _of_few(measurement, whitened, weighting.from_residuals or has_scatter)
+    stds = np.sqrt(variances.clip(0)) * few
     # with fewer groups than directions a sum of outer products is singular
     stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
     rows = (stds[:, None] * vectors.T) @ whitened.factor()
@@ -425,16 +428,17 @@ def sandwich(measurement, whitened, weighting, middle, slack=None):
     return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
-def _of_few(measurement, whitened, weighting):
+def _of_few(measurement, whitened, from_residuals, more=0):
     """Return by how much errors grow where few degrees of freedom tell the noise.
 
-    By the quantiles of Student's t, for 95 of 100 cases within two errors if noise is even.
+    By the quantiles of Student's t, for 95 of 100 cases within two errors if noise is even;
+    ``more`` are directions besides those that the fit took.
     """
     # a calibration is read where there is no scipy
     from scipy.special import stdtrit
 
-    freedom = measurement.n_data - whitened.n_taken
-    if not weighting.from_residuals or freedom <= 0:
+    freedom = measurement.n_data - whitened.n_taken - more
+    if not from_residuals or freedom <= 0:
         return 1.0
     return max(1.0, stdtrit(freedom, _NORMAL[0]) / _NORMAL[1] / _NO_MATTER)
 
@@ -479,7 +483,9 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     n, level = measurement.n_data, measurement.weighting.level
     # columns of an orthonormal basis, and the root of how these are pulled
     variances, axes = np.linalg.eigh(_middle(scatter, level, *np.split(columns @ inverse, [n])))
-    root = inverse @ axes * np.sqrt(variances.clip(0))
+    root = (
+        inverse @ axes * np.sqrt(variances.clip(0)) * _few_at_bounds(measurement, whitened, scatter)
+    )
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
         i = names.index(name)
@@ -490,11 +496,19 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     return {"inward": inward, "released": released}
 
 
-def _levels(measurement, scatter, columns):
+def _few_at_bounds(measurement, whitened, scatter):
+    """Return `_of_few` of what is released from its bounds."""
+    known = scatter is not None and scatter.is_known
+    told = known or measurement.weighting.from_residuals
+    return _of_few(measurement, whitened, told, more=int(whitened.held.sum()))
+
+
+def _levels(measurement, whitened, scatter, columns):
     """Return by how much what is held is pulled along its own derivatives, over their length."""
     level, size = measurement.weighting.level, np.linalg.norm(columns, axis=0)
     pulled = np.diag(_middle(scatter, level, *np.split(columns, [measurement.n_data])))
-    return np.where(size > 0, np.sqrt(pulled) / np.where(size > 0, size, 1.0), level)
+    along = np.where(size > 0, np.sqrt(pulled) / np.where(size > 0, size, 1.0), level)
+    return along * _few_at_bounds(measurement, whitened, scatter)
 
 
 def _inward(measurement, whitened, scatter):
@@ -523,7 +537,7 @@ def _inward(measurement, whitened, scatter):
     # the triangular factor is as good as all rows
     rest = residual - basis @ (basis.T @ residual)
     square = np.linalg.qr(np.column_stack([columns * inward, rest]), mode="r")
-    levels = _levels(measurement, scatter, columns)
+    levels = _levels(measurement, whitened, scatter, columns)
     steps = [_rises(square, level, i, widths[i]) for i, level in enumerate(levels)]
     # what the data do not limit is anywhere up to the opposite bound
     far = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)

@@ -37,7 +37,7 @@ from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
 from astropolcal.measurement.parameters import declared_step
 from astropolcal.progress import counting, in_one_thread, shown
 from astropolcal.units import check_seed, to_unit
-from astropolcal.words import check_choice, did_you_mean
+from astropolcal.words import check_choice, did_you_mean, is_whole
 
 __all__ = ["Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
@@ -184,7 +184,7 @@ def profile(calibration, name, values=None, n=21):
     ParameterError
         If there is no such parameter, or a value has the wrong unit or is outside the bounds.
     FitError
-        If ``n`` is below 3.
+        If ``n`` is not a whole number from 3 up.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
 
@@ -207,8 +207,8 @@ def profile(calibration, name, values=None, n=21):
         known = ", ".join(covariance.names[:8]) + (", ..." if len(covariance.names) > 8 else "")
         hint = did_you_mean(name, covariance.names)
         raise ParameterError(f"no free parameter {name!r}; there are {known}{hint}")
-    if n < 3:
-        raise FitError(f"n = {n}; a profile needs at least 3 values")
+    if not is_whole(n) or n < 3:
+        raise FitError(f"n = {n}; a profile needs a whole number of values, at least 3")
     index = covariance.names.index(name)
     refit = problem_of(calibration)
     unit = covariance.units[index]
@@ -360,7 +360,7 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     Raises
     ------
     FitError
-        If the block is unknown, ``n`` is below 2, a dataset has fewer than
+        If the block is unknown, ``n`` is not a whole number from 2 up, a dataset has fewer than
         three blocks, or hardly any resample can be fitted.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
@@ -383,8 +383,8 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=False):
     >>> bootstrap(cal, n=10, seed=1)
     <Resampled: 10 bootstrap resamples of 6 derotator blocks, 49 parameters>
     """
-    if n < 2:
-        raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
+    if not is_whole(n) or n < 2:
+        raise FitError(f"n = {n}; a bootstrap needs a whole number of resamples, at least 2")
     refit = problem_of(calibration)
     measurement, labels = refit.measurement, labels_of(refit.measurement, block)
     # for each dataset the block of each datum
@@ -639,7 +639,8 @@ def robust_covariance(calibration, groups="derotator"):
     prior = problem.weighting.level * whitened.along(whitened.prior_rows)
     # of one array with itself: a product of two copies is symmetric to rounding only
     pulls = np.array(pulls)
-    return sandwich(measurement, whitened, problem.weighting, pulls.T @ pulls + prior.T @ prior)
+    middle = pulls.T @ pulls + prior.T @ prior
+    return sandwich(measurement, whitened, problem.weighting, middle, has_scatter=True)
 
 
 # ---- as published --------------------------------------------------------------------------

@@ -33,6 +33,8 @@ KINDS = ("optic", "parameter", "bound", "detector", "source", "discrete")
 # the most that a kind may be: beyond it is no perturbation
 _LIMITS = {"retardance": np.pi, "rotation": np.pi / 4, "diattenuation": 3.0, "depolarization": 3.0}
 _LIMIT = 0.5
+# the dependence of what is in one of several runs, each of which is asked for
+OWN_RUN = "dataset:own"
 # kinds that are several generators; an error of an orientation is a rotation and one back
 _SEVERAL = {
     "diattenuation": ("diattenuation_h", "diattenuation_d"),
@@ -447,6 +449,19 @@ class Effect:
         others = dict.fromkeys(o.name for found in every for o in found if o.name not in first)
         return [self, *(self.at(name) for name in others)]
 
+    def per_run(self, runs):
+        """Return itself, or once for each run in which it may differ: of two only the second."""
+        if self.dependence != OWN_RUN:
+            return [self]
+        return [
+            self.changed(
+                name=f"{self.name}/dataset:{run}",
+                title=f'{self.title} in "{run}"',
+                dependence=f"dataset:{run}",
+            )
+            for run in (runs[1:] if len(runs) == 2 else runs)
+        ]
+
     def applies(self, chains):
         """Return whether one of the chains, one per dataset, has the place for this effect."""
         return any(self.applies_to(self.roles(chain)) for chain in chains)
@@ -479,6 +494,10 @@ class Effect:
         if place is None or (self.when is not None and not self.when(roles)):
             return False
         what, stage, *_ = (*split_run(self._dependence(roles))[0].split(":"), "")
+        if self._dependence(roles) == OWN_RUN:
+            return False
+        if what in ("direction", "move") and f"{stage}_{what}" not in optics.COORDINATES:
+            return False
         needed = what in ("harmonic", "direction", "move")
         return not needed or any(o.stage == stage for o in roles.leaves)
 
@@ -488,7 +507,7 @@ class Effect:
     def _dependence(self, roles):
         """Return the dependence, with the name of the stage of the effect's own optic."""
         text = split_run(self.dependence)[0]
-        if ":own" not in text:
+        if ":own" not in text or self.dependence == OWN_RUN:
             return self.dependence
         stage = f":{self.where.anchor(roles).stage}"
         return text.replace(":own", stage) + self.dependence.removeprefix(text)

@@ -10,7 +10,7 @@ import astropy.units as u
 from astropolcal import optics
 from astropolcal.gap.cells import DETECTED
 from astropolcal.gap.effects import _laws as laws
-from astropolcal.gap.effects.effect import DETECTOR, NUMBER, Effect
+from astropolcal.gap.effects.effect import DETECTOR, NUMBER, OWN_RUN, Effect
 from astropolcal.gap.effects.where import Where
 
 __all__ = []
@@ -70,6 +70,20 @@ def _encoder(name, n, place, optic, like, shows):
     )  # fmt: skip
 
 
+def _angle_off(name, optic, place, title, dependence, shows):
+    """Return an offset of the angle of a stage in some of the frames."""
+    return Effect(
+        name, title.format(optic), place, "orientation", dependence, NUMBER,
+        shows=shows.format(optic), reference=_HOLSTEIN, words=f"stage of the {optic}",
+        category="parameter", **_size(0.1, 5, u.deg),
+    )  # fmt: skip
+
+
+_BACKLASH = (
+    "backlash of the {}", "direction:own", "opposite offsets of the {} after moves to either side",
+)  # fmt: skip
+
+
 def _transmission(name, n, title):
     """Return a gain of both beams that changes as the plate turns."""
     return _effect(
@@ -114,6 +128,7 @@ _PLATE_EFFECTS = [
         _PLATE, "diattenuation_h", optics.Diattenuator(), "diattenuation", _size(0.003, 0.1),
         "harmonic 2 of the plate angle in sums and in differences of unpolarized light", _BRYAN,
     ),
+    _angle_off("hwp_backlash", "half-wave plate", _PLATE, *_BACKLASH),
     _transmission(
         "hwp_transmission", 2, "transmission of the half-wave plate that changes twice a turn",
     ),
@@ -195,6 +210,7 @@ _DEROTATOR_EFFECTS = [
         )
         for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)
     ),
+    _angle_off("derotator_backlash", "derotator", _DEROTATOR, *_BACKLASH),
     # for internal sources the derotator is static during an exposure: bench data would tie the
     # lag to a rate that they do not have
     _effect(
@@ -555,3 +571,14 @@ LIBRARY = (
     _PLATE_EFFECTS + _DEROTATOR_EFFECTS + _RELAY_EFFECTS + _SOURCE_EFFECTS + _SKY_EFFECTS
     + _DETECTOR_EFFECTS + _HELD_EFFECTS + _ALTERNATIVES
 )  # fmt: skip
+
+#: What may differ between several runs, in each of which it is asked for.
+OF_RUNS = [
+    _angle_off(
+        f"{name}_zero", optic, place, "zero of the angle of the {}", OWN_RUN,
+        "all frames of one run, as an offset of the {}",
+    )
+    for name, optic, place in (
+        ("hwp", "half-wave plate", _PLATE), ("derotator", "derotator", _DEROTATOR),
+    )
+]  # fmt: skip

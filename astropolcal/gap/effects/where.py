@@ -224,7 +224,7 @@ class Roles:
         return all(is_held(getattr(o, key)) for o in self._in_front() for key in o.param_names)
 
 
-def adapted(effects, chains):
+def adapted(effects, chains, runs=()):
     """
     Return the effects of a library that chains have a place for, one for each optic of a kind.
 
@@ -234,6 +234,8 @@ def adapted(effects, chains):
         The library.
     chains : sequence
         One per dataset.
+    runs : sequence of str
+        Names of the datasets, where several are of one kind of source.
 
     Returns
     -------
@@ -253,7 +255,8 @@ def adapted(effects, chains):
     ['m3_diattenuation', 'm3_diattenuation:m4']
     """
     chains = list(chains)
-    found = [one for effect in effects for one in effect.per_optic(chains)]
+    found = [own for effect in effects for own in effect.per_run(runs)]
+    found = [one for effect in found for one in effect.per_optic(chains)]
     found = [one for one in found if one.applies(chains)]
     every = [Roles(chain) for chain in chains]
     plates = [o for roles in every for o in roles.all("plate")]
