@@ -255,6 +255,7 @@ def _found(entry):
         return f"The model lacks one effect: {entry['title']} ({chance})."
     cell, places = Cell(**entry["cell"]), _places(_alike(entry), "in")
     begin = "The detector shows" if cell.place == "detector" else f"Something {places} causes"
+    begin = "The data show another" if cell.kind == "brightness" else begin
     words = f"{_kind_words(cell)}{_when(cell.dependence)}"
     return f"{begin} {words} ({chance}); no name is known for it."
 
@@ -412,6 +413,16 @@ def where_words(entry, of=None):
     return f"{whole}{verb} {entry['detail']}"
 
 
+def is_single(content):
+    """Return whether all data are intensities of a single beam."""
+    return content["accuracy_before"]["observable"] == "intensity"
+
+
+def unit(content):
+    """Return in percent of what a gap is."""
+    return f"percent of {'the mean of their group' if is_single(content) else 'polarization'}"
+
+
 def _how_large(content):
     them = "it" if len(content["causes"]) == 1 else "them"
     if _is_one(content):
@@ -424,15 +435,16 @@ def _how_large(content):
         return f"{percent(before)} %{more}{worse} (noise {percent(noise)} %)"
 
     keys, double = ("before_percent", "after_percent"), content["double_difference"]
-    single = content["accuracy_before"]["observable"] == "intensity"
-    text = f"In {'intensities' if single else 'single differences'} the model is off by "
+    text = (
+        f"In {'intensities' if is_single(content) else 'single differences'} the model is off by "
+    )
     if double:
         text = "In double differences, which calibrate fits, the model is off by "
         text += f"{gaps(*(double[key] for key in keys), double['noise_percent'])}; "
         text += "in single differences by "
     text += gaps(*(content[f"gap_{key}"] for key in keys), content["noise_floor_percent"])
     frames = "frames left out of the fit" if content["cross_validated"] else "the frames of the fit"
-    text += f": percent of polarization, {'the frames' if content['exchanged'] else frames}."
+    text += f": {unit(content)}, {'the frames' if content['exchanged'] else frames}."
     if not content["converged"]:
         text += " The nominal fit did not converge; its last steps gained less than 2 %."
     if content["verdict"] == "none":

@@ -68,7 +68,8 @@ class Cell:
         ``"after:OPTIC"`` (the frame that is static) or ``"detector"``.
     kind : str
         Kind of a `~astropolcal.optics.Perturbation`, or ``"background"``,
-        ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
+        ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``, or
+        ``"brightness"``, which a gain is where there is one beam.
     dependence : str
         As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of
         several runs only with ``"/dataset:NAME"`` after it.
@@ -121,6 +122,7 @@ _KINDS = {
     "depolarization_d": "depolarization at 45 deg to the axes",
     "depolarization_circular": "depolarization of circular light",
     "gain": "gain of one beam against the other",
+    "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
     "background": "background in both beams",
@@ -273,7 +275,7 @@ def dependences(problem):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"state:{stage}" for stage in given if "=" in stage]
-    names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
+    names += [f"{what}:{s}" for s in stages for what in _MOVED]
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
     n = min(d.observations.n_frames for d in problem.datasets)
@@ -477,7 +479,8 @@ class Probes:
                         self.bends.setdefault((place, kind), {})[i] = bend
             right, left = sweep.fluxes
             gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
-            found.setdefault(("detector", "gain"), {})[i] = gain * channel.valid
+            kind = "gain" if channel.groups is None else "brightness"
+            found.setdefault(("detector", kind), {})[i] = gain * channel.valid
             for kind, slope in self._at_detector(i, channel, sweep):
                 found.setdefault(("detector", kind), {})[i] = slope * channel.valid
         self.bends = {

@@ -54,6 +54,13 @@ class Channels:
             self.valid &= ~(self.variance[1] > _FAINT**-2)
             self.variance[0] = 1.0
         self.observed = np.where(self.valid, self.observed, 0.0)
+        #: What a residual counts in a gap: a logarithm of an intensity as its share of the mean of
+        #: the group, lest frames that are nearly dark count most.
+        self.level = np.ones(self.shape[1:])
+        if obs.single_beam:
+            flux = np.where(self.valid, np.exp(self.observed[1]), 0.0)
+            mean = _GroupLamp(self.groups).mean(flux, self.valid * 1.0)
+            self.level = flux / np.where(mean > 0, mean, 1.0)
         #: Whether the table states errors.
         self.stated = bool(np.any(np.isfinite(self.variance) & (self.variance > 0) & self.valid))
         self.sequence = obs.position("sequence")
@@ -135,11 +142,19 @@ class Channels:
         return out
 
     def gap(self, residual):
-        """Return what of residuals (2, W, F) is a gap: differences, or sums less their lamp."""
+        """Return what of residuals (2, W, F) is a gap: differences, or intensities less their lamp.
+
+        Those are shares of the mean of their group.
+        """
         if self.groups is None:
             return residual[0]
         level, weight = residual[1], self.valid / np.square(self.sigma[1])
-        return np.where(self.valid, level - self.lamp.mean(level, weight), 0.0)
+        return np.where(self.valid, level - self.lamp.mean(level, weight), 0.0) * self.level
+
+    @property
+    def noise(self):
+        """Noise of what is a gap, (W, F)."""
+        return self.sigma[self.told] * self.level
 
     def _calm(self, sums):
         """Take the flicker out of sums in units of their noise, (..., W, F), where they are."""

@@ -92,8 +92,9 @@ class Course:
         one, both = (_best(gained) for gained in self._of_steps(steps))
         (k,), (i, j) = one[1:], sorted(both[1:])
         word = f"from {one[0]}frame {names[k]}{of[run[k]]} on"
-        if k and run[k - 1] != run[k]:
-            word = f'in "{observations[run[k]].name}"'
+        if not k or run[k - 1] != run[k]:
+            # all of a single run is no shape
+            word = f'in "{observations[run[k]].name}"' * (len(sizes) > 1)
         known = [(word, steps[:, [k]])]
         ends = [f"{names[i]}{of[run[i]]}", f"{names[j]}{of[run[j]]}"]
         if run[i] == run[j]:
@@ -147,6 +148,14 @@ class Course:
         gram, target = self._normal(courses)
         gained = target @ np.linalg.lstsq(gram, target, rcond=_ABSORBED)[0] - len(target)
         return gained / max(self.lowered - self.freedom, 1.0)
+
+    def is_constant(self, temper):
+        """Return whether one size for all frames, with a law as free, does as well (95 %)."""
+        ones = [np.ones((1, 1, len(wave))) for wave in self.wave]
+        (gram,), (target,) = self.reduced.normal(ones)
+        more = self.lowered - target @ np.linalg.lstsq(gram, target)[0]
+        freer = max(self.freedom - len(target), 1.0)
+        return more / temper <= freer + self.chosen + 2 * np.sqrt(2 * freer)
 
     @property
     def chosen(self):
@@ -206,7 +215,8 @@ def courses(model, base):
 
     ``base`` is the model without them. Derivatives are those at the model, and where its causes are
     so large that the base is not what they are to first order, also at the base, where a course may
-    do better: many causes that are not the true ones are far from where it is.
+    do better: many causes that are not the true ones are far from where it is. One that does no
+    better than a constant is none.
     """
     names = [name for name in model.added if name not in base.added]
     without = model.without(names)
@@ -220,6 +230,8 @@ def courses(model, base):
     temper *= 1 + (model.alike - 1) * temper / large
     best = {}
     for one, without in found:
+        if one.is_constant(temper):
+            continue
         # to first order, as the courses are
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
         freer = max(one.freedom - freedom, 1.0)
@@ -277,7 +289,7 @@ def _of_one_beam(probes):
     problem, found = probes.problem, {}
     for i, slope in probes.slopes.get(("detector", "gain"), {}).items():
         channel = problem.channels[i]
-        for sign, beam in ((1, "right"), (-1, "left")) if channel.groups is None else ():
+        for sign, beam in ((1, "right"), (-1, "left")):
             both = np.stack([slope[0], slope[1] + sign * channel.valid]) / 2
             found.setdefault(("detector", f"gain_of_{beam}_beam"), {})[i] = both
     return found

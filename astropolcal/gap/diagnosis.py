@@ -29,7 +29,7 @@ from astropolcal.gap.frames import (
     unknown_angles,
     without_frames,
 )
-from astropolcal.gap.model import Model, nominal_model, starting_model
+from astropolcal.gap.model import Model, chains_of, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
@@ -185,8 +185,8 @@ class Diagnosis:
 
     @property
     def noise_floor_percent(self):
-        """Noise of a normalized single difference, or a single beam, rms, in percent."""
-        parts = [c.sigma[c.told][c.valid] for c in self.nominal.problem.channels]
+        """Noise of a single difference, or of an intensity over the mean of its group, rms."""
+        parts = [c.noise[c.valid] for c in self.nominal.problem.channels]
         return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     @property
@@ -285,8 +285,8 @@ def diagnose(
     ------
     GapError
         If the nominal fit does not converge, there are too few groups of frames
-        to leave out, an effect is unknown, the same data are given twice, or changes
-        are asked for where no two datasets have the same source.
+        to leave out, an effect is unknown, or is given and has no place in the chains, the same
+        data are given twice, or changes are asked for where no two datasets have the same source.
     ObservationError
         If the observations are not tables of fluxes.
 
@@ -315,11 +315,14 @@ def diagnose(
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)
+    for effect in library if effects != "all" else ():
+        effect.check_for(chains_of(calibration, observations), observations)
     if cross_validate:
         # too few frames are refused before anything is fitted
         frame_groups(observations)
     how = {"cells": cells, "changes": changes, "cross_validate": cross_validate, "nested": nested}
     found = _diagnosed(calibration, observations, library, say, how)
+    found.settings["names"] = [o.name for o in observations]
     found.seconds = time.perf_counter() - started
     return found
 

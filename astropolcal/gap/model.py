@@ -486,10 +486,7 @@ def starting_model(calibration, observations, library, say):
     alternative is followed by its aliases. The fourth says up to or from which frame the model does
     not fit, though it fits all others, where that is so.
     """
-    chains = calibration.chains if isinstance(calibration, Calibration) else calibration
-    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
-    if len(chains) != len(observations):
-        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    chains = chains_of(calibration, observations)
     chains = [_at_data(chain, observations) for chain in _set_apart(chains)]
     # of a calibration too: in other data a wavelength may be in another branch
     made, where = nominal_calibration(chains, observations), ""
@@ -506,6 +503,15 @@ def starting_model(calibration, observations, library, say):
                 return *_with_alternative(*read, given, best, found), where
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, [], where
+
+
+def chains_of(calibration, observations):
+    """Return the chain of each dataset, of a calibration, one for all, or given."""
+    chains = calibration.chains if isinstance(calibration, Calibration) else calibration
+    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    if len(chains) != len(observations):
+        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    return chains
 
 
 def _at_data(chain, observations):
@@ -536,9 +542,8 @@ def _alternatives(chains, observations, made, discrete, say):
     where = ""
     if not settled:
         # or in a part of the run: there is a frame too many, or one was lost
-        *parts, where = _parts(chains, observations, misfit, say)
-        partly = [e.in_run(where) for e in discrete if where and e.may_be_in_part]
-        inside = [one for one in _tried(*parts, partly, say, []) if one[0] < _SETTLED * misfit]
+        some = [e for e in discrete if e.may_be_in_part]
+        inside, parts, where = _in_part(chains, observations, misfit, some, say)
         if inside:
             return inside, (*parts, nominal_calibration(*parts)), where
     if len(observations) > 1 and (not settled or found[0][1] in misread):
@@ -549,27 +554,79 @@ def _alternatives(chains, observations, made, discrete, say):
     return found, asked, where
 
 
-def _parts(chains, observations, misfit, say):
+def _in_part(chains, observations, misfit, effects, say):
     """
-    Return chains and datasets, one of these in two parts, and the name of that which does not fit.
+    Return misfit and effect of alternatives in a part of a run that does not fit, best first.
 
-    The other part is the longest that the model fits with all other datasets, from the first frame
-    on or up to the last. Without such a part they are as they were, and the name is empty.
+    With them, chains and datasets, one of these in two parts, and the name of that which does not
+    fit. Without such a part they are as they were, and the name is empty.
     """
+
+    def tried(*edge):
+        *parts, where = _split(chains, observations, *edge)
+        found = _tried(*parts, [e.in_run(where) for e in effects], say, [])
+        return [one for one in found if one[0] < _SETTLED * misfit], parts, where
+
     say("where the model begins to fail")
+    edge = _edge(chains, observations, misfit)
+    if edge is None:
+        return [], (chains, observations), ""
+    found, parts, where = tried(*edge)
+    if found:
+        i, order, words, good = edge
+        best = nominal_calibration(*_read(found[0][1], *parts))
+        # in double differences a frame without a partner is not seen, and few of many are no misfit
+        sure = _nearer(best.chains[i : i + 2], observations[i], order)
+        again = tried(i, order, words, sure) if sure != good else ([],)
+        found, parts, where = again if again[0] else (found, parts, where)
+    return found, parts, where
+
+
+def _edge(chains, observations, misfit):
+    """
+    Return which dataset fits in part, the order of its frames, and how many of them do.
+
+    These are the most that the model fits with all other datasets, from the first frame on or up to
+    the last. Before their number is where the others are, in words. None without such frames.
+    """
     few_chains, few = thinned(chains, observations, _FEW)
     for i, whole in enumerate(observations):
         forward = np.argsort(whole.position("sequence"), kind="stable")
-        for order, words in ((forward, "from"), (forward[::-1], "up to")):
-            others = few[:i], few[i + 1 :]
-            good = _fitting(few_chains, *others, few[i], order, misfit)
-            if good < len(order):
-                name = frame_names(whole.frames)[order[good]]
-                parts = [whole.select(np.sort(part)) for part in (order[:good], order[good:])]
-                parts[1].name = f"{whole.name} {words} frame {name}"
-                split = [*observations[:i], *parts, *observations[i + 1 :]]
-                return [*chains[: i + 1], *chains[i:]], split, parts[1].name
-    return chains, observations, ""
+        parts = few[:i], few[i + 1 :], few[i]
+        found = [
+            (i, order, words, _fitting(few_chains, *parts, order, misfit))
+            for order, words in ((forward, "from"), (forward[::-1], "up to"))
+        ]
+        found = [edge for edge in found if edge[-1] < len(forward)]
+        if found:
+            return max(found, key=lambda edge: edge[-1])
+    return None
+
+
+def _split(chains, observations, i, order, words, good):
+    """Return chains and datasets, one of these in two parts, and the name of the second part."""
+    whole = observations[i]
+    parts = [whole.select(np.sort(part)) for part in (order[:good], order[good:])]
+    parts[1].name = f"{whole.name} {words} frame {frame_names(whole.frames)[order[good]]}"
+    split = [*observations[:i], *parts, *observations[i + 1 :]]
+    return [*chains[: i + 1], *chains[i:]], split, parts[1].name
+
+
+def _nearer(chains, whole, order):
+    """
+    Return how many frames of a dataset are those of the first of two chains, and not of the second.
+
+    That is decided frame by frame, in single differences.
+    """
+    off = []
+    for chain in chains:
+        problem = GapProblem([chain], [whole])
+        problem.settle_noise()
+        (channel,), (difference,) = problem.channels, problem.differences(problem.start)
+        off.append(np.sum(channel.gap(difference) ** 2, axis=0))
+    more = np.cumsum((off[0] - off[1])[order])
+    least = len(order) // _LEAST_PART
+    return least + int(np.argmin(more[least - 1 : -1]))
 
 
 def _fitting(chains, before, after, whole, order, misfit):

@@ -119,6 +119,8 @@ def _worked_out(diagnosis):
     # the share of the excess over the noise that the improved model leaves
     left = float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
     scores = ("statistic", "rank", "evidence")
+    # as they were given: a part of a run has a name of its own, and is no run
+    names = diagnosis.settings.get("names", [o.name for o in improved.observations])
     content = {key: getattr(diagnosis, key) for key in _OWN} | {
         "nominal": _nominal(nominal),
         "n_free": int(nominal.problem.size),
@@ -140,7 +142,7 @@ def _worked_out(diagnosis):
         "left_share_limit": diagnosis.hidden_share,
         "hidden_percent": diagnosis.hidden_percent,
         "causes": causes,
-        "changes": runs.changes(diagnosis, causes),
+        "changes": runs.changes(diagnosis, causes) if len(names) > 1 else [],
         "scores": [
             _named(one) | {key: getattr(one, key) for key in scores}
             for one in diagnosis.scan.candidates[:_MOST_SCORES]
@@ -150,7 +152,6 @@ def _worked_out(diagnosis):
         "accuracy_after": after,
         "next_observations": plan(diagnosis),
     }
-    names = [o.name for o in improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content, len(names) > 1), *runs.paragraph(content, names, asked)]
     if misread and causes[0]["probability"] >= 0.5:

@@ -38,7 +38,6 @@ _MOST_TERMS = 12
 _DOUBT = 0.5
 # a pattern with a smaller share than this is not worth a sentence
 _LEAST_SHARE = 0.01
-_CHANNELS = ("differences", "sums")
 # what double sums see: all that is the same a quarter of a turn further on
 _NULL = ("beam", "what is equal at plate angles 45 deg apart (null channel)")
 # harmonics in the order of who gives a name to what the angles cannot tell apart
@@ -146,7 +145,8 @@ def _terms(model):
     columns = _outer(known.pop(_NULL), smooth, problem)
     null = _Term(_NULL[0], f"{_NULL[1]}, in the differences", 0, columns)
     notes, terms = badly_separated(model.observations), []
-    for channel, name in enumerate(_CHANNELS):
+    sums = "intensities" if _is_single(problem) else "sums"
+    for channel, name in enumerate(("differences", sums)):
         for (axis, words), parts in known.items():
             note = f" ({notes[words]})" if words in notes else ""
             columns = _outer(parts, smooth, problem)
@@ -157,6 +157,11 @@ def _terms(model):
                 columns = _outer(parts, rough, problem)
                 terms.append(_Term(f"wavelength x {axis}", detail, channel, columns))
     return [*terms, _flux(problem)], null
+
+
+def _is_single(problem):
+    """Return whether all datasets have one beam."""
+    return all(channel.groups is not None for channel in problem.channels)
 
 
 def _outer(parts, law, problem):
@@ -420,7 +425,8 @@ def places(model):
         names = [f'dataset "{o.name}"' for o in observations]
         yield "dataset", labels(range(len(names))), names, None
     beams = ["the differences of the beams", "the sums of the beams"]
-    yield "beam", labels([np.arange(2)[:, None, None]] * len(observations)), beams, None
+    if not _is_single(problem):
+        yield "beam", labels([np.arange(2)[:, None, None]] * len(observations)), beams, None
     if all("derotator" in o.frame_columns for o in observations):
         turned = [np.round(o.position("derotator") / SAME_ANGLE) for o in observations]
         kinds = np.unique(np.concatenate(turned))

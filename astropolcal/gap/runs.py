@@ -63,7 +63,8 @@ def changes(diagnosis, causes):
 
     Keys are ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
     ``probability``, ``brought_by`` (optics that only this run has, upstream of the place) and
-    ``words``; the most probable first, and among these the most significant.
+    ``words``; the most probable first, and among these the most significant. A mistake of a table
+    has no cell.
     """
     if not causes or count_runs(diagnosis.improved.problem) < 2:
         return []
@@ -73,16 +74,19 @@ def changes(diagnosis, causes):
     found = []
     for cause in causes:
         cell = cause["cell"] and Cell(**cause["cell"])
-        run = cell and _run_of(cell, names, chains)
+        run = _run_of(cell, names, chains) if cell else split_run(cause["name"])[1]
         if run is not None:
-            brought = _brought(cell, run, names, chains)
+            brought = _brought(cell, run, names, chains) if cell else []
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
             of = "" if _is_told(cell, cause, names) else " of this or what looks the same"
             # what has a name of its own in each run
             is_named = str(cause.get("effect")).endswith(f"/dataset:{run}")
             named = cause["title"].removesuffix(f' in "{run}"') if is_named else ""
-            entry["words"] = _sentence(cell, entry, names, wavelength, of, named)
+            if cell:
+                entry["words"] = _sentence(cell, entry, names, wavelength, of, named)
+            else:
+                entry["words"] = f"What changed: {cause['title']} ({_chance(entry, of)})."
             found.append(entry)
     return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
 
@@ -103,7 +107,7 @@ def _is_told(cell, cause, names):
     """Return whether nothing looks like a change but, of two runs, the opposite of the other."""
     there = [(Cell(**one["cell"]), one["probability"]) for one in cause["aliases"] if one["cell"]]
     there = there if len(names) == 2 else []
-    same = sum(chance for one, chance in there if _in_any_run(one) == _in_any_run(cell))
+    same = sum(chance for one, chance in there if cell and _in_any_run(one) == _in_any_run(cell))
     return cause["share"] + same >= ONE
 
 
@@ -157,6 +161,10 @@ def paragraph(content, names, asked=False):
     return words
 
 
+def _chance(entry, of):
+    return f"probability {100 * entry['probability']:.0f} %{of}"
+
+
 def _sentence(cell, entry, names, wavelength, of, named):
     """Return one change in words."""
     plain = _in_any_run(cell)
@@ -165,7 +173,7 @@ def _sentence(cell, entry, names, wavelength, of, named):
     title = named or title
     # the size of a gain is half the difference of the beams
     size = _size(entry["size"], wavelength, 2.0 if cell.kind == "gain" else 1.0)
-    chance = f"probability {100 * entry['probability']:.0f} %{of}"
+    chance = _chance(entry, of)
     run = entry["dataset"]
     if constant and len(names) == 2 and size:
         # of the second against the first, whichever of the two has it

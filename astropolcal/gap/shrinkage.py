@@ -157,7 +157,7 @@ def foreseen(model, groups):
         group.append([np.where(channel.valid, number, -1)] * 2)
         # whitened differences are divided by their noise; sums have none of their own here
         scale.append(np.zeros(channel.shape))
-        scale[-1][channel.told] = channel.sigma[channel.told]
+        scale[-1][channel.told] = channel.noise
     group, scale = (np.concatenate([np.ravel(one) for one in each]) for each in (group, scale))
     for i in range(len(labels)):
         rows = np.flatnonzero(group == i)

@@ -436,7 +436,7 @@ def frame_coordinate(observations, name):
         return passed / (passed.max() or 1.0)
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
-    if name in MOVES:
+    if name.endswith(MOVES):
         stage, _, what = name.rpartition("_")
         angle = observations.position(stage)
         out = np.zeros_like(angle)

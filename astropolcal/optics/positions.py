@@ -18,11 +18,9 @@ FLUXES = ("flux", "total_flux", "previous_flux")
 #: By how much an angle changes from one frame to the next.
 RATES = ("parallactic_rate", "derotator_rate")
 
-#: The last move of a stage: 1 where it went backwards, else 0; how far, and how far the next one
-#: goes, in radian.
-MOVES = tuple(
-    f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move", "next")
-)
+#: What stands behind the name of a stage for its last move: 1 where it went backwards, else 0; how
+#: far, and how far the next one goes, in radian.
+MOVES = ("_direction", "_move", "_next")
 
 
 #: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
@@ -31,21 +29,27 @@ PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
 
 
 class _Coordinates(tuple):
-    """Names of positions that are numbers; ``PLACES`` and ``"COLUMN=STATE"`` are among them."""
+    """Names of positions that are numbers, also ``PLACES``, ``"COLUMN=STATE"``, moves of stages."""
 
     __slots__ = ()
 
     def __contains__(self, name):
         known = tuple.__contains__(self, name) or name in PLACES
-        return known or (isinstance(name, str) and "=" in name)
+        return known or (isinstance(name, str) and ("=" in name or name.endswith(MOVES)))
 
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
 #: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
-#: last moves of the stages, and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column
-#: has that state and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian
-#: Date or `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
-COORDINATES = _Coordinates(("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES))
+#: last moves of stages (those of ``hwp`` and ``derotator``, and ``"STAGE_direction"`` and so on of
+#: any other), and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column has that state
+#: and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian Date or
+#: `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
+COORDINATES = _Coordinates(
+    (
+        *("sequence", "flc_state", "frame", *RATES, *FLUXES),
+        *(f"{stage}{what}" for stage in ("hwp", "derotator") for what in MOVES),
+    )
+)
 
 
 def finite_position(value, name, stage=None):

@@ -32,7 +32,7 @@ def _datasets(diagnosis):
     pairs = zip(*(m.problem.differences(m.fit.coefficients) for m in models), strict=True)
     for dataset, channel, pair in zip(problem.datasets, problem.channels, pairs, strict=True):
         # whitened by the same noise before and after, lest the two differ by their lamps
-        gaps = (100 * channel.whiten(gap) * channel.sigma for gap in pair)
+        gaps = (100 * channel.whiten(gap) * channel.sigma * channel.level for gap in pair)
         # there is room for so many characters above a panel
         name = shortened(dataset.observations.name, 30)
         gaps = (np.where(channel.valid, gap, np.nan) for gap in gaps)
@@ -93,7 +93,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
         for row, channel, dataset in zip(panels, channels, datasets, strict=True):
             name, _, nm, before, after = dataset
             order = np.argsort(nm)
-            noise = np.where(channel.valid, 100 * channel.sigma, np.nan)
+            noise = np.where(channel.valid, 100 * channel.sigma * channel.level, np.nan)
             for c, (axes, (title, label)) in enumerate(zip(row, _CHANNELS.values(), strict=True)):
                 floor, one, two = (st.rms(v[c], axis=1)[order] for v in (noise, before, after))
                 x, level = st.widened(nm[order], floor)

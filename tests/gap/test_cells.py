@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from gap_setups import SETUPS
 
+from astropolcal.exceptions import ObservationError
 from astropolcal.gap.cells import Cell, Probes, dependences, places
+from astropolcal.gap.effects import Effect, check_effect
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
@@ -128,6 +130,19 @@ def test_only_what_data_can_tell_is_a_dependence():
     # what changes may do so in one of them only
     assert not both["time/dataset:July"][1].any()
     np.testing.assert_allclose(both["time/dataset:July"][0], whole["time"][0])
+
+
+def test_moves_of_every_stage_are_dependences():
+    setup = SETUPS["rotating"]()
+    seen = setup.observed()
+    chains = [setup.nominal]
+    effect = Effect("e", "e", "in:rotator", "orientation", "move:rotator", "number")
+    check_effect(effect, chains, [seen])
+    assert {"move:hwp", "move:rotator"} <= set(dependences(GapProblem(chains, [seen])))
+    moves = np.diff(seen.position("rotator"), prepend=seen.position("rotator")[:1])
+    np.testing.assert_allclose(seen.position("rotator_move"), moves)
+    with pytest.raises(ObservationError, match="no column 'nothing'"):
+        seen.position("nothing_next")
 
 
 def test_every_cell_has_a_name_and_words_of_its_own():

@@ -71,6 +71,17 @@ def test_frames_wavelengths_and_beam_of_a_course_are_found():
         assert one.shape.split(", ") == words
 
 
+def test_what_is_the_same_in_all_frames_is_no_course():
+    seen = data.observed()
+    model = data.fitted(data.with_flux(seen, np.full(seen.n_frames, 1.02)))
+    found = courses(model, model)
+    assert ("detector", "gain") not in [(one.place, one.kind) for one in found]
+    # of one that does what a constant does all is no part of the run
+    for one in found[:20]:
+        one.find_shape(model)
+        assert "frame 0 on" not in one.shape
+
+
 @pytest.mark.slow
 def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
     # as few wavelengths and angles as tell the course from the causes of the table

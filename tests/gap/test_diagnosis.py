@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Verdicts: on planted effects and cells, on none, on wrong frames and on bad input."""
 
+import json
 import warnings
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
+from astropy.table import QTable
 from gap_setups import SETUPS
 from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
@@ -15,7 +17,7 @@ from star_data import WAVELENGTH, observe_star, star_chain
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap import EFFECTS, diagnose, model, problem
+from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
 from astropolcal.gap.report import to_dict, with_causes
@@ -327,6 +329,39 @@ def test_an_alternative_beside_which_much_is_left_is_not_sure():
     assert found.causes[0].probability < 0.9
 
 
+def _one_beam(drift, retardance):
+    """Return a chain of one beam with extinction, and data that lack a retarder or a calm lamp."""
+    wavelength = [1.0, 1.3, 1.7] * u.um
+    plate = optics.LinearRetarder(retardance=[120, 128, 135] * u.deg, mount="plate", name="plate")
+    plate.retardance.bounds = (100, 150)
+    first = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    chain = first | plate | optics.LinearPolarizer(name="analyser")
+    window = optics.LinearRetarder(retardance=retardance, theta=45 * u.deg, name="window")
+    frames = QTable({"calibrator": np.repeat([0, 45, 80, 130], 16) * u.deg})
+    frames["plate"] = np.tile(3 + np.arange(16) * 22.5, 4) * u.deg
+    frames["group"] = np.repeat(np.arange(4), 16)
+    lamp = 1 + drift * np.linspace(-1, 1, len(frames))
+    truth = insert_optic(chain, window, before="analyser")
+    return chain, simulate(truth, wavelength, frames, flux=1e7, seed=1, lamp=lamp, name="lamp")
+
+
+def test_one_beam_has_intensities_and_no_gain_between_beams():
+    for drift, retardance in ((0.02, 0 * u.deg), (0, 2 * u.deg)):
+        chain, seen = _one_beam(drift, retardance)
+        found = diagnose(chain, seen)
+        content = to_dict(found)
+        (cause,) = content["causes"]
+        assert cause["probability"] > 0.9
+        said = json.dumps([content[key] for key in ("sentences", "causes", "where", "scores")])
+        assert "beam" not in said
+        assert ("brightness of the source, or gain" in said) == bool(drift)
+        assert "percent of the mean of their group" in said
+        # shot noise: of that the frames that are nearly dark have the least
+        noise = found.noise_floor_percent
+        assert noise == pytest.approx(100 / np.sqrt(seen.flux_right.mean()), rel=0.1)
+        assert found.gap_after_percent < 1.1 * noise < 0.3 * found.gap_before_percent
+
+
 def test_a_wavelength_that_has_the_gap_alone_comes_first():
     few = data.WAVELENGTH[:5]
     rng, table = np.random.default_rng(3), data.observed(flux=1e7, wavelength=few).to_table()
@@ -429,6 +464,17 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         "no effect 'beam_gian'.*'beam_gain'": (chain, observed, {"effects": ["beam_gian"]}),
         "too few frames to leave out in groups: 1 in the shortest": (chain, one, {}),
     }
+    # of one's own, or of the library, which no chain has a place for
+    for message, place, dependence in (
+        ("e: optic of its place = 'hpw'; allowed are .*did you mean 'hwp'", "in:hpw", "time"),
+        ("e: place = 'telescope'; allowed are source, in:hwp", "telescope", "time"),
+        ("e: stage of its dependence move:x = 'x'; allowed are hwp", "in:hwp", "move:x"),
+        ("e: dependence = 'step:32'; frames are 0 to 31", "in:hwp", "step:32"),
+        ("e: dataset of its dependence = 'x'; allowed are lamp", "in:hwp", "time/dataset:x"),
+    ):
+        one = Effect("e", "e", place, "rotation", dependence)
+        cases[f"effect {message}"] = (chain, observed, {"effects": [one]})
+    cases["effect altitude_sign: "] = (chain, observed, {"effects": ["altitude_sign"]})
     for message, (chains, observations, options) in cases.items():
         with pytest.raises(GapError, match=message) as refused:
             diagnose(chains, observations, **options)

@@ -716,10 +716,19 @@ def test_effects_of_ones_own():
         Effect.insert(optics.LinearRetarder(retardance=0 * u.deg, name="a"), inside="derotator"),
         Effect.insert(optics.BeamGain(name="a"), after="wollaston", degree="number"),
     ]
+    film = optics.Diattenuator(theta=30 * u.deg, name="a")
+    some.append(Effect.insert(film, inside="derotator", limit=0.1))
     for effect in some:
         check_effect(effect, chains, data)
         if effect.kinds:
             assert len(effect.cells(chains)) == len(effect.kinds) * (1 + effect.around)
+    # its axis is relative to that of the optic, also where that is free
+    for fixed in (True, False):
+        chain = chains[0].copy()
+        chain["derotator"].theta, chain["derotator"].theta.fixed = 2 * u.deg, fixed
+        edit = some[-1].edit([chain], context_of(data))
+        assert edit.chains[0]["gap_a"].theta.value == 32
+        assert [tie.offset for tie in edit.ties.values()] == [30 * u.deg] * (not fixed)
     assert not Effect("a", "a", "telescope", "rotation").applies(chains)
     assert not Effect("a", "a", "after:hwp", "rotation", "harmonic:other:1").applies(chains)
 

@@ -194,3 +194,18 @@ def test_errors_of_sizes_are_those_of_the_report():
     for name, size in Fitted(model).sizes("hwp_encoder_two_lobe").items():
         expected = np.rad2deg(errors[model.problem.slices[name]])
         np.testing.assert_allclose(size["std"], expected, rtol=1e-6)
+
+
+def test_beams_are_exchanged_from_the_very_frame_on():
+    """A frame without a partner on its side of the edge shows in single differences only."""
+    wavelength, library = data.WAVELENGTH[::3], [get_effect("beams_swapped")]
+    chain, right = data.chain(wavelength), data.observed(flux=1e7, wavelength=wavelength)
+    number = np.repeat(np.arange(right.n_frames), right.n_bins)
+    for frame, words, there in ((14, "from", number >= 14), (10, "up to", number <= 10)):
+        table = right.to_table()
+        for key in ("flux_right", "flux_left", "flux_right_err", "flux_left_err"):
+            other = key.replace(*(("right", "left") if "right" in key else ("left", "right")))
+            table[key] = np.where(there, right.to_table()[other], table[key])
+        wrong = Observations.from_table(table, name="run")
+        *_, where = starting_model(chain, [wrong], library, lambda line: None)
+        assert where == f"run {words} frame {frame}"

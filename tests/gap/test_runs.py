@@ -144,6 +144,17 @@ def test_which_of_three_runs_changed_is_not_told_as_sure_where_two_may_have():
         assert change["words"].endswith(end)
 
 
+def test_a_mistake_in_the_table_of_one_run_is_a_change():
+    model = data.fitted([data.observed(name=name) for name in "ab"])
+    cause = {"name": "beams_swapped/dataset:b", "title": 'beams exchanged in "b" only'}
+    cause |= {"cell": None, "aliases": [], "size": {}, "share": 1.0}
+    cause |= {"probability": 0.99, "significance": None}
+    found = changes(SimpleNamespace(improved=model), [cause, cause | {"name": "mirror_flip"}])
+    assert [(one["dataset"], one["cell"], one["brought_by"]) for one in found] == [("b", None, [])]
+    (words,) = paragraph({"changes": found, "verdict": "named"}, "ab", asked=True)
+    assert words == 'What changed: beams exchanged in "b" only (probability 99 %).'
+
+
 @pytest.mark.slow
 def test_what_both_runs_lack_is_no_change():
     found = diagnose(data.chain(), pair([GAIN], [GAIN]))

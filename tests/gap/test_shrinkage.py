@@ -204,7 +204,8 @@ class Table:
         rng = np.random.default_rng(seed)
         valid = rng.random(self.shape[1:]) < 0.8
         sigma = np.broadcast_to(rng.uniform(0.5, 2, (2, 4, 1)), self.shape)
-        self.channel = SimpleNamespace(shape=self.shape, valid=valid, sigma=sigma, told=0, count=2)
+        told = {"sigma": sigma, "told": 0, "noise": sigma[0]}
+        self.channel = SimpleNamespace(shape=self.shape, valid=valid, count=2, **told)
         keep = np.broadcast_to(valid, self.shape).ravel()
         self.slopes, self.target = rng.normal(size=(64, 3)), rng.normal(size=64)
         self.slopes[~keep], self.target[~keep] = 0.0, 0.0

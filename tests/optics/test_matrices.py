@@ -175,7 +175,10 @@ def test_numbers_and_angles_of_stages():
 
 def test_kinds_of_positions_do_not_overlap():
     assert not set(FLUXES) & set(RATES)
-    assert {*FLUXES, *RATES, *MOVES, "sequence", "flc_state", "frame"} == set(COORDINATES)
+    moves = {f"{stage}{what}" for stage in ("hwp", "derotator") for what in MOVES}
+    assert {*FLUXES, *RATES, *moves, "sequence", "flc_state", "frame"} == set(COORDINATES)
+    # and the moves of any other stage
+    assert "kmirror_move" in COORDINATES
 
 
 # --- the matrices in the docstrings -------------------------------------------------------------

@@ -70,7 +70,9 @@ def complaint(capsys, *arguments):
 
 
 @pytest.mark.slow
-def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
+def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys, monkeypatch):
+    # where no exposure is better, what was saved is next
+    monkeypatch.setattr("astropolcal.gap.report.plan", lambda diagnosis: [])
     tables = [folder / "polarized.ecsv", folder / "unpolarized.ecsv"]
     report, saved = tmp_path / "gap.html", tmp_path / "improved.asdf"
     outputs = ["--report", report, "--save", saved, "--json", tmp_path / "out.json"]
@@ -79,6 +81,8 @@ def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     printed = capsys.readouterr()
     assert printed.out.startswith("The model lacks one effect: unequal gains of the two beams")
     assert str(report) in printed.out
+    told = " ".join(printed.out.partition("Next")[2].split())
+    assert told.startswith(f"correct measurements with {saved}")
     # how far it is, is for terminals
     assert "looking for causes" not in printed.err
     content = json.loads((tmp_path / "out.json").read_text())

@@ -25,6 +25,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES, LinearPolarizer
+from astropolcal.optics.positions import MOVES
 
 __all__ = []
 
@@ -148,6 +149,7 @@ def sequence_of(wanted, settings):
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
+    own = [stage for stage in own if not stage.endswith(MOVES)]
     if not own or not {*own} <= {*settings}:
         return None
     known = [settings[stage] for stage in own]

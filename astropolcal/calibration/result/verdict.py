@@ -424,7 +424,7 @@ def _next(calibration, free, wrong, sky):
 
 def _more_angles(turning):
     """Say which stages should stand at more angles, of all whose position the chains need."""
-    angles = turning - {*COORDINATES, "parallactic", "altitude"}
+    angles = {s for s in turning if s not in COORDINATES} - {"parallactic", "altitude"}
     known = {"derotator": "derotator", "hwp": "half-wave plate"}
     names = [words for stage, words in known.items() if stage in angles]
     names += sorted(angles - set(known))

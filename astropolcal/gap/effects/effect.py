@@ -15,16 +15,16 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments, optics
-from astropolcal.chain import insert_optic
+from astropolcal.chain import Train, insert_optic
 from astropolcal.exceptions import GapError, InstrumentError, ParameterError
-from astropolcal.gap.cells import Cell
+from astropolcal.gap.cells import Cell, places
 from astropolcal.gap.effects.where import SEVERAL, Roles, Where
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import did_you_mean
+from astropolcal.words import check_choice, did_you_mean
 
 __all__ = []
 
@@ -366,7 +366,8 @@ class Effect:
         optic : Optic
             Any optic, at parameters at which it does nothing.
         after, before, inside : str
-            Name or role of the optic next to which it stands, or with which it turns.
+            Name or role of the optic next to which it stands, or with which it turns: its ``theta``
+            is then relative to the axis of that.
         **settings
             Others of an `Effect`; by default name and title are those of the optic.
 
@@ -464,6 +465,28 @@ class Effect:
     def applies(self, chains):
         """Return whether one of the chains, one per dataset, has the place for this effect."""
         return any(self.applies_to(self.roles(chain)) for chain in chains)
+
+    def check_for(self, chains, observations):
+        """Raise GapError if no chain has its place, or no dataset what it depends on."""
+        every, where = [self.roles(chain) for chain in chains], self.where
+        text, run = split_run(self.dependence)
+        (what, on, *_), allowed = (*text.split(":"), ""), {}
+        if where is not None and all(where.find(roles, self.optic) is None for roles in every):
+            optic = self.optic or where.optic
+            there = [r.leaves if optic else places(Train(r.leaves)) for r in every]
+            there = [one.name for part in there for one in part]
+            allowed["optic of its place" if optic else "place"] = optic or where.relation, there
+        if what in ("harmonic", "direction", "move") and on != "own":
+            stages = [o.stage for roles in every for o in roles.leaves]
+            allowed[f"stage of its dependence {text}"] = on, stages
+        if run is not None:
+            allowed["dataset of its dependence"] = run, [o.name for o in observations]
+        for words, (value, known) in allowed.items():
+            known = dict.fromkeys(name for name in known if name)
+            check_choice(f"effect {self.name}: {words}", value, known, GapError)
+        last = max(o.n_frames for o in observations) - 1
+        if what in ("step", "frame") and int(on) > last:
+            raise GapError(f"effect {self.name}: dependence = {text!r}; frames are 0 to {last}")
 
     def applies_to(self, roles):
         """Return whether one chain has the place, and the stage on which the effect depends."""
@@ -615,7 +638,8 @@ class Effect:
         follows = anchor is not None and self.where.follows and not self.around
         if follows and self.inserted is not None and not anchor.theta.fixed and _has_axes(added[0]):
             added[0].theta.bounds = (None, None)
-            ties[f"{label}.theta"] = Tie(f"{anchor.name}.theta")
+            offset = (added[0].theta.value - anchor.theta.value) * u.deg
+            ties[f"{label}.theta"] = Tie(f"{anchor.name}.theta", offset=offset)
         if self.around:
             # equal and opposite: what turns the light in front is turned back behind
             for part in parts:
@@ -649,7 +673,8 @@ class Effect:
         where = self.where
         inside = where.relation == "in" and _has_axes(one)
         if anchor is not None and (inside or where.turned is not None):
-            one.theta = (anchor.theta.value + (where.turned or 0.0)) * u.deg
+            own = one.theta.value if inside else 0.0
+            one.theta = (own + anchor.theta.value + (where.turned or 0.0)) * u.deg
         for key in one.param_names:
             getattr(one, key).fixed = key not in (*free, *self.equal)
         return one
@@ -709,7 +734,8 @@ class CellEffect(Effect):
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
-        super().__init__(cell.name, cell.title, place, cell.kind, dependence, degree, **settings)
+        kind = "gain" if cell.kind == "brightness" else cell.kind
+        super().__init__(cell.name, cell.title, place, kind, dependence, degree, **settings)
         self._cell = cell
 
     def cells(self, chains):
