@@ -677,7 +677,9 @@ class Fault:
     def _draw_listed(self, rng):
         self.amplitude = 1.0
         bench, name = self.bench, self.told.get("effect")
-        known = EFFECTS.values() if name is None else [get_effect(name)]
+        # what follows the last move is drawn as a cell
+        drawn = (e for e in EFFECTS.values() if not e.dependence.startswith("direction"))
+        known = drawn if name is None else [get_effect(name)]
         fitting = [e for e in known if e.kind != "discrete" and e.applies(bench.chains)]
         if not fitting:
             raise GapError(f"effect = {name!r} has no place on the bench")

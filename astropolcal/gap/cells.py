@@ -111,7 +111,9 @@ class Cell:
 
     def to_dict(self):
         """Return place, kind and dependence, ready for JSON."""
-        return {"place": self.place, "kind": self.kind, "dependence": self.dependence}
+        # what is a gain in words of two beams is one in those for machines
+        kind = "gain" if self.kind == "brightness" else self.kind
+        return {"place": self.place, "kind": kind, "dependence": self.dependence}
 
 
 _KINDS = {

@@ -244,6 +244,26 @@ def test_restart_frees_what_is_named_and_holds_the_rest(years):
     assert new.converged
 
 
+def test_what_was_open_is_not_known_because_it_is_held():
+    wavelength = CHARIS.wavelength[::8]
+    chain = CHARIS.chain(wavelength=wavelength)
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    first, second = (simulate(chain, wavelength, frames, seed=seed) for seed in (2, 3))
+    old = calibrate(chain, first, cross_validate=False)
+    assert "AoLP on sky is open" in old.verdict().words[0]
+    found = restart(old, second, ["hwp.theta"], cross_validate=False).verdict()
+    assert not found.usable
+    assert "open in the calibration before: calibration_polarizer.theta" in found.reasons[0]
+    assert "unknown" in found.words[1]
+    # of a calibration without anything open the errors are those of a part
+    chain = CHARIS.chain(wavelength=wavelength, derotator="linear")
+    old = calibrate(chain, simulate(chain, wavelength, frames, seed=2), cross_validate=False)
+    new = simulate(chain, wavelength, frames, seed=3)
+    found = restart(old, new, ["hwp.theta"], cross_validate=False).verdict()
+    assert found.usable
+    assert found.cautions == ["errors of what is held are not in these"]
+
+
 def test_change_about_a_restart_is_said_to_be_unsure(years):
     """What it holds errs too: 55 to 95 of 100 comparisons with a third one said changed."""
     new = restart(years[0], observe(7, "2026-03-01"), ["derotator"], cross_validate=False)

@@ -130,6 +130,8 @@ def verdict(calibration, targets=TARGETS):
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
+        if "restarted" in calibration.settings:
+            cautions.append("errors of what is held are not in these")
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
