@@ -195,8 +195,8 @@ def test_an_optic_is_replaced_in_a_chain():
     assert type(new) is type(chain)
     assert new["other"] is other
     assert "second" in chain.submodel_names
-    with pytest.raises(ChainError, match="no optic 'secnd' in the chain"):
-        chain.replace_submodel("secnd", other)
+    with pytest.raises(ChainError, match="no optic 'fifth' in the chain"):
+        chain.replace_submodel("fifth", other)
 
 
 def test_the_inverse_undoes_a_chain():
