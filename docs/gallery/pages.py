@@ -359,7 +359,8 @@ def effect_row(name):
     effect = EFFECTS[name]
     parts = [f"Place: {effect.place}", f"Shows: {effect.shows}"]
     if effect.kind != "discrete":
-        keys = sorted(effect.free)
+        # what is added without an optic of its own is a perturbation
+        keys = sorted(effect.free or ("amplitude",))
         listed = ", ".join(f"``{key}``" for key in keys)
         sizes = f"about {_quantity(effect.scale)}, at most {_quantity(effect.limit)}"
         parts.append(f"Law: {_law_of(effect)}")
