@@ -73,8 +73,7 @@ def leaves(chain):
 
 
 class Train(tuple):
-    """
-    Optics in the order of the light that are not joined yet.
+    """Optics in the order of the light that are not joined yet.
 
     What is tried by the hundred need not be a compound model each time: its making costs as the
     square of the number of optics.
@@ -384,8 +383,7 @@ def states_of(chain):
 
 
 def check_states(chain, columns, label, least=2):
-    """
-    Refuse columns, by name, with a state that no optic of the chain knows.
+    """Refuse columns, by name, with a state that no optic of the chain knows.
 
     Of devices with ``least`` known states: one that is known in one state only may be off.
     """
@@ -604,8 +602,7 @@ def _check_axes(wavelength, positions):
 
 
 def system_mueller_derivatives(chain, wavelength=None, positions=None):
-    """
-    Return the derivatives of `system_mueller` to parameters, by ``"optic.parameter"``.
+    """Return the derivatives of `system_mueller` to parameters, by ``"optic.parameter"``.
 
     Quantities of shape (n_frames, n_wavelengths, 4, 4) per unit of the parameter.
     """

@@ -55,8 +55,7 @@ _KINDS = {
 
 
 def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
-    """
-    Return the path of a file to write, before the work of writing it is done.
+    """Return the path of a file to write, before the work of writing it is done.
 
     It is not a folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
     content.
@@ -82,8 +81,7 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
 
 @contextmanager
 def atomic_path(path, error=AstropolcalError):
-    """
-    Give a temporary path that takes the place of ``path`` when the block ends well.
+    """Give a temporary path that takes the place of ``path`` when the block ends well.
 
     It has the same suffix, and nobody else writes there. A file that exists keeps its permissions,
     and a link stays a link: what it points to is replaced. Pipes and devices, such as
@@ -184,8 +182,7 @@ def _standard_stream(path):
 
 
 def append_line(path, line, error=AstropolcalError):
-    """
-    Append a line to a file, which is on the disk then; all of it or nothing.
+    """Append a line to a file, which is on the disk then; all of it or nothing.
 
     A last line that was cut off, as its writer was killed, is ended first.
     """
@@ -253,8 +250,7 @@ def check_kind(path, error=AstropolcalError):
 
 @contextmanager
 def understood(path, error, words, *, reads=True):
-    """
-    Turn any failure of a reader into one line that names the file and says what it is not.
+    """Turn any failure of a reader into one line that names the file and says what it is not.
 
     Parsers raise errors of every kind for a damaged file. Errors of this package pass unchanged.
     What is not a regular file is refused before it is opened, where it is going to be read, see
@@ -278,8 +274,7 @@ def understood(path, error, words, *, reads=True):
 
 
 def one_line(problem, longest=_LONGEST_REASON):
-    """
-    Return what an error or a text says, in one line of up to ``longest`` characters (None: all).
+    """Return what an error or a text says, in one line of up to ``longest`` characters (None: all).
 
     The type of an error is named where its words alone say little.
     """
@@ -351,8 +346,7 @@ def columns(table, *keys):
 
 
 def check_yaml(text, error=AstropolcalError):
-    """
-    Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.
+    """Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.
 
     Links make a document of a kilobyte grow without bounds, loops never end, and a loader that
     calls itself for each level takes the whole process with it. Nothing is loaded here. What is not

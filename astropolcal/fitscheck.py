@@ -53,8 +53,7 @@ def readable_fits(path, error=ObservationError):
 
 
 def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):
-    """
-    Open a FITS file for astropy, at its beginning, after ``check_fits`` with the same arguments.
+    """Open a FITS file for astropy, at its beginning, after ``check_fits`` with the same arguments.
 
     Astropy does not close a file that it cannot read, and loses its way in a packed one whose
     headers are damaged: so it is given a file that is open, and unpacked.
@@ -80,8 +79,7 @@ def primary_header(path, error=ObservationError):
 
 
 def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
-    """
-    Refuse a FITS file whose headers would take astropy minutes or all of the memory.
+    """Refuse a FITS file whose headers would take astropy minutes or all of the memory.
 
     The file may be packed by gzip, bzip2 or xz; ``count`` HDUs are going to be read, and ``whole``
     refuses data that are claimed and not there. ``error`` is raised if a header has no end, claims

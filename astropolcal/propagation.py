@@ -289,8 +289,7 @@ def _at(nodes, values, frame):
 
 
 def _enter(steps, light, *, entered=False):
-    """
-    Carry light to the last optic with a matrix; return it, or None, and the light it sees.
+    """Carry light to the last optic with a matrix; return it, or None, and the light it sees.
 
     Light that has ``entered`` is in the frame of the first optic already.
     """
@@ -325,8 +324,7 @@ _CROSSING = -1
 
 
 def _back(steps, adjoint, behind, by_optic, result, crossings=None):
-    """
-    Carry the adjoint back through ``steps``, adding derivatives to ``result``.
+    """Carry the adjoint back through ``steps``, adding derivatives to ``result``.
 
     Returns the adjoint, and adjoint and light as they enter the first optic. ``behind`` has such
     pairs for the optics downstream of the steps. The product a . G s of a pair is the same on

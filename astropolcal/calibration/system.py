@@ -105,8 +105,7 @@ class Rows:
 
 
 def inverse_rows(rows, weights=None, max_condition=1e6):
-    """
-    Return what turns fluxes into Stokes parameters, and how well it is determined.
+    """Return what turns fluxes into Stokes parameters, and how well it is determined.
 
     ``rows`` are (..., n_data, n), ``weights`` (..., n_data) inverse variances, equal by default.
     Returns the gain of least squares, (..., n, n_data), the singular values, (..., n), largest

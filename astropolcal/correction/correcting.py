@@ -392,8 +392,7 @@ _TOGETHER = 8
 def corrected_planes(
     source, solution, by_variance, *, chunk=None, workers=None, cluster=None, progress=False
 ):
-    """
-    Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
+    """Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
 
     Their shape is (n, n_wavelengths, *image_shape), covariances in the order of
     `covariance_index`. ``by_variance`` weights each pixel by its own variances. ``workers`` threads
@@ -434,8 +433,7 @@ def corrected_planes(
 
 
 def _block(source, solution, wavelengths, by_variance, in_order, shape):
-    """
-    Return components and covariances at some wavelengths, of the ``shape`` of their images.
+    """Return components and covariances at some wavelengths, of the ``shape`` of their images.
 
     ``in_order`` calls a function with parts of the frames, and gives the results in the order of
     the parts.

@@ -468,8 +468,7 @@ def _centres(centres, layout):
 
 
 def frame_positions(instrument, table, chain, names=None):
-    """
-    Return the position of every stage of a chain in each frame, radian, (n_frames,), by name.
+    """Return the position of every stage of a chain in each frame, radian, (n_frames,), by name.
 
     ``table`` has one row per frame with the angles of the headers, and ``flc_state``, A or B, if
     the chain has a modulator; ``names`` are those of the frames in messages.

@@ -27,8 +27,7 @@ _REACH = 25
 
 
 def derotate(image, position_angle, *, centre=None, size=None, mirrored=False, order=3):
-    """
-    Resample images (..., Y, X) so that north is up and east is left.
+    """Resample images (..., Y, X) so that north is up and east is left.
 
     NaN outside and where a pixel without a value has a share.
 
@@ -44,8 +43,7 @@ def derotate(image, position_angle, *, centre=None, size=None, mirrored=False, o
 
 
 def derotate_variance(variance, position_angle, *, centre=None, size=None, mirrored=False, order=3):
-    """
-    Return the variances of images turned by `derotate`, of independent pixels.
+    """Return the variances of images turned by `derotate`, of independent pixels.
 
     The sum of the squared spline weights times the variance interpolated linearly: exact where the
     variance is the same within a few pixels. Correlations that resampling makes are not in it.

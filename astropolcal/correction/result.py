@@ -430,8 +430,7 @@ class Corrected:
 
 
 def fractions(stokes, covariances, components="IQU"):
-    """
-    Return standard deviations ``q``, ``u``, ``v`` of Q / I and so on, and ``covariance_qu``.
+    """Return standard deviations ``q``, ``u``, ``v`` of Q / I and so on, and ``covariance_qu``.
 
     From Stokes parameters (n, ...), I first, and covariances (n, n, ...); infinite where a
     covariance is, NaN where it is not known or there is no light.
@@ -456,8 +455,7 @@ def fractions(stokes, covariances, components="IQU"):
 
 
 def polarization(q, u, errors):
-    """
-    Return degree and angle of linear polarization with their errors.
+    """Return degree and angle of linear polarization with their errors.
 
     ``dolp``, ``dolp_debiased``, ``aolp`` (degree, 0 to 180), and ``s_p`` and ``s_chi`` (degree) of
     each kind of error that `fractions` gave; the statistical one removes the bias of noise.

@@ -30,8 +30,7 @@ _MOST_RADIAN = 8 * np.pi
 
 
 def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration", date=None):
-    """
-    Return the optics from the sky to the detector, with calibrated values.
+    """Return the optics from the sky to the detector, with calibrated values.
 
     The chain of a star that was calibrated, without the star; if there is none, the instrument's
     chain from the sky with the calibrated optics inside. Without a telescope it begins with the
@@ -48,8 +47,7 @@ def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration"
 
 
 class RowModel(Rows):
-    """
-    Measurement rows of a calibration, or a chain, at given positions, and how they move.
+    """Measurement rows of a calibration, or a chain, at given positions, and how they move.
 
     Positions are (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of the exposures;
     without a unit in radian. Parameters known at the calibrated wavelengths only are interpolated

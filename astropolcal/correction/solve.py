@@ -36,8 +36,7 @@ CHANNELS = {
 
 
 class Channels:
-    """
-    Linear combinations of the fluxes of both beams in all frames.
+    """Linear combinations of the fluxes of both beams in all frames.
 
     ``intensity``: the fluxes; ``single``: difference and sum of each frame; ``double``: half the
     difference of differences and half the sum of sums of each pair, frames (n_pairs, 2).
@@ -59,8 +58,7 @@ class Channels:
                 )
 
     def combine(self, fluxes, power=1):
-        """
-        Return channels, (2, n_units, ...), of fluxes of shape (2, n_frames, ...).
+        """Return channels, (2, n_units, ...), of fluxes of shape (2, n_frames, ...).
 
         With a ``power`` of two, of variances, without their correlations.
         """
@@ -119,8 +117,7 @@ class Estimator:
     settings: dict
 
     def apply(self, fluxes):
-        """
-        Return Stokes parameters, (n_components, n_wavelengths, ...), of fluxes.
+        """Return Stokes parameters, (n_components, n_wavelengths, ...), of fluxes.
 
         These have shape (2, n_frames, n_wavelengths, ...), the right beam first.
         """
@@ -138,8 +135,7 @@ def estimator(
     max_condition=_MAX_CONDITION,
     labels=None,
 ):
-    """
-    Solve for what turns fluxes into Stokes parameters, wavelength by wavelength.
+    """Solve for what turns fluxes into Stokes parameters, wavelength by wavelength.
 
     ``rows`` are those of `measurement_rows`, (2, n_wavelengths, n_frames, 4). Without V in
     ``components`` it is taken as zero, and so where it cannot be determined. ``observable`` and
@@ -250,8 +246,7 @@ _STEPS, _SETTLED = 50, 1e-13
 
 
 def frame_brightness(rows, fluxes, groups=None, **settings):
-    """
-    Return the relative brightness of frames, (n_wavelengths, n_frames), of mean one.
+    """Return the relative brightness of frames, (n_wavelengths, n_frames), of mean one.
 
     ``fluxes`` are those of the whole image of each beam, (2, n_frames, n_wavelengths), NaN where
     there is none, which gives one; the settings are those of `estimator`. The sum of both beams

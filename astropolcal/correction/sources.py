@@ -22,8 +22,7 @@ _MOST_SIZE = 2
 
 
 class ArraySource:
-    """
-    Beams as arrays, (n_frames, n_wavelengths, ...): in memory, mapped from disk, or of dask.
+    """Beams as arrays, (n_frames, n_wavelengths, ...): in memory, mapped from disk, or of dask.
 
     At a time all frames of arrays in memory are read, those of a chunk of dask arrays, and one of
     arrays on disk. Quantities are converted to ``unit``; what is masked has no value.
@@ -92,8 +91,7 @@ def _array(values, name, unit):
 
 
 class TurnedSource:
-    """
-    Beams of another source, turned north up frame by frame when they are read.
+    """Beams of another source, turned north up frame by frame when they are read.
 
     ``position_angle`` is that of the +y axis, (n_frames,); ``centre`` the 0-based x and y that
     stays, (2,) or (n_frames, 2, 2) of each beam, by default the middle; ``size`` rows and columns
@@ -190,8 +188,7 @@ class CubeFiles(TurnedSource):
 
 
 class _WholeCubes:
-    """
-    Cubes of both beams in FITS files, which are opened when they are needed.
+    """Cubes of both beams in FITS files, which are opened when they are needed.
 
     Inverse variances or errors (``weights``) may follow the cube's ``extension``, else those of
     the ``detectors`` count; ``left_scale`` multiplies the left beam. Of ``stacked`` files the

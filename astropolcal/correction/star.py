@@ -98,8 +98,7 @@ def stated_star(corrected, dolp, aolp, errors):
 
 
 def without_star(corrected, star, words, measured):
-    """
-    Return images or spectra without the polarization of a star, a spectrum.
+    """Return images or spectra without the polarization of a star, a spectrum.
 
     Of a ``measured`` one the polarization is subtracted that the calibration made of it: what is
     added to all light in proportion to its intensity drops out, and so does its error.

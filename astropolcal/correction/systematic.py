@@ -130,8 +130,7 @@ def check_choices(open_directions, n_samples, seed):
 
 
 def linear_systematic(model, solution, *, mode="stokes", open_directions="infinite"):
-    """
-    Return the systematic errors by the exact derivatives of the rows.
+    """Return the systematic errors by the exact derivatives of the rows.
 
     For ``open_directions`` see `correct`.
     """
@@ -143,8 +142,7 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
 def sampled_systematic(
     model, solution, *, n_samples, seed=None, mode="stokes", open_directions="infinite"
 ):
-    """
-    Return the systematic errors by solving again for samples of the parameters.
+    """Return the systematic errors by solving again for samples of the parameters.
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
     drawn from its covariance. These stay where they are along directions that the calibration does

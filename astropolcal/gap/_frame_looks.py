@@ -123,8 +123,7 @@ class Look:
         return found
 
     def _of_flux(self):
-        """
-        Return what background and nonlinearity do to the differences, or sums, (n_rows, k).
+        """Return what background and nonlinearity do to the differences, or sums, (n_rows, k).
 
         A lamp that is dim in a few frames must not make a background look like their fault.
         """
@@ -170,8 +169,7 @@ class Look:
         return [dataset.forward(self.vector) for dataset in self.problem.datasets]
 
     def columns(self, i):
-        """
-        Return what an error of each kind does to every frame of a dataset, (k, 2, W, F) each.
+        """Return what an error of each kind does to every frame of a dataset, (k, 2, W, F) each.
 
         By kind: ``"STAGE angle"`` per radian, ``"right beam"`` and ``"left beam"`` for a law in
         wavelength of the logarithm of the beam's flux.
@@ -205,8 +203,7 @@ class Look:
         return _fall(values, along)
 
     def deleted(self, i):
-        """
-        Return by how much each frame's differences raise chi-square, and their number, (F,).
+        """Return by how much each frame's differences raise chi-square, and their number, (F,).
 
         That is by how much it falls if a frame that takes part is left out, and by how much it
         rises if one that does not is taken in.
@@ -230,8 +227,7 @@ class Look:
         return self.problem.channels[i].valid.any(axis=0) & ~self.out[i]
 
     def of_frame(self, i, f):
-        """
-        Return what the other frames say of the differences of one.
+        """Return what the other frames say of the differences of one.
 
         By how far it misses what is predicted from them, (W,), whitened; the inverse of the
         covariance of this, with the errors of the prediction, (W, W); and the inverse of the noise,
@@ -248,8 +244,7 @@ class Look:
         return missed, (vectors * np.maximum(1 - values, 0.0)) @ vectors.T, weight
 
     def sums_of_frame(self, i, f):
-        """
-        Return what the sums of a frame miss, (W,), what the lamp leaves of sums, and whitening.
+        """Return what the sums of a frame miss, (W,), what the lamp leaves of sums, and whitening.
 
         The latter two are (W, W).
         """
@@ -269,8 +264,7 @@ def _fall(values, along):
 
 
 def _basis(columns, rows):
-    """
-    Return the basis that is orthonormal in some rows, in all of them, and in these rows only.
+    """Return the basis that is orthonormal in some rows, in all of them, and in these rows only.
 
     A coefficient that these rows do not determine is left out.
     """
@@ -436,8 +430,7 @@ class Frame:
         return float(offset), float(chi2[best])
 
     def beam(self, law, side):
-        """
-        Return the trial in which the right (1) or left (-1) beam, or a single one, was off.
+        """Return the trial in which the right (1) or left (-1) beam, or a single one, was off.
 
         The logarithm of the factor is a law in wavelength. The sums take part, too: they tell
         which of the beams it was where the lamp is steady.

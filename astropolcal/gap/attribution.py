@@ -158,8 +158,7 @@ class Scan:
     temper: float = 1.0
 
     def freer(self, candidate, among=()):
-        """
-        Return a cause with the law in wavelength for which there is most evidence.
+        """Return a cause with the law in wavelength for which there is most evidence.
 
         It is quicker where the candidates ``among`` which it is are known.
         """
@@ -227,8 +226,7 @@ class Scan:
 
 
 def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
-    """
-    Return the evidence for all cells and named effects beside a fitted model.
+    """Return the evidence for all cells and named effects beside a fitted model.
 
     Effects that are in the model or have no place in it are left out; ``temper`` is the variance of
     the residuals about the model with the cause, in units of the noise. One effect of the model may
@@ -266,8 +264,7 @@ def _cells(probes, temper):
 
 
 def _sharpest(probes, temper, least):
-    """
-    Return the few cells with most evidence for another size at each wavelength, best first.
+    """Return the few cells with most evidence for another size at each wavelength, best first.
 
     What changes from one wavelength to the next, as fringes do, is in no smooth law. What the model
     absorbs of it is left out here, and no two wavelengths or waves are taken to share anything.
@@ -292,8 +289,7 @@ def _sharpest(probes, temper, least):
 
 
 def _bent(probes, place, kind, law):
-    """
-    Return gram and target of a constant cell with its second derivative, None if it has none.
+    """Return gram and target of a constant cell with its second derivative, None if it has none.
 
     The derivative vanishes where a parameter is at an extremum, as half a wave is; a change shows
     in second order then, with one sign only.

@@ -188,8 +188,7 @@ def _ordinal(number):
 
 
 def alike(cells):
-    """
-    Return what two cells have in common: a "course" through the run, or an "action".
+    """Return what two cells have in common: a "course" through the run, or an "action".
 
     That is place and kind. Both may be one thing that no table has; empty for all others.
     """
@@ -401,8 +400,7 @@ class Probes:
         return len(self.waves) > self._asked
 
     def grouped(self, names):
-        """
-        Return dependences with their functions of the frame, those of as many together.
+        """Return dependences with their functions of the frame, those of as many together.
 
         Each is the names and, per dataset, an array (n, count, F).
         """

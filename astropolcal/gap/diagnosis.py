@@ -512,8 +512,7 @@ def _conclude(nominal, base, exchanged, selection, frames):
 
 
 def _exchanged(nominal, base, improved, exchanged, total):
-    """
-    Return the cause that an alternative is, as sure as all causes explain the gap.
+    """Return the cause that an alternative is, as sure as all causes explain the gap.
 
     It is no surer than it explains the double differences alone: others may be in its place.
     """

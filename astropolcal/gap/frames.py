@@ -162,8 +162,7 @@ def single_data(model, known=()):
 
 
 def _single(residual, tangent, weight, least):
-    """
-    Return by how many standard deviations data are off, (F, W), 0 where it is less than so many.
+    """Return by how many standard deviations data are off, (F, W), 0 where it is less than so many.
 
     Each is left out in turn: of a frame, beside a smooth law in wavelength of its own, and of what
     the nominal model absorbs, ``tangent`` (F, W, p). ``weight`` (F, W) whitens.
@@ -434,8 +433,7 @@ def lamp_faults(model, others=()):
 
 
 def _off_the_drift(channel, gap):
-    """
-    Return by how much the brightness of every frame is off a smooth drift, (F,) each.
+    """Return by how much the brightness of every frame is off a smooth drift, (F,) each.
 
     As the logarithm of the flux that is common to all wavelengths, and in robust standard
     deviations; ``gap`` is that of the sums, (W, F).

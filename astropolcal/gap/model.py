@@ -258,8 +258,7 @@ class Model:
 
     @cached_property
     def _spectra(self):
-        """
-        Return what the data say of each effect at the fit, by name, for `costs`.
+        """Return what the data say of each effect at the fit, by name, for `costs`.
 
         Eigenvalues of its normal equations beside the nominal model and the effects before it, and
         by how much chi-square rises along their vectors without it, in units of the usual size.
@@ -439,8 +438,7 @@ def nominal_model(chains, observations, calibration=None, other=None):
 
 
 def _lowest(problem, starts):
-    """
-    Fit from the calibration and from the starts; return the lowest.
+    """Fit from the calibration and from the starts; return the lowest.
 
     In the double differences, which the calibration fits, noise or a fault may have put a
     wavelength into the wrong mirror branch: single differences often tell.
@@ -526,8 +524,7 @@ def _at_data(chain, observations):
 
 
 def _alternatives(chains, observations, made, discrete, say):
-    """
-    Return misfit and effect of discrete alternatives, best first.
+    """Return misfit and effect of discrete alternatives, best first.
 
     With them, the chains, datasets and calibration of which they are alternatives, and the name of
     the part of a dataset that does not fit, see `_parts`.
@@ -555,8 +552,7 @@ def _alternatives(chains, observations, made, discrete, say):
 
 
 def _in_part(chains, observations, misfit, effects, say):
-    """
-    Return misfit and effect of alternatives in a part of a run that does not fit, best first.
+    """Return misfit and effect of alternatives in a part of a run that does not fit, best first.
 
     With them, chains and datasets, one of these in two parts, and the name of that which does not
     fit. Without such a part they are as they were, and the name is empty.
@@ -583,8 +579,7 @@ def _in_part(chains, observations, misfit, effects, say):
 
 
 def _edge(chains, observations, misfit):
-    """
-    Return which dataset fits in part, the order of its frames, and how many of them do.
+    """Return which dataset fits in part, the order of its frames, and how many of them do.
 
     These are the most that the model fits with all other datasets, from the first frame on or up to
     the last. Before their number is where the others are, in words. None without such frames.

@@ -477,8 +477,7 @@ class GapProblem:
 
 
 def _within(triangle, wanted, low, high, found):
-    """
-    Return the least squares within bounds, given those without.
+    """Return the least squares within bounds, given those without.
 
     What was outside is guessed to be at its bound, and the guess is corrected for all at once
     (Portugal, Judice & Vicente 1994, doi:10.2307/2153286). Where that does not end, as in one of
@@ -505,8 +504,7 @@ def _within(triangle, wanted, low, high, found):
 
 
 def _behind_walls(triangle, wanted, rows, room):
-    """
-    Return the least squares where no row times the unknowns is above its room.
+    """Return the least squares where no row times the unknowns is above its room.
 
     Lawson & Hanson (1974), chapter 23: the step from the solution without walls that is the
     shortest in units of the noise, by non-negative least squares.

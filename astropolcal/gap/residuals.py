@@ -237,8 +237,7 @@ def _simplest(terms, tested, best):
 
 
 def _normal_equations(data, terms):
-    """
-    Return Gram matrix and right side of the columns of all terms, less the tangent space.
+    """Return Gram matrix and right side of the columns of all terms, less the tangent space.
 
     Whitening mixes neither datasets nor channels, so that the matrix is made
     block by block and the columns are never all there at once.

@@ -269,8 +269,7 @@ def _merged(task, best):
 
 
 def _with_axes(task, best):
-    """
-    Return the set with an optic of any axis in place of what two components change twice a turn.
+    """Return the set with an optic of any axis in place of what two components change twice a turn.
 
     An optic that turns with a stage has a second harmonic of it in each component of a static
     frame: four numbers for the two components in its own frame.
@@ -317,8 +316,7 @@ def _possible(task, best, scans):
 
 
 def _checked(task, best):
-    """
-    Return the set without causes that left-out frames contradict.
+    """Return the set without causes that left-out frames contradict.
 
     With it, what is left with one cause more each, and the errors on left-out frames.
     """
@@ -626,8 +624,7 @@ def _in_place(task, one, state):
 
 
 def _exchanged(task, best, first):
-    """
-    Return the set with every cause the best beside all the others, and the scans beside these.
+    """Return the set with every cause the best beside all the others, and the scans beside these.
 
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
@@ -708,8 +705,7 @@ def _rivals_beside(found, own, library):
 
 
 def _unlisted(base, best, stable, instead):
-    """
-    Return the probability that the gap has a cause that no table has.
+    """Return the probability that the gap has a cause that no table has.
 
     A remainder of probability p is evidence for it by a Bayes factor of at most -1/(e p ln p)
     (Sellke, Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger it is.

@@ -182,8 +182,7 @@ def _polarized_star(known, wavelength, name):
 
 
 def _rotation(known, wavelength):
-    """
-    Return the change of the angle per logarithm of the wavelength, and its error (deg).
+    """Return the change of the angle per logarithm of the wavelength, and its error (deg).
 
     That of the catalogue is one per wavelength; the two are the same in the middle. The error
     makes that of the angle at the wavelength farthest from lambda_max no less than it is in the

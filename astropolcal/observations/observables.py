@@ -566,8 +566,7 @@ def _where(frame, rows):
 def _candidates(
     frames, width, *, hwp, steps, tolerance, flc_state, derotator=None, derotator_tolerance=0.0
 ):
-    """
-    Return plus and minus frame of all possible pairs, the best first.
+    """Return plus and minus frame of all possible pairs, the best first.
 
     Only frames at most ``width`` places apart in ``frames`` count.
     """

@@ -577,8 +577,7 @@ def modulator_states(frames, label):
 
 
 def _courses(observations):
-    """
-    Return the time of each frame, or its place in the order, and the frames of each beam by it.
+    """Return the time of each frame, or its place in the order, and the frames of each beam by it.
 
     The beams of an exposure, which are frames of a table, are taken at once.
     """

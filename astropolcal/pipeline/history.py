@@ -568,8 +568,7 @@ def _weighed(found, mjd, priors):
 
 
 def _partitions(gram, target, size, priors):
-    """
-    Return the log evidence of one stretch, and of more, and the chance of a change in each gap.
+    """Return the log evidence of one stretch, and of more, and the chance of a change in each gap.
 
     By dynamic programming over the ends of stretches; the chance is that among partitions of
     more than one stretch.

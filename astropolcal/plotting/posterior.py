@@ -108,8 +108,7 @@ def _columns(posterior, parameters, most):
 
 
 def _labels(posterior, columns, samples):
-    """
-    Return axis labels, and what is taken off each parameter's values for legible ticks.
+    """Return axis labels, and what is taken off each parameter's values for legible ticks.
 
     A width of 0.1 um about 1654 um would leave no space for ticks.
     """

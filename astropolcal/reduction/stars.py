@@ -263,8 +263,7 @@ def _measured(cube, result, k, radius):
 
 
 def _aperture(cube, k, beam, places, radius):
-    """
-    Return flux, its variance, background, and what the latter's noise adds to the variance.
+    """Return flux, its variance, background, and what the latter's noise adds to the variance.
 
     Or why the aperture cannot be used.
     """

@@ -363,8 +363,7 @@ def undecided_signs(measurement, view, stds):
 
 
 def bent_valleys(measurement, whitened, stds):
-    """
-    Return how far parameters of a wavelength may go where chi-square is not a parabola.
+    """Return how far parameters of a wavelength may go where chi-square is not a parabola.
 
     Each is an element of the flat vector, a direction, (n_free,) in canonical units, and by how
     much the element may fall and rise. The direction is as long as a standard error: half the way
@@ -406,8 +405,7 @@ def bent_valleys(measurement, whitened, stds):
 
 
 def other_laws(problem, vector, origin):
-    """
-    Return sums of squares and starts with other thicknesses of each optic, best first.
+    """Return sums of squares and starts with other thicknesses of each optic, best first.
 
     A phase that is a law of a thickness has minima of its own, as one of a bin has. Thicknesses are
     tried around those of ``origin``, beside the other common parameters of ``vector``, with each
@@ -462,8 +460,7 @@ def other_axes(problem, vector, origin):
 
 
 def least_bent(problem, branches, ratio, origin):
-    """
-    Return the branch of each bin, (n_bins,), with which phases bend least over the wavelengths.
+    """Return the branch of each bin, (n_bins,), with which phases bend least over the wavelengths.
 
     ``ratio`` has the sums of squares of branches over those of the first, (n_branches, n_bins). The
     least sum of all is found by dynamic programming over pairs of neighbours.

@@ -244,8 +244,7 @@ def _descend(measurement, weighting, fitter, search, options, origin, is_searche
 
 
 def _smoothed(measurement, weighting, fitter, outcome, origin):
-    """
-    Fit again with wavelengths in the branches that make their phases smooth, if nearly as good.
+    """Fit again with wavelengths in the branches that make their phases smooth, if nearly as good.
 
     Where a half-wave plate has half a wave, both signs of all other retardances fit nearly equally
     well, and without circular polarization both signs of all together fit exactly so. Any error of

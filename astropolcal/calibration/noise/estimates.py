@@ -584,8 +584,7 @@ def noise_from_roughness(measurement, vector=None):
 
 
 def frame_noise(channel, residual, angles, bins=None):
-    """
-    Return the noise of every number of each frame: the stated errors, or more by the data.
+    """Return the noise of every number of each frame: the stated errors, or more by the data.
 
     ``channel`` has the stated ``variance`` (n, W, F) and what is ``valid`` (W, F), ``residual`` has
     the shape of the variance, ``angles`` the position of every stage, radian, (F,), and ``bins``,

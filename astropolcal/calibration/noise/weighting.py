@@ -337,8 +337,7 @@ class Problem:
 
 
 def _short(residuals, slopes):
-    """
-    Return residuals and their derivatives, turned so that all but a few rows are zero.
+    """Return residuals and their derivatives, turned so that all but a few rows are zero.
 
     The triangular factor of both has the same sums of squares and products as they have: a fitter
     takes the same steps, and decomposes a small matrix in place of a tall one.

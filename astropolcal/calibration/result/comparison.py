@@ -101,8 +101,7 @@ def compare(members):
 
 
 def moved(earlier, later):
-    """
-    Return by how many standard errors the parameters of each optic differ, of all under "".
+    """Return by how many standard errors the parameters of each optic differ, of all under "".
 
     Those that both determine, by the covariances of both, beyond what is expected by chance: two
     thicknesses of a plate may move by little each, and its retardance by much.
