@@ -229,6 +229,8 @@ def _check_options(arguments):
             f"--camera-angle {arguments.camera_angle:g}: is for --rotation fixed or --rotation "
             "pupil; with --rotation none the images are not turned"
         )
+    if arguments.rotation == "none" and arguments.mirrored:
+        raise ParameterError("--mirrored: with --rotation none the images are not turned")
     if arguments.seed is not None and not arguments.samples:
         raise ParameterError(f"--seed {arguments.seed}: is for --samples N")
     check_seed(arguments.seed)

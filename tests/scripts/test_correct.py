@@ -212,6 +212,7 @@ def test_bad_input(night, tmp_path, monkeypatch):
         (["--max-condition", "0.5"], "max_condition = 0.5"),
         (["--radius", "0"], "no pixel is inside"),
         (["--radius", "3"], r"--radius 3: leaves the images of --size 5; allowed are up to 2\.5"),
+        (["--mirrored"], "--mirrored: with --rotation none the images are not turned"),
         (["--camera-angle", "113"], "--camera-angle 113: is for --rotation fixed or --rotation pu"),
         (
             ["--camera-angle", "0", "--rotation", "none"],
