@@ -185,8 +185,7 @@ def correct(
     (0.02, -0.01)
     """
     by_variance = isinstance(weights, str)
-    _check(frames, mode, weights)
-    check_choices(open_directions, n_samples, seed)
+    _check(frames, mode, weights, open_directions, n_samples, seed)
     if hasattr(calibration, "datasets"):
         chain = _chain_at(calibration, frames, chain, max_age=max_age, dates=not any_date)
     model = RowModel(
@@ -205,8 +204,7 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     if systematic is not None and systematic.is_open:
         unmeasured.append(_OPEN)
-    if by_variance and getattr(frames.source, "estimated", False):
-        unmeasured.append(_BIASED)
+    unmeasured += _weighted(by_variance, frames.source)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -226,7 +224,13 @@ def correct(
     )
 
 
-def _check(frames, mode, weights):
+def _weighted(by_variance, source):
+    """Say what weights by variances that follow the fluxes do."""
+    return [_BIASED] if by_variance and getattr(source, "estimated", False) else []
+
+
+def _check(frames, mode, weights, *choices):
+    check_choices(*choices)
     check_choice("mode", mode, MODES, ParameterError)
     if isinstance(weights, str) and weights != "variance":
         raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
