@@ -12,7 +12,7 @@ import numpy as np
 
 from astropolcal.calibration import Calibration
 from astropolcal.calibration.fit.branches import BinProblem, search_branches
-from astropolcal.calibration.fit.calibrate import Fitted, fitted
+from astropolcal.calibration.fit.calibrate import FittedMeasurement, fitted
 from astropolcal.calibration.fit.strategies import few_frames
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.estimates import rms
@@ -83,7 +83,7 @@ class Model:
     #: Effects in the chains, with the parameters that they added.
     added: dict = field(default_factory=dict)
     #: The fit of a calibration that was made for it, None where it began with another one.
-    calibration: Fitted | None = None
+    calibration: FittedMeasurement | None = None
     #: Chains with the values from which a nominal model was fitted, None of others.
     start: list | None = None
 
@@ -433,7 +433,7 @@ def nominal_model(chains, observations, calibration=None, other=None):
             "the nominal fit did not converge: nothing can be said of missing effects; "
             "check the angles, the optics in the beam and the starting values"
         )
-    made = calibration if isinstance(calibration, Fitted) else None
+    made = calibration if isinstance(calibration, FittedMeasurement) else None
     return Model(problem, found, calibration=made, start=chains)
 
 

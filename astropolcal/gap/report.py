@@ -437,14 +437,15 @@ def accuracies(model, cross_validate=True):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AstropolcalWarning)
             made = model.calibration
-            how = {"cross_validate": cross_validate, "instrument": instrument}
             calibration = (
-                with_causes(model, held=True, **how)
+                with_causes(model, held=True, cross_validate=cross_validate, instrument=instrument)
                 if made is None
                 else made.calibration(cross_validate=cross_validate)
             )
             # what is not known of the causes is not known on sky
-            seen = with_causes(model, **how) if model.added else calibration
+            seen = calibration
+            if model.added:
+                seen = with_causes(model, cross_validate=False, instrument=instrument)
             targets = target_accuracies(seen)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
                 targets = target_accuracies(seen, open_directions="ignore")

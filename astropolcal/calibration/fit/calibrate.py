@@ -211,7 +211,7 @@ def calibrate(
 
 
 @dataclass
-class Fitted:
+class FittedMeasurement:
     """A measurement that was fitted, of which errors are worked out where they are asked for."""
 
     measurement: Measurement
@@ -274,7 +274,7 @@ def fitted(
     gauge = describe_gauge(chosen["gauge"], taken, measurement.free, held)
     settings = {"instrument": instrument, "fitter": type(fitter).__name__, **chosen, "gauge": gauge}
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
-    return Fitted(measurement, whitened, settings, outcome, stages)
+    return FittedMeasurement(measurement, whitened, settings, outcome, stages)
 
 
 def _by_strategy(strategy, *how):

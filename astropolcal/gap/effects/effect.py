@@ -496,8 +496,6 @@ class Effect:
         what, stage, *_ = (*split_run(self._dependence(roles))[0].split(":"), "")
         if self._dependence(roles) == OWN_RUN:
             return False
-        if what in ("direction", "move") and f"{stage}_{what}" not in optics.COORDINATES:
-            return False
         needed = what in ("harmonic", "direction", "move")
         return not needed or any(o.stage == stage for o in roles.leaves)
 
