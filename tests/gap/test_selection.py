@@ -6,12 +6,15 @@ import importlib
 import runpy
 from pathlib import Path
 
+import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import QTable, Table
 from gap_setups import SETUPS
 
+from astropolcal import optics
+from astropolcal.chain import insert_optic
 from astropolcal.gap.attribution import Candidate, Scan
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.challenge import Setup, make_challenge, score_answer
@@ -21,6 +24,7 @@ from astropolcal.gap.model import nominal_model
 from astropolcal.gap.report import Fitted, to_dict
 from astropolcal.gap.selection import _members, select
 from astropolcal.gap.shrinkage import frame_groups
+from astropolcal.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
 SMOOTH = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]
@@ -254,3 +258,19 @@ def test_sets_of_causes_are_compared_by_their_fits():
         assert score_answer(case, to_dict(diagnosis)) == "right", seed
         names = [cause.name for cause in diagnosis.causes]
         assert not any(name.startswith("fringes_drift") for name in names), (seed, names)
+
+
+@pytest.mark.slow
+def test_what_an_exchange_makes_superfluous_goes():
+    """A retarder at any axis is one, and no second cause beside it halves its probability."""
+    wavelength = np.linspace(0.5, 0.8, 6) * u.um
+    frames = QTable({"pol": np.repeat(np.arange(0, 180, 30), 16) * u.deg})
+    frames["qwp"] = np.tile(np.arange(16) * 22.5, 6) * u.deg
+    plate = optics.LinearRetarder(retardance=np.full(6, 90.0) * u.deg, mount="qwp", name="qwp")
+    nominal = optics.LinearPolarizer(mount="pol", name="pol") | plate
+    nominal = nominal | optics.WollastonPrism(efficiency=np.full(6, 0.97), name="wollaston")
+    film = optics.LinearRetarder(retardance=2 * u.deg, theta=30 * u.deg, name="film")
+    seen = simulate(insert_optic(nominal, film, after="qwp"), wavelength, frames, seed=11)
+    found = diagnose(nominal, seen, cross_validate=False)
+    assert [cause.name for cause in found.causes] == ["static_retarder"]
+    assert found.causes[0].probability > 0.9
