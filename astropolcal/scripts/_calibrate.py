@@ -198,7 +198,7 @@ def _check_start(arguments):
     if not arguments.start:
         return
     # they would contradict what the old calibration holds
-    keys = ("fix", "prior", "without", "own", "follow", "derotator", "m3", "bounds", "exact")
+    keys = ("fix", "prior", "without", "own", "follow", "exact", *common.MODEL)
     given = [f"--{key}" for key in keys if getattr(arguments, key)]
     given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
     if given:
