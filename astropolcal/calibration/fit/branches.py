@@ -9,7 +9,7 @@ for the joint fit, later a check whether a bin sits in the wrong valley, and aft
 the valleys go and which signs the data do not tell.
 """
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import astropy.units as u
 import numpy as np
@@ -43,8 +43,12 @@ _HARDLY, _STUCK = 1e-6, 1.0
 _STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
 # so many other thicknesses to either side are tried; each step changes the data by so much (rms)
 _LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
+# a phase with bounds so far apart may go on by half a turn
+_WHOLE_TURN = 1.99 * np.pi
 # starts whose sums of squares differ by less are the same
 _APART = 1.001
+# so many steps tell which signs may be the best, and of so many more are taken
+_GLIMPSE, _PROMISING = 2, 4
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
 _UNDECIDED = 9.0
 # so far an axis is turned for another start (radian)
@@ -456,6 +460,67 @@ def other_axes(problem, vector, origin):
             start[slot.slice] = (start[slot.slice] - low[slot.slice] + turn) % np.pi
             start[slot.slice] += low[slot.slice]
             found.append(np.clip(start, low, high))
+    return found
+
+
+def centres(problem):
+    """Return what priors hold near a centre: common angles, and phases of single wavelengths.
+
+    Each is its elements and its centre, and of a phase whether half a turn stays in its bounds.
+    """
+    free, axes, phases = problem.measurement.free, [], []
+    for slot, prior in free.priors:
+        if prior.is_flat or slot.unit is None or not slot.unit.is_equivalent(u.rad):
+            continue
+        centre, (low, high) = prior.mode * prior.factor, slot.canonical_bounds()
+        if slot in problem.slots:
+            places = problem.elements[problem.slots.index(slot)]
+            phases.append((places, centre, high - low > _WHOLE_TURN))
+        else:
+            axes.append((slice(slot.start, slot.start + slot.size), centre))
+    return axes, phases
+
+
+def best_signs(problem, vector, phases):
+    """Return a vector whose bins have their best signs of phases, and the best half turns of these.
+
+    With a few steps of all parameters of a wavelength from each, and more from the best; common
+    ones are held.
+    """
+    tried = [problem.polish(vector, _GLIMPSE)]
+    ways = [range(4 if turns else 2) for *_, turns in phases]
+    for which in list(product(*ways))[1:]:
+        trial = vector.copy()
+        for k, (places, centre, _) in zip(which, phases, strict=True):
+            side = trial[places] - centre
+            side = -side if k % 2 else side
+            trial[places] = centre + (side - np.pi * np.where(side > 0, 1, -1) if k > 1 else side)
+        tried.append(problem.polish(np.clip(trial, problem._low, problem._high), _GLIMPSE))
+    order = np.argsort([costs for _, costs in tried], axis=0)[:_PROMISING]
+    best, least = vector.copy(), np.full(problem.n_bins, np.inf)
+    for ranked in order:
+        trial = vector.copy()
+        for i, k in enumerate(ranked):
+            trial[problem.elements[:, i]] = tried[k][0][problem.elements[:, i]]
+        trial, costs = problem.polish(trial, known=least)
+        better = costs < least
+        best[problem.elements[:, better]] = trial[problem.elements[:, better]]
+        least = np.where(better, costs, least)
+    return best
+
+
+def mirrored(vector, axes):
+    """Return a vector, and others in which common angles lie on the other sides of their centres.
+
+    Half a wave along the axes of an analyzer mirrors all axes between it and the analyzer. So a
+    static retarder of any retardance hides the signs of what is downstream of it.
+    """
+    found = [vector]
+    for places, centre in axes:
+        for one in list(found):
+            other = one.copy()
+            other[places] = 2 * centre - other[places]
+            found.append(other)
     return found
 
 

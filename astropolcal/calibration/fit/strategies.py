@@ -20,7 +20,10 @@ from astropolcal.calibration.fit.branches import (
     COARSE,
     ROUNDED,
     BinProblem,
+    best_signs,
+    centres,
     least_bent,
+    mirrored,
     other_axes,
     other_laws,
     search_branches,
@@ -57,6 +60,8 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
 # after so many evaluations, or where steps gain less than a share
 _HOPELESS, _GLANCE, _GAIN = 100.0, 15, 1e-4
+# of so many signs not all combinations are tried
+_MANY_SIGNS = 8
 # more data than these are fitted without astropy's fitter
 _TALL = 20_000
 # below this the sign of the start is as good
@@ -183,6 +188,32 @@ def joint(measurement, weighting, fitter, search, options=None):
             if not stands_out(measurement):
                 break
     measurement.stand_at(found)
+    return _behind_mirrors(measurement, best, how)
+
+
+def _behind_mirrors(measurement, best, how):
+    """Fit again from where axes and phases lie on the other sides of what priors hold near."""
+    problem = BinProblem(*few_frames(measurement, best[1]))
+    axes, phases = centres(problem)
+    if not axes or not phases or len(axes) + len(phases) > _MANY_SIGNS:
+        return best
+    found, starts = measurement.vector(), mirrored(measurement.vector(), axes)
+    least, worth = np.sum(problem.residuals(found) ** 2), 2 * problem.noise**2
+    first, done = least, 0
+    while done < len(starts):
+        start, left = starts[done], np.inf
+        # bins that follow common parameters may have other signs there
+        for _ in range(2):
+            start = problem.fit(best_signs(problem, start, phases), evaluations=2 * _GLANCE, gain=_GAIN)[0]
+            before, left = left, np.sum(problem.residuals(start) ** 2)
+            if not 1.001 * least < left < 2 * least:
+                break
+        done += 1
+        if left < least - worth:
+            found, least, starts, done = start, left, mirrored(start, axes), 0
+    if least < first:
+        measurement.stand_at(found)
+        best = _descend(measurement, best[1], *how, is_searched=True)
     return best
 
 
