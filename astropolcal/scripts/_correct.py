@@ -156,6 +156,7 @@ def work(arguments):
     files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
+    faults = _faults(calibration, provenance["calibration"])
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
@@ -205,7 +206,7 @@ def work(arguments):
         from astropolcal.plotting.correction import plot_corrected
 
         save(plot_corrected(result), arguments.plot, ObservationError)
-    summary = _summary(result, star, arguments, len(files))
+    summary = _summary(result, star, arguments, len(files)) | {"calibration_faults": faults}
     common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
@@ -312,6 +313,15 @@ def choose_calibration(arguments, files):
     chain = sky_chain(calibration, label=str(path), **wanted)
     made = {"calibration": str(path), "calibration_hash": digest}
     return calibration, chain, made
+
+
+def _faults(calibration, name):
+    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
+    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
+    if faults:
+        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+    return faults
 
 
 def _read(path):
@@ -445,6 +455,9 @@ def _words(summary, systematic, arguments):
     elif lost:
         verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
+    elif faults := summary.get("calibration_faults"):
+        verdict = f"NOT USABLE AS IT IS: the calibration is not: {faults[0]}"
+        advice = common.following("info", summary["calibration"])
     elif good < n:
         what = "poorly determined" if len(poor) == n - good else "without a value"
         verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"
