@@ -340,8 +340,8 @@ def sky_position(text, option):
         return SkyCoord(*angles, unit=u.deg)
     except (ValueError, u.UnitsError):
         raise ParameterError(
-            f"{option} {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00; allowed is a "
-            "declination from -90 to 90"
+            f"{option} {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00; allowed are "
+            "a right ascension from -360 to 360 deg and a declination from -90 to 90 deg"
         ) from None
 
 
