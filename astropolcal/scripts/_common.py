@@ -416,6 +416,18 @@ def give(arguments, lines, content, *written):
     say(arguments, *lines, *([""] if last else []), *last)
 
 
+def calibrated_instrument(calibration, path, name):
+    """Return the instrument of a calibration; it has to be the one that was named, if it was."""
+    own = calibration.instrument
+    if not (name or own):
+        raise InstrumentError(f"{path}: names no instrument; give --instrument NAME")
+    instrument = instruments.get(name or own)
+    if own and not instrument.answers_to(own):
+        words = f"the calibration is of instrument {own!r}, not {instrument.name!r}"
+        raise InstrumentError(f"{path}: {words}")
+    return instrument
+
+
 def write_calibration(calibration, arguments, content):
     """Write calibration, figures and what ``content()`` returns as asked for; say so in lines."""
     figures, kept = [], ["Not kept: -o cal.asdf writes the calibration to a file"]
