@@ -296,6 +296,8 @@ def choose_calibration(arguments, files):
     # a folder is searched when it is known what the frames need
     calibration, digest = (None, None) if path.is_dir() else _read(path)
     name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
+    if calibration is not None and calibration.instrument:
+        common.calibrated_instrument(calibration, path, name)
     night = read_night(files, instruments.get(name))
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}

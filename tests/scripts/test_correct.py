@@ -605,7 +605,10 @@ def test_files_that_cannot_be_read_leave_the_instrument_as_it_is():
 
 
 def test_file_that_holds_is_taken_with_its_hash(frames_with):
-    found = chosen(OLD, frames_with({}), optics_in=["nbs"])
+    # not one of another instrument, whatever its frames do not say
+    with pytest.raises(AstropolcalError, match="is of instrument 'charis', not 'irdis'"):
+        chosen(OLD, frames_with({}), optics_in=["nbs"], instrument="irdis", any_date=True)
+    found = chosen(OLD, frames_with({}), optics_in=["nbs"], instrument="SCExAO/CHARIS")
     assert found["calibration"] == str(OLD)
     assert found["calibration_hash"] == content_hash(Calibration.read(OLD))
 
