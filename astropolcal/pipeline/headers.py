@@ -278,7 +278,7 @@ def _check_own(calibration, kinds, label):
     if len({tuple(optic.get(name, name) for name in names) for names in kinds}) < len(kinds):
         raise ChainError(
             f"{label}: {', '.join(own)} with a value of its own in each table or group of tables: "
-            "nothing tells which one a frame has; calibrate with the tables of its night alone"
+            "nothing tells which holds for a frame; calibrate with the tables of its night alone"
         )
 
 

@@ -156,7 +156,7 @@ def work(arguments):
     files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
-    faults = _faults(calibration, provenance["calibration"])
+    faults = common.faults_of(calibration, provenance["calibration"])
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
@@ -315,15 +315,6 @@ def choose_calibration(arguments, files):
     chain = sky_chain(calibration, label=str(path), **wanted)
     made = {"calibration": str(path), "calibration_hash": digest}
     return calibration, chain, made
-
-
-def _faults(calibration, name):
-    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
-    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
-    if faults:
-        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
-    return faults
 
 
 def _read(path):

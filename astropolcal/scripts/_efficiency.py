@@ -94,6 +94,7 @@ def _chain(arguments):
     calibration = Calibration.read(arguments.file)
     grid = calibration.wavelength
     instrument = common.calibrated_instrument(calibration, arguments.file, arguments.instrument)
+    common.faults_of(calibration, arguments.file)
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
     chain = _on_sky(instrument, chains[0], grid, arguments)

@@ -226,7 +226,7 @@ def test_health_says_that_changes_about_a_restart_are_unsure(steady):
     # what lies before or after all runs is no reason for a change between two
     for event, count in (("1990-01-01", 1), ("2031-01-01", 1), ("2020-03-01", 0)):
         (group,) = health(library, now="2021-01-01", events=[event])["groups"]
-        words = f"event {event} is not between two of the runs, and says nothing of them."
+        words = f"event {event} is not between two of the runs, and has no part."
         assert group["alarms"].count(words) == count, event
 
 

@@ -47,7 +47,7 @@ def chances_of(dates, events, usual):
     for event in events:
         gap = int(np.searchsorted(ordered.mjd, moment_of(event, "event").mjd)) - 1
         if not 0 <= gap < len(found):
-            words = f"event {event} is not between two of the runs, and says nothing of them"
+            words = f"event {event} is not between two of the runs, and has no part"
             warnings.warn(words, AstropolcalWarning, stacklevel=3)
             continue
         if found[gap] == EVENT:

@@ -240,7 +240,7 @@ def _mirrors(calibration, known):
 
 
 def _of_one_table(calibration):
-    """Name what has values of its own in the tables: what is said of the sky is of one of them."""
+    """Name what has values of its own in the tables: the sky is that of one of them."""
     own, chains = calibration.settings.get("own") or {}, calibration.chains
     seen = next((i for i, chain in enumerate(chains) if "parallactic" in stages(chain)), 0)
     on_sky = {leaf.name for leaf in leaves(chain_from_sky([chains[seen]])[0])} if own else set()
