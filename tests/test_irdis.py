@@ -436,6 +436,11 @@ def test_header_that_cannot_be_used_is_refused():
         ({"ESO TEL ALT": "high"}, ObservationError, "frame 1: ESO TEL ALT = 'high'; a number"),
         ({"ESO TEL ALT": "6_2"}, ObservationError, "frame 1: ESO TEL ALT = '6_2'; a number"),
         ({"EXPTIME": -1.0}, ObservationError, "frame 1: EXPTIME = '-1.0'; .* at least 0"),
+        # what stands for no value would have a mean, too
+        ({"ESO TEL PARANG START": 9999.0}, ObservationError, "START = '9999.0'; .* -720 to 720"),
+        ({"ESO INS4 DROT2 END": 180.3}, ObservationError, "BEGIN = 359.8, but .* = 180.3; within"),
+        ({"ESO TEL ALT": 96.0}, ObservationError, "ESO TEL ALT = '96.0'; a number from 0 to 90"),
+        ({"RA": 400.0}, ObservationError, "RA = '400.0'; a number from 0 to 360 is needed"),
         ({"ESO INS4 COMB ROT": "NONE"}, ObservationError, "allowed are FIELD, PUPIL"),
         ({"ESO TEL PARANG START": None}, ObservationError, "frame 1: no keyword ESO TEL PARANG"),
         ({"ESO OCS DPI H2RT STOKES": "V"}, ObservationError, "'V'; allowed are Qplus"),

@@ -31,6 +31,7 @@ from astropolcal.exceptions import (
 from astropolcal.gap import diagnose
 from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.observations import Observations
+from astropolcal.pipeline import load, restart
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_factor
@@ -445,6 +446,24 @@ def test_other_parameters_of_the_optic_stay_shared(still, nights):
     np.testing.assert_array_equal(
         found.chains[0]["hwp"].retardance.value, found.chains[1]["hwp_night_2"].retardance.value
     )
+
+
+def test_no_frame_has_the_value_of_the_first_night_in_silence(still, nights):
+    own = calibrate(still, nights, own=["wollaston.efficiency"], **ARRAY)
+    assert "on sky as in night 1: own values of wollaston.efficiency" in own.verdict().cautions
+    words = "wollaston.efficiency with a value of its own in each table"
+    for use in (lambda: load(own).chain, lambda: measurement_rows(own, {}, WAVELENGTH)):
+        with pytest.raises(ChainError, match=words):
+            use()
+    with pytest.raises(ParameterError, match=r"wollaston.efficiency has several values"):
+        restart(own, nights[2], ["derotator"])
+    assert restart(own, nights[2], ["wollaston"], cross_validate=False).chain[
+        "wollaston"
+    ].efficiency.value == pytest.approx(0.95, abs=2e-3)
+    # of the lamp there is nothing in a frame
+    lamp = calibrate(still, nights[:2], own=["polarizer.theta"], **ARRAY)
+    assert not any("own values" in words for words in lamp.verdict().cautions)
+    assert "polarizer" not in [leaf.name for leaf in leaves(load(lamp).chain)]
 
 
 def test_own_parameters_that_cannot_be(still, nights):

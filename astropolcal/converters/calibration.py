@@ -93,16 +93,21 @@ def node_from_calibration(calibration):
     node |= {"priors": priors} if priors else {}
     node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
-    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
     return node | {
         "checksum": _checksum(node),
         "validity": {
             **validity_of(calibration).to_dict(),
-            "dates": sorted(dates - {None}),
+            "dates": _dates(calibration),
             "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in chains],
         },
         "written_with": {"astropolcal": version} | versions,
     }
+
+
+def _dates(calibration):
+    """Return the dates of the datasets, oldest first."""
+    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
+    return sorted(dates - {None})
 
 
 def _checksum(node):
@@ -174,8 +179,23 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
-    validity_of(calibration)
+    _check_validity(calibration, node["validity"])
     return calibration
+
+
+def _check_validity(calibration, told):
+    """Refuse what somebody wrote into the copy for readers, which decides nothing."""
+    held = validity_of(calibration).to_dict()
+    if told.get("dates") != _dates(calibration):
+        # of older software, which understood other dates
+        return
+    # optics in the beam hang on the instruments that are installed
+    for key in ("instrument", "mode", "valid_from", "valid_until"):
+        if told.get(key, held[key]) != held[key]:
+            raise CalibrationFileError(
+                f"validity: {key} = {one_line(repr(told[key]))}, but its content says "
+                f"{held[key]!r}: it was changed after it was written; with_validity states it"
+            )
 
 
 def _to_1_1(node):

@@ -41,7 +41,7 @@ def sky_chain(calibration, *, optics_in=None, beam=None, label="the calibration"
     if not hasattr(calibration, "datasets"):
         return chain_from_sky([calibration])[0]
     inner = inner_optics(calibration, optics_in, beam, label)
-    chain = join([*telescope_optics(calibration), *inner])
+    chain = join([*telescope_optics(calibration, label), *inner])
     instrument = known_instrument(calibration.instrument)
     return chain_from_sky([chain], instrument, calibration.wavelength, date)[0]
 

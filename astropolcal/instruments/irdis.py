@@ -26,7 +26,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.layout import COMMON, FileLayout, side_by_side
+from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
 from astropolcal.instruments.telescope import INTERNAL, PARANAL, STARS, misaligned, star_source
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
@@ -40,6 +40,8 @@ __all__ = ["IRDIS"]
 _PLATE_ZERO, _PUPIL_OFFSET = 152.15, 135.99
 # seconds: of the read-out of every DIT, and of the start of an exposure
 _READ_OUT, _START = 0.938, 2.4
+# degrees by which a stage or the sky may turn within a frame
+_MOST_TURN = 90.0
 _COMMANDED = {"Qplus": 0.0, "Qminus": 45.0, "Uplus": 22.5, "Uminus": 67.5}
 _STAGES = {"hwp_true": "ESO INS4 DROT3", "derotator": "ESO INS4 DROT2"}
 _ROTATION, _STOKES = "ESO INS4 COMB ROT", "ESO OCS DPI H2RT STOKES"
@@ -77,23 +79,30 @@ class _Header:
             )
         return value
 
-    def number_of(self, key, low=-np.inf):
+    def number_of(self, key, low, high=np.inf):
         text = self.text(key)
         try:
             value = plain_number(text)
         except ValueError:
             value = np.nan
-        if not (np.isfinite(value) and value >= low):
-            limit = "" if np.isinf(low) else f" of at least {low:g}"
+        if not (np.isfinite(value) and low <= value <= high):
+            limit = f" of at least {low:g}" if np.isinf(high) else f" from {low:g} to {high:g}"
             raise ObservationError(
                 f"frame {self.number}: {key} = {text!r}; a number{limit} is needed"
             )
         return value
 
     def mean_angle(self, first, last):
+        ends = [self.number_of(key, *RANGES["parallactic"]) for key in (first, last)]
+        turn = (ends[1] - ends[0] + 180) % 360 - 180
+        # half a turn has no middle, and long before light of all angles is mixed
+        if abs(turn) > _MOST_TURN:
+            raise ObservationError(
+                f"frame {self.number}: {first} = {ends[0]:g}, but {last} = {ends[1]:g}; within a "
+                f"frame up to {_MOST_TURN:g} deg are allowed"
+            )
         # on the circle: 359 and 3 deg have the mean 1, not 181
-        ends = np.deg2rad([self.number_of(first), self.number_of(last)])
-        return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
+        return float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(ends)).sum())))
 
 
 def frame_table(headers, site, sky_law):
@@ -147,13 +156,14 @@ def _row(frame, tracking, site):
         moment = middle.isot
     if site is not None:
         angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
-        target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
+        limits = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0)}
+        target = SkyCoord(*(frame.number_of(key, *limits[key]) for key in limits), unit=u.deg)
         places = pointing(target, Time([start, middle]), location_of(site))
         # by how much altitude and parallactic angle change until the middle
         higher, turned = (float(np.diff(angle.to_value(u.deg))[0]) for angle in places)
         motion = (turned + 180) % 360 - 180, higher
         # of the start: an offset of what is computed cancels in the change
-        angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0) + motion[1]
+        angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0, 90.0) + motion[1]
     commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
     angles["hwp"] = angles["hwp_true"] if commanded is None else commanded
     row = {"frame": frame.number, "motion": motion} | {

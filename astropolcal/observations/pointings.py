@@ -117,8 +117,9 @@ def sky_angle(name, value):
         angle = plain_number(value)
     except (TypeError, ValueError):
         angle = _sexagesimal(str(value), u.hourangle if name == "right_ascension" else u.deg)
-    if not np.isfinite(angle):
-        raise ValueError(f"{value!r} is not finite")
+    limit = 360 if name == "right_ascension" else 90
+    if not abs(angle) <= limit:
+        raise ValueError(f"{value!r} is not from {-limit} to {limit} deg")
     return angle
 
 

@@ -238,6 +238,7 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
         if fits:
             # chains of the same optics share them by name, so any one stands for all
             kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
+    _check_own(calibration, kinds, label)
     if not kinds:
         wanted = beam_words(beam) if known is None else optics_words([tuple(sorted(known))])
         raise ChainError(f"{label}: no chain {wanted}; it holds for {validity_of(calibration)}")
@@ -252,16 +253,33 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
     return next(iter(kinds.values()))
 
 
-def telescope_optics(calibration):
+def telescope_optics(calibration, label="the calibration"):
     """Return the optics of a calibrated telescope, from the sky on; empty if there are none."""
+    kinds = {}
     for chain in calibration.chains:
         outer, _ = split_chain(chain)
         # upstream of the turning of the sky stands the star itself, which is no telescope
         turns = (i for i, leaf in enumerate(outer) if leaf.stage and leaf.rotates_frame)
         start = next(turns, None)
         if start is not None:
-            return outer[start:]
-    return []
+            kinds.setdefault(tuple(leaf.name for leaf in outer[start:]), outer[start:])
+    _check_own(calibration, kinds, label)
+    return next(iter(kinds.values()), [])
+
+
+def _check_own(calibration, kinds, label):
+    """Refuse chains that differ by what has values of its own in single tables."""
+    own = calibration.settings.get("own") or {}
+    optic = {
+        copy.partition(".")[0]: name.partition(".")[0]
+        for name, copies in own.items()
+        for copy in copies
+    }
+    if len({tuple(optic.get(name, name) for name in names) for names in kinds}) < len(kinds):
+        raise ChainError(
+            f"{label}: {', '.join(own)} with a value of its own in each table or group of tables: "
+            "nothing tells which holds for a frame; calibrate with the tables of its night alone"
+        )
 
 
 def told_beam(headers, instrument, labels=None):

@@ -670,6 +670,9 @@ def restart(calibration, observations, free, *, chain=None, **options):
     free = [free] if isinstance(free, str) else list(free)
     instrument = known_instrument(old.instrument)
     chains = _new_chains(old, datasets, instrument, chain)
+    for name in old.settings.get("own") or ():
+        if not {name, name.partition(".")[0]} & set(free):
+            raise ParameterError(f"{name} has several values in the old calibration: free it, too")
     _hold(old, chains, free)
     # another mirror branch would look like a change of the instrument
     start = {"observable": old.settings["observable"], "search": False}

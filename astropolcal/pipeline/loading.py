@@ -348,7 +348,7 @@ class LoadedCalibration:
             If the calibration has several sets of optics in the beam and none was stated.
         """
         inner = inner_optics(self.calibration, self.optics_in, label=self.path.name)
-        return join([*telescope_optics(self.calibration), *inner]).copy()
+        return join([*telescope_optics(self.calibration, self.path.name), *inner]).copy()
 
     def system_mueller(
         self,
@@ -551,7 +551,7 @@ class LoadedCalibration:
         inner = inner_optics(self.calibration, self.optics_in, beam, self.path.name)
         if light == "internal":
             return join(inner), ()
-        if outer := telescope_optics(self.calibration):
+        if outer := telescope_optics(self.calibration, self.path.name):
             return join([*outer, *inner]), ()
         return self._published(inner, [date for _, date, _ in frames if date is not None])
 

@@ -100,6 +100,8 @@ def _understood(content, path):
 def export(folder, name, path):
     """Write a context and its files as one archive."""
     files = frozen(folder, name)
+    if Path(path).suffix != ".zip":
+        raise CalibrationFileError(f"{one_line(path)}: the name must end with .zip")
     check_new(path, error=CalibrationFileError, sources=files)
     with (
         atomic_path(path, CalibrationFileError) as new,

@@ -109,6 +109,8 @@ def run_archive(command, arguments):
                 entry |= {"source": source, "state": "done"} | (each.result or {})
                 if each.reason is not None:
                     entry |= {"state": "failed", "reason": each.reason}
+                    if (old := folder / f"{name}{_SUFFIX[command]}").exists():
+                        entry["reason"] += f"; {old.name} is that of an earlier run"
                 manifest.add(entry)
                 add()
         found = [manifest.entries[s.name] for s, *_ in sequences()]

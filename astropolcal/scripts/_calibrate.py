@@ -189,7 +189,10 @@ def _own(texts):
     if len(pairs) > 1 and len({bool(groups) for _, groups in pairs}) > 1:
         raise ParameterError("--own: name the groups of all parameters, or of none")
     if pairs and pairs[0][1]:
-        return {name: groups.split(",") for name, groups in pairs}
+        found = {name: [group.strip() for group in groups.split(",")] for name, groups in pairs}
+        if empty := [name for name, groups in found.items() if not all(groups)]:
+            raise ParameterError(f"--own {empty[0]}=...: each group needs a name")
+        return found
     return [name for name, _ in pairs]
 
 

@@ -340,8 +340,8 @@ def sky_position(text, option):
         return SkyCoord(*angles, unit=u.deg)
     except (ValueError, u.UnitsError):
         raise ParameterError(
-            f"{option} {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00; allowed is a "
-            "declination from -90 to 90"
+            f"{option} {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00; allowed are "
+            "a right ascension from -360 to 360 deg and a declination from -90 to 90 deg"
         ) from None
 
 
@@ -414,6 +414,27 @@ def give(arguments, lines, content, *written):
         write_json(content, arguments.json)
     last = written_lines(written)
     say(arguments, *lines, *([""] if last else []), *last)
+
+
+def calibrated_instrument(calibration, path, name):
+    """Return the instrument of a calibration; it has to be the one that was named, if it was."""
+    own = calibration.instrument
+    if not (name or own):
+        raise InstrumentError(f"{path}: names no instrument; give --instrument NAME")
+    instrument = instruments.get(name or own)
+    if own and not instrument.answers_to(own):
+        words = f"the calibration is of instrument {own!r}, not {instrument.name!r}"
+        raise InstrumentError(f"{path}: {words}")
+    return instrument
+
+
+def faults_of(calibration, name):
+    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
+    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
+    if faults:
+        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+    return faults
 
 
 def write_calibration(calibration, arguments, content):

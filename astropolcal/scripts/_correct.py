@@ -156,6 +156,7 @@ def work(arguments):
     files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
+    faults = common.faults_of(calibration, provenance["calibration"])
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
@@ -205,7 +206,7 @@ def work(arguments):
         from astropolcal.plotting.correction import plot_corrected
 
         save(plot_corrected(result), arguments.plot, ObservationError)
-    summary = _summary(result, star, arguments, len(files))
+    summary = _summary(result, star, arguments, len(files)) | {"calibration_faults": faults}
     common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
@@ -295,6 +296,8 @@ def choose_calibration(arguments, files):
     # a folder is searched when it is known what the frames need
     calibration, digest = (None, None) if path.is_dir() else _read(path)
     name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
+    if calibration is not None and calibration.instrument:
+        common.calibrated_instrument(calibration, path, name)
     night = read_night(files, instruments.get(name))
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
@@ -445,6 +448,9 @@ def _words(summary, systematic, arguments):
     elif lost:
         verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
+    elif faults := summary.get("calibration_faults"):
+        verdict = f"NOT USABLE AS IT IS: the calibration is not: {faults[0]}"
+        advice = common.following("info", summary["calibration"])
     elif good < n:
         what = "poorly determined" if len(poor) == n - good else "without a value"
         verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"

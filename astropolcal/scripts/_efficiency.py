@@ -92,13 +92,9 @@ def _chain(arguments):
         chain, grid = instrument.published(), instrument.wavelength
         return instrument, _on_sky(instrument, chain, grid, arguments), grid, {}
     calibration = Calibration.read(arguments.file)
-    own, grid = calibration.instrument, calibration.wavelength
-    if not (arguments.instrument or own):
-        raise InstrumentError(f"{arguments.file}: names no instrument; give --instrument NAME")
-    instrument = instruments.get(arguments.instrument or own)
-    if own and not instrument.answers_to(own):
-        words = f"the calibration is of instrument {own!r}, not {instrument.name!r}"
-        raise InstrumentError(f"{arguments.file}: {words}")
+    grid = calibration.wavelength
+    instrument = common.calibrated_instrument(calibration, arguments.file, arguments.instrument)
+    common.faults_of(calibration, arguments.file)
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
     chain = _on_sky(instrument, chains[0], grid, arguments)

@@ -60,6 +60,10 @@ examples:
 def run(arguments):
     """Print what the file holds."""
     path = arguments.file
+    if arguments.instruments and path is not None:
+        raise AstropolcalError(f"{path}: --instruments goes without a file")
+    if path is None and (arguments.frame or arguments.context):
+        raise AstropolcalError("--frame and --context need a folder of calibrations")
     if arguments.instruments:
         common.say(arguments, *instruments.names())
         return
@@ -159,7 +163,13 @@ def _choice(library, frame):
     """Return which calibration of a library holds for a frame, and why none of the others."""
     from astropolcal.pipeline.loading import wanted_of
 
-    table = library.explain(**wanted_of(frame))
+    try:
+        wanted = wanted_of(frame)
+    except InstrumentError as error:
+        # an argument of Python is no way out in a terminal
+        words = str(error).partition("; give instrument=")[0]
+        raise InstrumentError(f"{frame}: {words}; give a raw frame, which does") from error
+    table = library.explain(**wanted)
     lines = [f"{row['name']}: {row['why']}" for row in table]
     problem = table.meta["problem"]
     rows = [dict(zip(table.colnames, map(str, row), strict=True)) for row in table]

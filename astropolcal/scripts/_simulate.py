@@ -54,7 +54,7 @@ _USUAL = {
 OPTIONS = f"""
 -o --output OBS.ecsv Output  the table (required without --cubes; with it, the true fluxes);
     overwritten if it exists
---instrument NAME =charis  default: charis
+--instrument NAME  default: that of --calibration, or charis
 --calibration CAL.asdf Input  take the chain from this file
 --hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25; of a star 0, 45,
     22.5 and 67.5)
@@ -90,8 +90,7 @@ def run(arguments):
     for name, default in _USUAL.items():
         if not arguments.cubes and getattr(arguments, name) != default:
             raise AstropolcalError(f"{common.label_of(name)}: is for --cubes DIR")
-    instrument = instruments.get(arguments.instrument)
-    chain, wavelength, meta = _truth(arguments, instrument)
+    instrument, chain, wavelength, meta = _truth(arguments)
     # free and prior mean nothing for what is true
     (chain,) = common.edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
@@ -158,16 +157,19 @@ def _frames(arguments, chain):
     return both_states(frames) if "flc_state" in stages(chain) else frames
 
 
-def _truth(arguments, instrument):
-    """Return the true chain, its wavelengths and the meta that describe its set-up."""
+def _truth(arguments):
+    """Return the instrument, its true chain, wavelengths and the meta that describe the set-up."""
     if arguments.calibration:
         from astropolcal.calibration import Calibration
 
         calibration = Calibration.read(arguments.calibration)
+        told = arguments.calibration, arguments.instrument
+        instrument = common.calibrated_instrument(calibration, *told)
         # a copy: it is edited
         chain, wavelength = calibration.chain.copy(), calibration.wavelength
         meta = dict(calibration.datasets[0].meta)
     else:
+        instrument = instruments.get(arguments.instrument or "charis")
         chain, wavelength = instrument.published(), instrument.wavelength
         meta = instrument.published_meta()
     # a calibration of stars has its telescope already
@@ -176,11 +178,13 @@ def _truth(arguments, instrument):
         if on_sky:
             words = "the chain begins on sky; give --source star and where it points"
             raise AstropolcalError(words)
-        return chain, wavelength, meta
+        return instrument, chain, wavelength, meta
     if not on_sky:
         if not any(leaf.stage == "hwp" for leaf in leaves(chain)):
             raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
         # its first optic is the source, behind which the telescope is as published
         star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
-        chain = join([star, *leaves(instrument.on_sky(chain))])
-    return chain, wavelength, meta | {"source": "star"}
+        known = {"wavelength": wavelength, "date": meta.get("date")}
+        told = {key: known[key] for key in instrument.sky_options}
+        chain = join([star, *leaves(instrument.on_sky(chain, **told))])
+    return instrument, chain, wavelength, meta | {"source": "star"}

@@ -223,6 +223,11 @@ def test_health_says_that_changes_about_a_restart_are_unsure(steady):
         (group,) = health(library, now="2021-01-01")["groups"]
         assert sum("whose errors are not in its own" in words for words in group["alarms"]) == count
         assert group["courses"]
+    # what lies before or after all runs is no reason for a change between two
+    for event, count in (("1990-01-01", 1), ("2031-01-01", 1), ("2020-03-01", 0)):
+        (group,) = health(library, now="2021-01-01", events=[event])["groups"]
+        words = f"event {event} is not between two of the runs, and has no part."
+        assert group["alarms"].count(words) == count, event
 
 
 @pytest.mark.slow

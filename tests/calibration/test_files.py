@@ -496,7 +496,7 @@ def test_stages_elsewhere_than_the_columns_say(path):
         again.with_observations(night, [positions] * 2)
 
 
-def test_file_says_for_what_it_holds(content):
+def test_file_says_for_what_it_holds(content, path):
     with asdf.open(io.BytesIO(content), _force_raw_types=True) as file:
         node = file["calibration"]
     assert node["validity"] == {
@@ -514,6 +514,18 @@ def test_file_says_for_what_it_holds(content):
     assert node["written_with"]["asdf"] == asdf.__version__
     assert set(node["written_with"]) == {"astropolcal", "asdf", "asdf-astropy", "astropy"}
     assert node["datasets"][1]["meta"]["n"] == 3
+    # it is no place to state it
+    for old, new in (
+        (b"valid_until: null", b"valid_until: '2026-01-01'"),
+        (b"valid_from: '2025-05-01'", b"valid_from: '2024-05-01'"),
+        (b"mode: null", b"mode: H"),
+    ):
+        before, key, after = content.rpartition(b"\n  validity:")
+        assert after.count(old) == 1, old
+        path.write_bytes(before + key + after.replace(old, new))
+        words = "validity: .* = '.*', but its content says .*: it was changed after"
+        with pytest.raises(CalibrationFileError, match=words):
+            Calibration.read(path)
 
 
 @pytest.mark.slow

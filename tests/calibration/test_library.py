@@ -730,6 +730,8 @@ def test_context_is_what_it_was(calibration, years, tmp_path):
 def test_archive_of_a_context(years, tmp_path_factory):
     folder, other = (tmp_path_factory.mktemp("archives") for _ in range(2))
     years.freeze("spring")
+    with refused("spring.tar: the name must end with .zip"):
+        years.export("spring", folder / "spring.tar")
     path = years.export("spring", folder / "spring.zip")
     assert import_context(path, other / "new") == "spring"
     for name in ("2025.asdf", "again.asdf", "spring.context.json"):

@@ -255,6 +255,10 @@ def test_a_sequence_that_fails_stops_no_other(lab, tmp_path, capsys):
     fits.setval(one, "RET-ANG1", value=0.0)
     status, summary = archive(lab, out, tree=tree)
     assert (status, summary["n_worked_on"], summary["n_failed"]) == (0, 1, 0)
+    # a product that is there already is not taken for that of this run
+    fits.setval(one, "RET-ANG1", value=1e9)
+    _, summary = archive(lab, out, tree=tree)
+    assert summary["failed"][name].endswith(f"; {name}.fits is that of an earlier run")
 
 
 @pytest.mark.slow

@@ -586,6 +586,7 @@ def test_laws_and_groups_that_do_not_fit_get_one_line(nights, capsys):
         (["--follow", "hwp.theta:Polynomial1D(1):time:soon"], "is not a date"),
         (["--own", "hwp.thetta"], "did you mean 'hwp.theta'"),
         (["--own", "hwp.theta=march"], "has 1 group for 2 datasets"),
+        (["--own", "hwp.theta=march,"], "--own hwp.theta=...: each group needs a name"),
         (["--own", "hwp.theta", "--own", "wollaston.efficiency=a,b"], "or of none"),
         (["--own", "hwp.theta", "--start", "old.asdf"], "--own cannot be combined with --start"),
     ):

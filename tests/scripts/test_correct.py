@@ -104,6 +104,23 @@ def test_cubes_to_product(night, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_product_is_not_usable_where_its_calibration_is_not(night, tmp_path, capsys):
+    calibration = Calibration.read(night / "charis.asdf")
+    calibration.fit["converged"] = False
+    calibration.write(tmp_path / "bad.asdf")
+    words = [night / "cubes", "-o", tmp_path / "out.fits", "--size", 31]
+    words += ["--json", tmp_path / "s.json", "--calibration"]
+    told = "the fit did not converge"
+    with pytest.warns(AstropolcalWarning, match=f"bad.asdf: NOT USABLE AS IT IS: {told}"):
+        command(*words, tmp_path / "bad.asdf")
+    assert f"NOT USABLE AS IT IS: the calibration is not: {told}\n" in capsys.readouterr().out
+    assert json.loads((tmp_path / "s.json").read_text())["calibration_faults"] == [told]
+    # what it leaves open is in the errors, of which the user may know better
+    command(*words, night / "charis.asdf", "--open-directions", "ignore")
+    assert "\nUsable" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_a_star_is_subtracted_and_told(night, tmp_path, capsys):
     out, summary = tmp_path / "out.fits", tmp_path / "s.json"
     paths, cal = sorted((night / "cubes").glob("*.fits"))[:4], night / "charis.asdf"
@@ -588,7 +605,10 @@ def test_files_that_cannot_be_read_leave_the_instrument_as_it_is():
 
 
 def test_file_that_holds_is_taken_with_its_hash(frames_with):
-    found = chosen(OLD, frames_with({}), optics_in=["nbs"])
+    # not one of another instrument, whatever its frames do not say
+    with pytest.raises(AstropolcalError, match="is of instrument 'charis', not 'irdis'"):
+        chosen(OLD, frames_with({}), optics_in=["nbs"], instrument="irdis", any_date=True)
+    found = chosen(OLD, frames_with({}), optics_in=["nbs"], instrument="SCExAO/CHARIS")
     assert found["calibration"] == str(OLD)
     assert found["calibration_hash"] == content_hash(Calibration.read(OLD))
 

@@ -3,15 +3,22 @@
 
 import json
 import re
+import warnings
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal import calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments
 from astropolcal.efficiency import polarimetric_efficiency
-from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    ChainError,
+    InstrumentError,
+    ParameterError,
+)
 from astropolcal.plotting import _style
 from astropolcal.scripts.main import build_parser
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -57,7 +64,14 @@ def test_more_than_one_is_explained(capsys):
 
 def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
     out = tmp_path / "out.json"
-    run(calibration, "--altitude", 50, "--parallactic", -30, "--json", out, "-q")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(calibration, "--altitude", 50, "--parallactic", -30, "--json", out, "-q")
+    bad = Calibration.read(calibration)
+    bad.fit["converged"] = False
+    bad.write(tmp_path / "bad.asdf")
+    with pytest.warns(AstropolcalWarning, match="bad.asdf: NOT USABLE AS IT IS: the fit did not"):
+        run(tmp_path / "bad.asdf", "-q")
     content = json.loads(out.read_text())
     assert content["wavelength_nm"] == pytest.approx([1200, 1600, 2200])
     assert np.shape(content["efficiency"]) == (7, 3)

@@ -82,6 +82,25 @@ def test_json_of_a_folder_and_what_is_wrong_in_it(folder, capsys):
     assert "OVERLAP: c.asdf" in text
 
 
+def test_options_of_a_folder_do_nothing_in_silence_nowhere(folder, capsys):
+    fits.PrimaryHDU().writeto(folder / "cube.fits")
+    for words, told in (
+        (["--frame", "a.fits"], "--frame and --context need a folder of calibrations"),
+        (["--context", "now"], "--frame and --context need a folder of calibrations"),
+        (["--instruments", OLD], "--instruments goes without a file"),
+        ([OLD, "--frame", "a.fits"], "are for a folder of calibrations"),
+        # of a terminal's options there is none for its instrument
+        (
+            [folder, "--frame", folder / "cube.fits"],
+            "cube.fits: which instrument? the header does not say it; give a raw frame",
+        ),
+    ):
+        assert main(["info", *map(str, words)]) == 2, words
+        complaint = capsys.readouterr().err
+        assert told in complaint, words
+        assert "instrument=" not in complaint, words
+
+
 def test_folder_without_calibrations(tmp_path, capsys):
     assert main(["info", str(tmp_path)]) == 0
     # a long path is wrapped

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from astropolcal import Observations, instruments
+from astropolcal import Observations, calibrate, instruments
 from astropolcal.chain import stages
+from astropolcal.correction import measurement_rows
 from astropolcal.reduction.cubes import DetectorModel, simulate_cubes
 from astropolcal.scripts.main import main
-from astropolcal.simulation import half_wave_plate_cycles
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
 STAR = ["--source", "star", "--altitude", "67,64", "--parallactic", "24,30"]
@@ -83,6 +84,26 @@ def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
     assert main(["calibrate", str(lamp), "-q", "-o", str(cal)]) == 0
     assert simulated("-o", table, "--calibration", cal, *STAR, "--derotator", "97") == 0
     assert Observations.read(table).n_bins == 22
+
+
+def test_a_calibration_brings_its_instrument(tmp_path, capsys):
+    irdis, band = instruments.get("irdis"), [1.625] * u.um
+    frames, chain = half_wave_plate_cycles(derotator=[10, 35, 60] * u.deg), irdis.chain
+    meta = irdis.published_meta() | {"date": "2018-03-20"}
+    lamp = simulate(chain(wavelength=band), band, frames, seed=1, meta=meta)
+    cal = calibrate(chain(wavelength=band), lamp, instrument="irdis", cross_validate=False)
+    cal.write(tmp_path / "cal.asdf")
+    argv = ["-o", tmp_path / "x.ecsv", "--calibration", tmp_path / "cal.asdf", "--no-noise"]
+    argv += [*STAR, "--derotator", "20"]
+    assert simulated(*argv) == 0
+    found = Observations.read(tmp_path / "x.ecsv")
+    # behind the mirrors of its own telescope, of that day
+    sky = irdis.on_sky(cal.chain, wavelength=band, date="2018-03-20")
+    positions = irdis.positions(found, sky)
+    right, left = measurement_rows(sky, positions, band)[:, 0, :, 0]
+    np.testing.assert_allclose(found.flux_right[:, 0] / found.flux_left[:, 0], right / left)
+    assert simulated(*argv, "--instrument", "charis") == 2
+    assert "calibration is of instrument 'irdis', not 'charis'" in capsys.readouterr().err
 
 
 def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys):

@@ -7,12 +7,13 @@ g-prior), averaged over three orders of magnitude, and over laws in wavelength o
 numbers per parameter, or one per wavelength.
 """
 
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
 from astropy.time import Time
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ParameterError
 
 __all__ = []
 
@@ -45,13 +46,16 @@ def chances_of(dates, events, usual):
     found = np.full(len(ordered) - 1, usual)
     for event in events:
         gap = int(np.searchsorted(ordered.mjd, moment_of(event, "event").mjd)) - 1
-        if 0 <= gap < len(found):
-            if found[gap] == EVENT:
-                raise ParameterError(
-                    f"event {event}: another one lies between {ordered[gap].isot[:10]} and "
-                    f"{ordered[gap + 1].isot[:10]} too; the data cannot tell them apart"
-                )
-            found[gap] = EVENT
+        if not 0 <= gap < len(found):
+            words = f"event {event} is not between two of the runs, and has no part"
+            warnings.warn(words, AstropolcalWarning, stacklevel=3)
+            continue
+        if found[gap] == EVENT:
+            raise ParameterError(
+                f"event {event}: another one lies between {ordered[gap].isot[:10]} and "
+                f"{ordered[gap + 1].isot[:10]} too; the data cannot tell them apart"
+            )
+        found[gap] = EVENT
     return found
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.chain import stages
+from astropolcal.chain import leaves, stages
 from astropolcal.measurement.parameters import are_outside, limits
 from astropolcal.optics import COORDINATES
 from astropolcal.words import HEIGHT, WIDTH, counted, listed, p_words, shortened
@@ -132,6 +132,7 @@ def verdict(calibration, targets=TARGETS):
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         if "restarted" in calibration.settings:
             cautions.append("errors of what is held are not in these")
+        cautions += _of_one_table(calibration)
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
@@ -236,6 +237,16 @@ def _mirrors(calibration, known):
                 f"{told}?"
             )
     return found
+
+
+def _of_one_table(calibration):
+    """Name what has values of its own in the tables: the sky is that of one of them."""
+    own, chains = calibration.settings.get("own") or {}, calibration.chains
+    seen = next((i for i, chain in enumerate(chains) if "parallactic" in stages(chain)), 0)
+    on_sky = {leaf.name for leaf in leaves(chain_from_sky([chains[seen]])[0])} if own else set()
+    names = [name for name, copies in own.items() if on_sky & {c.split(".")[0] for c in copies}]
+    if names:
+        yield f"on sky as in {calibration.datasets[seen].name}: own values of {', '.join(names)}"
 
 
 def _few(calibration):

@@ -50,8 +50,9 @@ def _errors_on_sky(calibration, view, targets, ignore):
     matrices, count = (covariance, *map(_products, along)), view.good.sum(axis=1)[:, None]
     for dolp, double in targets:
         weights = _weights(dolp, double).reshape(-1, 9)
+        # sums of squares: what cancels may come out a trifle below zero
         variance, known, is_open, blind = (
-            np.sum((matrix @ weights.T) * weights.T, axis=-2) for matrix in matrices
+            np.sum((matrix @ weights.T) * weights.T, axis=-2).clip(0) for matrix in matrices
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
         limit = STILL**2 * (known + is_open + blind)
