@@ -320,6 +320,25 @@ def test_what_is_open_is_infinite_and_what_it_leaves_alone_is_not(alone):
     assert np.isinf(faint["s_chi"]).all()
 
 
+def test_rounding_is_no_open_direction():
+    """The retardance of a plate turns no angle; what is computed of that is rounding."""
+    frames = half_wave_plate_cycles(derotator=[0, 30, 60, 90] * u.deg)
+    frames["lamp"] = frames.columns.pop("derotator")
+    grid = [0.5, 0.6, 0.7] * u.um
+    for retardance in ([172, 175, 178] * u.deg, 172 * u.deg):
+        train = (
+            optics.LinearPolarizer(mount="lamp", name="lamp", fixed={"theta": False})
+            | optics.LinearRetarder(retardance=retardance, mount="hwp", theta=0.3 * u.deg, name="p")
+            | optics.WollastonPrism(efficiency=0.97, name="prism")
+        )
+        for seed in (1, 2, 3):
+            data = simulate(train, grid, frames, flux=1e5, seed=seed)
+            cal = calibrate(train, data, weights="errors", cross_validate=False)
+            for table in target_accuracies(cal):
+                assert np.isfinite(table["s_chi"]).all()
+            assert cal.verdict().usable, cal.summary()
+
+
 def test_error_of_the_model_alone():
     """With a perfect fit it is all that there is: shares of q, of u and of the intensity."""
     cal = fitted(lamp(noise=False), fix={"hwp.theta": None, "derotator.theta": None})

@@ -33,6 +33,8 @@ from astropolcal.words import check_choice
 __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
 
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
+# of a sum of products, relative to its terms
+_ROUNDING = 1e-14
 
 
 def _errors_on_sky(calibration, view, targets, ignore):
@@ -53,8 +55,12 @@ def _errors_on_sky(calibration, view, targets, ignore):
         variance, known, is_open, blind = (
             np.sum((matrix @ weights.T) * weights.T, axis=-2) for matrix in matrices
         )
-        # as for any quantity derived from the parameters, see `Covariance.propagate`
-        limit = STILL**2 * (known + is_open + blind)
+        # as for any quantity derived from the parameters, see `Covariance.propagate`; what
+        # cancels leaves the rounding of its terms, of either sign
+        terms = np.trace(sum(matrices[1:]), axis1=-2, axis2=-1)[..., None]
+        limit = STILL**2 * np.abs(known + is_open + blind)
+        limit += _ROUNDING * terms * np.sum(weights**2, axis=-1)
+        variance = np.maximum(variance, 0.0)
         lost = blind > limit
         if not axes.partial:
             lost &= known <= limit
