@@ -77,7 +77,7 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
 
 def _behind_lamp(train, instrument):
     """Return the optics downstream of those of a lamp, none where it is not known which."""
-    entrance = None if instrument is None else instrument.entrance
+    entrance = Instrument.entrance if instrument is None else instrument.entrance
     # one that says nothing of it may have other optics upstream of its plate, too
     named = [i for i, o in enumerate(train) if o.name == entrance != Instrument.entrance]
     # a polarizer upstream of what modulates belongs to the lamp
