@@ -130,12 +130,15 @@ def frame_groups(observations):
 
 def _blocks(observations, count=8):
     """Return blocks of frames that were taken one after the other."""
-    shortest = min(o.n_frames for o in observations)
-    count = min(count, shortest // 4)
+    shortest = min(observations, key=lambda o: o.n_frames)
+    count = min(count, shortest.n_frames // 4)
     if count < 3:
+        least = f"twelve frames of {shortest.name}"
+        if any("derotator" in o.frame_columns for o in observations):
+            least = f"three derotator angles, or {least},"
         raise GapError(
-            f"too few frames to leave out in groups: {shortest} in the shortest dataset; "
-            "three derotator angles, or twelve frames, are the least"
+            f"too few frames to leave out in groups: {shortest.n_frames} in the shortest dataset; "
+            f"{least} are the least"
         )
     labels = [f"frames {i + 1} of {count}" for i in range(count)]
     return labels, [runs_of_frames(o.n_frames, count) for o in observations]

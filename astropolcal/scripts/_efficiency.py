@@ -69,10 +69,11 @@ def run(arguments):
     tabulated = not planned or any(a is not None for a in asked)
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
     arguments.parallactic = arguments.parallactic or 0.0
-    instrument, chain, grid, settings = _chain(arguments)
+    instrument, (chain, *others), grid, settings = _chains(arguments)
     found = None
     if not has_plate(chain):
-        content, lines, found = _any_modulation(arguments, instrument, chain, grid, settings)
+        chains = [chain, *others]
+        content, lines, found = _any_modulation(arguments, instrument, chains, grid, settings)
     else:
         content, lines = _table(arguments, instrument, chain, grid)
         if planned:
@@ -83,32 +84,32 @@ def run(arguments):
     common.give(arguments, lines, content, arguments.output, arguments.json)
 
 
-def _chain(arguments):
-    """Return instrument, chain from the sky and wavelengths."""
+def _chains(arguments):
+    """Return instrument, chains, that from the sky first, wavelengths and frames."""
     from astropolcal import Calibration
 
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
         chain, grid = instrument.published(), instrument.wavelength
-        return instrument, _on_sky(instrument, chain, grid, arguments), grid, {}
+        return instrument, [_on_sky(instrument, chain, grid, arguments)], grid, {}
     calibration = Calibration.read(arguments.file)
     grid = calibration.wavelength
     instrument = common.calibrated_instrument(calibration, arguments.file, arguments.instrument)
     common.faults_of(calibration, arguments.file)
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
-    chain = _on_sky(instrument, chains[0], grid, arguments)
-    return instrument, chain, grid, calibration.fit.get("sky_settings") or {}
+    chains[0] = _on_sky(instrument, chains[0], grid, arguments)
+    return instrument, chains, grid, calibration.fit.get("sky_settings") or {}
 
 
-def _any_modulation(arguments, instrument, chain, grid, settings):
+def _any_modulation(arguments, instrument, chains, grid, settings):
     """Return the efficiencies of the frames that were calibrated, of any modulator."""
     from astropolcal.calibration.identifiability.sky import chain_from_sky, sequence_of
 
     for option in ("derotator", "target", "night", "law"):
         if getattr(arguments, option):
             raise ParameterError(f"--{option}: is for instruments with a half-wave plate")
-    chain = chain_from_sky([chain])[0]
+    chain = chain_from_sky(chains, instrument, grid, arguments.date)[0]
     own = [stage for stage in stages(chain) if stage not in ("altitude", "parallactic")]
     placed = sequence_of(own, settings)
     if placed is None:

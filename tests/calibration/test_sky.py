@@ -2,10 +2,12 @@
 """What open directions and mirror branches do to bright and faint polarization on sky."""
 
 from dataclasses import replace
+from itertools import permutations
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
@@ -28,7 +30,9 @@ from astropolcal.calibration.identifiability.sky import (
     view_of_measurement,
 )
 from astropolcal.chain import join, leaves
+from astropolcal.correction.rows import sky_chain
 from astropolcal.exceptions import ParameterError
+from astropolcal.instruments import Instrument
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -301,6 +305,35 @@ def test_where_the_telescope_comes_from(alone):
     assert np.abs(plates["pupil"] - plates["field"]).max() > 0.1
 
 
+def test_accuracy_on_sky_does_not_depend_on_the_order_of_the_datasets(monkeypatch):
+    """What not all datasets have upstream belongs to the lamp, and what an instrument says."""
+    polarizer = optics.LinearPolarizer(mount="first", name="polarizer")
+    retarder = optics.LinearRetarder(retardance=80 * u.deg, mount="unit", name="retarder")
+    inner = [
+        optics.DiattenuatorRetarder(diattenuation=0.03, retardance=170 * u.deg, name="mirror"),
+        optics.LinearRetarder(retardance=125 * u.deg, mount="turning", name="modulator"),
+        optics.WollastonPrism(efficiency=0.98, name="prism"),
+    ]
+    frames = QTable({"turning": np.tile(np.arange(0, 180, 22.5), 6) * u.deg})
+    frames["first"] = frames["unit"] = np.repeat(np.arange(0, 180, 30), 8) * u.deg
+    parts = []
+    for unit in ([polarizer], [polarizer, retarder], []):
+        chain = join([*unit, *inner])
+        parts.append((chain, simulate(chain, [0.5, 0.6] * u.um, frames, name=f"{len(unit)}")))
+    found = []
+    for some in permutations(parts):
+        cal = calibrate(*map(list, zip(*some, strict=True)), weights="errors", cross_validate=False)
+        found.append([table["s_p"].value for table in target_accuracies(cal)])
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found, [found[0]] * len(found), rtol=1e-3)
+    # of a single dataset the instrument tells what a star's light meets first
+    known = type("Known", (Instrument,), {"name": "known", "entrance": "mirror", "chain": None})
+    monkeypatch.setattr(instruments, "_REGISTRY", instruments._REGISTRY | {"known": known})
+    cal = calibrate(*parts[1], instrument="known", cross_validate=False)
+    assert [leaf.name for leaf in leaves(sky_chain(cal))] == ["mirror", "modulator", "prism"]
+    assert next(iter(leaves(view_of_calibration(cal).chain))).name == "mirror"
+
+
 def test_what_is_open_is_infinite_and_what_it_leaves_alone_is_not(alone):
     """Without telescope the open directions turn the AoLP and do nothing else."""
     bare = replace(alone, settings=alone.settings | {"instrument": None})
@@ -318,6 +351,25 @@ def test_what_is_open_is_infinite_and_what_it_leaves_alone_is_not(alone):
     assert np.isfinite(faint["s_p"]).all()
     # an unpolarized target has no angle
     assert np.isinf(faint["s_chi"]).all()
+
+
+def test_rounding_is_no_open_direction():
+    """The retardance of a plate turns no angle; what is computed of that is rounding."""
+    frames = half_wave_plate_cycles(derotator=[0, 30, 60, 90] * u.deg)
+    frames["lamp"] = frames.columns.pop("derotator")
+    grid = [0.5, 0.6, 0.7] * u.um
+    for retardance in ([172, 175, 178] * u.deg, 172 * u.deg):
+        train = (
+            optics.LinearPolarizer(mount="lamp", name="lamp", fixed={"theta": False})
+            | optics.LinearRetarder(retardance=retardance, mount="hwp", theta=0.3 * u.deg, name="p")
+            | optics.WollastonPrism(efficiency=0.97, name="prism")
+        )
+        for seed in (1, 2, 3):
+            data = simulate(train, grid, frames, flux=1e5, seed=seed)
+            cal = calibrate(train, data, weights="errors", cross_validate=False)
+            for table in target_accuracies(cal):
+                assert np.isfinite(table["s_chi"]).all()
+            assert cal.verdict().usable, cal.summary()
 
 
 def test_error_of_the_model_alone():

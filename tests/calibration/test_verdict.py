@@ -86,6 +86,29 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     assert held.verdict().words[1].endswith("deg")
 
 
+def test_beams_are_no_suspects_where_frames_are_wrong_or_there_is_one_beam():
+    """A frame whose plate stood elsewhere, and a plate that is always off by its own angle."""
+    plate = optics.LinearRetarder(retardance=125 * u.deg, mount="turning", name="plate")
+    lamp = optics.LinearPolarizer(mount="first", name="lamp", fixed={"theta": False})
+    frames = QTable({"turning": np.tile(np.arange(0, 180, 22.5), 6) * u.deg})
+    frames["first"] = np.repeat(np.arange(7, 180, 30), 8) * u.deg
+    frames["group"] = np.repeat(np.arange(6), 8)
+    one, wave = np.arange(48) == 20, 0.4 * np.sin(2 * frames["turning"])
+    for analyser, off, asked in [
+        (optics.WollastonPrism(efficiency=0.98, name="prism"), 2 * one, "wrong frames?"),
+        (optics.LinearPolarizer(name="analyser"), wave, "diagnose: why"),
+    ]:
+        chain = lamp | plate | analyser
+        data = simulate(chain, [0.5, 0.6] * u.um, frames, flux=1e6, seed=1, name="run")
+        table = data.to_table()
+        table["turning"] += np.repeat(off, 2) * u.deg
+        cal = calibrate(chain, Observations.from_table(table, name="run"), cross_validate=False)
+        lines = fits_a_terminal(cal)
+        assert asked in lines[0], lines
+        at_odds = "At odds     frame 20 of run, by " in cal.summary()
+        assert at_odds is (asked == "wrong frames?"), cal.summary()
+
+
 @pytest.mark.slow
 def test_exchanged_beams_are_asked_about_where_little_else_shows_them(example):
     """With polarizer and plate held, the other angles make up for all but 1.2 % of polarization."""

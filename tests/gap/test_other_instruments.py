@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from gap_setups import SETUPS, Cassegrain, Rotating, irdis_star
 
 from astropolcal import optics
@@ -69,6 +70,40 @@ def test_an_optic_that_is_absent_has_no_effect_of_its_own():
     assert not get_effect("hwp_tilt:other").applies([Rotating().chain()])
     with pytest.raises(GapError, match="no effect 'beam_gain:other'"):
         get_effect("beam_gain:other")
+
+
+def test_an_optic_is_the_same_in_all_datasets_whatever_is_upstream_of_it():
+    """A calibration unit of polarizer and retarder, and the light of a lamp without it."""
+    free = {"fixed": {"theta": False}, "bounds": {"theta": (-5, 5)}}
+    polarizer = optics.LinearPolarizer(mount="first", name="polarizer", **free)
+    retarder = optics.LinearRetarder(retardance=80 * u.deg, mount="unit", name="retarder", **free)
+    inner = [
+        optics.DiattenuatorRetarder(diattenuation=0.03, retardance=170 * u.deg, name="mirror"),
+        optics.LinearRetarder(retardance=125 * u.deg, mount="turning", name="modulator", **free),
+        optics.WollastonPrism(efficiency=0.98, name="prism"),
+    ]
+    chains = [join([*unit, *inner]) for unit in ([polarizer], [polarizer, retarder], [])]
+    at = [("first", [0, 45, 90, 135]), ("unit", [0, 30, 60, 90, 120, 150]), ("first", [0])]
+    data = []
+    for chain, (stage, angles) in zip(chains, at, strict=True):
+        frames = QTable({"first": np.zeros(8 * len(angles)) * u.deg})
+        frames[stage] = np.repeat(angles, 8) * u.deg
+        frames["turning"] = np.tile(np.arange(8) * 22.5, len(angles)) * u.deg
+        data.append(simulate(chain, [0.5, 0.6, 0.7] * u.um, frames, name=f"run {len(data)}"))
+    found = {one.name: one for one in adapted(EFFECTS.values(), chains)}
+    for effect in found.values():
+        check_effect(effect.name, chains, data)
+    for name, place, there in [
+        ("hwp_diattenuation:modulator", "modulator", 3),
+        ("hwp_diattenuation:retarder", "retarder", 1),
+        ("static_diattenuator", "prism", 3),
+    ]:
+        edited = found[name].edit(chains, Context(np.ones(3))).chains
+        trains = [[leaf.name for leaf in leaves(chain)] for chain in edited]
+        upstream = [train[train.index(place) - 1] for train in trains if place in train]
+        assert upstream == [f"gap_{name}".replace(":", "_")] * there
+        assert "half-wave" not in found[name].title
+    assert found["static_diattenuator"].title.endswith("modulator")
 
 
 def test_law_of_the_plate_is_that_of_each_datasets_instrument():

@@ -22,10 +22,11 @@ def errors(squares, counts=None, whitened=None):
     return HeldOut([f"group {i}" for i in range(len(squares))], squares, whitened, counts)
 
 
-def table(n_frames, derotator=None):
+def table(n_frames, derotator=None, name="night"):
     """A dataset with the positions of its frames, degree, and nothing else."""
     columns = {} if derotator is None else {"derotator": np.deg2rad(derotator)}
     return SimpleNamespace(
+        name=name,
         n_frames=n_frames,
         frame_columns=list(columns),
         position=lambda name: columns[name],
@@ -132,6 +133,10 @@ def test_too_few_frames():
     for n in [1, 11]:
         with pytest.raises(GapError, match=rf"{n} in the shortest dataset; .*twelve frames"):
             frame_groups([table(100), table(n)])
+        for angles, words in ((None, ""), ([45.0] * n, "three derotator angles, or ")):
+            short = table(n, angles, name="short")
+            with pytest.raises(GapError, match=f"; {words}twelve frames of short,? are the least"):
+                frame_groups([table(100), short])
 
 
 # ---- fits ----------------------------------------------------------------------------------

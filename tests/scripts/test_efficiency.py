@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal import Calibration, calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.efficiency import polarimetric_efficiency
 from astropolcal.exceptions import (
     AstropolcalError,
@@ -218,3 +218,21 @@ def test_without_a_half_wave_plate_it_is_that_of_the_frames_that_were_calibrated
         run(path, "--derotator", 45)
     with pytest.raises(ChainError, match="demodulation gives the efficiencies of its frames"):
         polarimetric_efficiency(chain, roman.wavelength, parallactic=0 * u.deg)
+
+
+def test_frames_are_those_of_all_datasets_whichever_comes_first(tmp_path, capsys, monkeypatch):
+    """The first has a calibration unit, whose angles are not those of the light of a star."""
+    known = type("Known", (instruments.Instrument,), {"name": "known", "chain": None})
+    monkeypatch.setattr(instruments, "_REGISTRY", instruments._REGISTRY | {"known": known})
+    inner = optics.LinearRetarder(retardance=125 * u.deg, mount="turning", name="plate")
+    inner |= optics.WollastonPrism(efficiency=0.98, name="prism")
+    unit = optics.LinearRetarder(retardance=80 * u.deg, mount="unit", name="retarder")
+    lamp = optics.LinearPolarizer(mount="first", name="polarizer")
+    frames = QTable({"turning": np.tile(np.arange(0, 180, 22.5), 6) * u.deg})
+    frames["first"] = frames["unit"] = np.repeat(np.arange(0, 180, 30), 8) * u.deg
+    chains = [lamp | unit | inner, inner]
+    data = [simulate(one, [0.5] * u.um, frames, name=one.submodel_names[0]) for one in chains]
+    path = tmp_path / "cal.asdf"
+    calibrate(chains, data, instrument="known", cross_validate=False).write(path)
+    run(path)
+    assert "Efficiencies of 8 frames of known" in capsys.readouterr().out

@@ -21,9 +21,9 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.calibration.system import Rows, free_of, from_first_stage, inverse_rows
 from astropolcal.chain import join, leaves, stages, standing
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw
-from astropolcal.instruments.base import without_nuisance
+from astropolcal.instruments.base import Instrument, without_nuisance
 from astropolcal.optics import COORDINATES, LinearPolarizer
 from astropolcal.optics.positions import MOVES
 
@@ -64,11 +64,30 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
         known = {"wavelength": wavelength, "date": date}
         options = {key: known[key] for key in instrument.sky_options}
         return instrument.on_sky(chains[0], **options), PUBLISHED
-    train = leaves(without_nuisance(chains[0]))
+    trains = [leaves(without_nuisance(chain)) for chain in chains]
+    # what is upstream of all that every dataset has belongs to the lamp, too
+    shared = set.intersection(*({(type(o), o.mount) for o in train} for train in trains))
+    found = [_behind_lamp(train, instrument) for train in trains]
+    starts = [[(type(o), o.mount) in shared for o in train] for train in found]
+    behind = [o[i.index(True) :] for o, i in zip(found, starts, strict=True) if any(i)]
+    if not behind:
+        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
+    return join(max(behind, key=len)), LEFT_OUT
+
+
+def _behind_lamp(train, instrument):
+    """Return the optics downstream of those of a lamp, none where it is not known which."""
+    entrance = Instrument.entrance if instrument is None else instrument.entrance
+    # one that says nothing of it may have other optics upstream of its plate, too
+    named = [i for i, o in enumerate(train) if o.name == entrance != Instrument.entrance]
     # a polarizer upstream of what modulates belongs to the lamp
     lamp = [i for i, leaf in enumerate(train) if isinstance(leaf, LinearPolarizer) and leaf.stage]
-    lamp = [i for i in lamp if any(leaf.stage for leaf in train[i + 1 :])]
-    return join(train[lamp[-1] + 1 :]) if lamp else from_first_stage(join(train)), LEFT_OUT
+    lamp = [i + 1 for i in lamp if any(leaf.stage for leaf in train[i + 1 :])]
+    if named or lamp:
+        return train[(named or lamp)[-1] :]
+    with suppress(ChainError):
+        return leaves(from_first_stage(join(train)))
+    return []
 
 
 def settings_of(measurement):

@@ -124,8 +124,8 @@ def verdict(calibration, targets=TARGETS):
         excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         if excess > _CLEARLY:
-            why = "beams exchanged?" if _worst(calibration, "s_res") > _MAYBE.value else "why"
-            cautions.append(f"residuals {excess:.2g} times the noise (astropolcal diagnose: {why})")
+            why = f"astropolcal diagnose: {_suspected(calibration)}"
+            cautions.append(f"residuals {excess:.2g} times the noise ({why})")
         cautions += [f"at its bound: {', '.join(at_bound)}"] if at_bound else []
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
@@ -267,6 +267,15 @@ def _misfit(calibration):
     if not worst > _MISFIT.value or not _excess(calibration):
         return ""
     return f"the model misses the data by {worst:.2g} %, {_excess(calibration):.2g} times the noise"
+
+
+def _suspected(calibration):
+    """Ask about the mistake of a table that residuals of more than a percent look like."""
+    if not _worst(calibration, "s_res") > _MAYBE.value:
+        return "why"
+    if calibration.fit.get("outliers"):
+        return "wrong frames?"
+    return "why" if calibration.settings.get("observable") == "intensity" else "beams exchanged?"
 
 
 def _absurd(free):
@@ -485,14 +494,18 @@ def compact_lines(calibration, found, height=HEIGHT):
 def _fit(calibration):
     """Say how the fit ended, and how good it is."""
     fit, n = calibration.fit, len(calibration.covariance)
-    outliers = len(fit.get("outliers") or [])
     yield (
         f"Fit         {counted(n, 'parameter')}, {fit['n_data']} data, rank "
         f"{calibration.identifiability.rank}, {calibration.settings['strategy']}, "
         + ("converged" if calibration.converged else "NOT CONVERGED")
-        + (f"; {counted(outliers, 'pair')} of frames at odds" if outliers else "")
         + ("" if calibration.posterior is None else ", sampled")
     )
+    outliers = sorted(fit.get("outliers") or [], key=lambda one: -one["sigma"])
+    for one in outliers[:1]:
+        what = "frames" if "," in one["frames"] else "frame"
+        more = f"; {len(outliers) - 1} more" if len(outliers) > 1 else ""
+        told = f"{what} {one['frames']} of {one['dataset']}, by {one['sigma']:.0f} robust sigma"
+        yield f"At odds     {told}{more}"
     s_res, s_cv = (_worst(calibration, key) for key in ("s_res", "s_cv"))
     left_out = f", s_cv {s_cv:.2g} %" if np.isfinite(s_cv) else ""
     datasets = "worst dataset, " if len(calibration.datasets) > 1 else ""

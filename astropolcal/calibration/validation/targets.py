@@ -33,6 +33,8 @@ from astropolcal.words import check_choice
 __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
 
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
+# of a sum of products, relative to its terms
+_ROUNDING = 1e-14
 
 
 def _errors_on_sky(calibration, view, targets, ignore):
@@ -50,12 +52,14 @@ def _errors_on_sky(calibration, view, targets, ignore):
     matrices, count = (covariance, *map(_products, along)), view.good.sum(axis=1)[:, None]
     for dolp, double in targets:
         weights = _weights(dolp, double).reshape(-1, 9)
-        # sums of squares: what cancels may come out a trifle below zero
+        # sums of squares: what cancels leaves the rounding of its terms, of either sign
         variance, known, is_open, blind = (
             np.sum((matrix @ weights.T) * weights.T, axis=-2).clip(0) for matrix in matrices
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
+        terms = np.trace(sum(matrices[1:]), axis1=-2, axis2=-1)[..., None]
         limit = STILL**2 * (known + is_open + blind)
+        limit += _ROUNDING * terms * np.sum(weights**2, axis=-1)
         lost = blind > limit
         if not axes.partial:
             lost &= known <= limit

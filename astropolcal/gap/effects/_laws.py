@@ -334,15 +334,16 @@ class Held(Effect):
 
     def edit(self, chains, context):
         """Return the chains with the parameters free; see `Effect.edit`."""
-        edited, added = [], {}
-        for chain in chains:
-            optic, keys = self.held(self.roles(chain))
-            if keys:
-                fresh, found = self.released(optic, keys, context)
-                # a dict, for the same parameter in two datasets is one
-                added |= {one.name: one for one in found}
-                chain = replace_optic(chain, optic.name, fresh)
-            edited.append(chain)
+        edited, added = list(chains), {}
+        held = [self.held(self.roles(chain)) for chain in chains]
+        for name, keys in {optic.name: keys for optic, keys in held if keys}.items():
+            for i, chain in enumerate(edited):
+                # free in every dataset that has the optic, whatever it is for there
+                if any(optic.name == name for optic in leaves(chain)):
+                    fresh, found = self.released(chain[name], keys, context)
+                    # a dict, for the same parameter in two datasets is one
+                    added |= {one.name: one for one in found}
+                    edited[i] = replace_optic(chain, name, fresh)
         return Edit(edited, list(added.values()))
 
     def released(self, optic, keys, context):

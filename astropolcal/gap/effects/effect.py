@@ -443,11 +443,14 @@ class Effect:
         """Return the effect once for each optic of its kind, itself for the first."""
         if self.acts_on is None or self.optic is not None:
             return [self]
-        every = [Roles(chain).all(self.acts_on) for chain in chains]
+        every = [[o.name for o in Roles(chain).all(self.acts_on)] for chain in chains]
+        names = dict.fromkeys(name for found in every for name in found)
+        first = {found[0] for found in every if found}
+        if any(name in first for found in every for name in found[1:]):
+            # which one is first depends on the dataset: none has the plain name
+            return [self.at(name) for name in names]
         # the first of a kind keeps the plain name, in whichever dataset it is
-        first = {found[0].name for found in every if found}
-        others = dict.fromkeys(o.name for found in every for o in found if o.name not in first)
-        return [self, *(self.at(name) for name in others)]
+        return [self, *(self.at(name) for name in names if name not in first)]
 
     def per_run(self, runs):
         """Return itself, or once for each run in which it may differ: of two only the second."""

@@ -180,8 +180,12 @@ class Roles:
         self.star = next((o for o in stars if isinstance(o, optics.PolarizedSource)), None)
         self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
         #: What static optics of the relay stand behind; others stand behind the plate, too.
-        self.relay = self.derotator or self.plate
-        turning = [o for o in (self.derotator, self.plate) if o is not None]
+        plates = self._kinds["plate"]
+        if plates and plates[0].stage != "hwp":
+            # without a half-wave plate they come in the order of the light
+            plates = plates[::-1]
+        turning = [o for o in (self.derotator, *plates[:1]) if o is not None]
+        self.relay = next(iter(turning), None)
         self._kinds["turning"] = turning
         self.turning = next((o for o in turning if chosen.get("turning") in (None, o.name)), None)
         #: The plate, where the model has nothing in front of it that could polarize.
@@ -265,9 +269,10 @@ def adapted(effects, chains, runs=()):
     for i, one in enumerate(found):
         words = {}
         if own_name and one.acts_on == "plate":
-            words["half-wave plate"] = one.optic or plates[0].name
+            words |= {"half-wave plate": one.optic or plates[0].name, f" ({one.optic})": ""}
         if all(roles.derotator is None for roles in every):
-            words[_BEHIND] = f"downstream of the {plates[0].name}" if own_name else _BEHIND_PLATE
+            relay = next((roles.relay for roles in every if roles.relay), None)
+            words[_BEHIND] = f"downstream of the {relay.name}" if own_name else _BEHIND_PLATE
         elif one.acts_on == "turning" and one.optic:
             words[_BEHIND] = f"downstream of the {one.optic}" if own_name else _BEHIND_PLATE
             words[f" ({one.optic})"] = ""
