@@ -250,3 +250,25 @@ def test_an_error_is_as_long_as_the_valley():
     made = profile(cal, names[0], values=np.linspace(-0.6, 0.6, 17))
     low, high = made.interval(rise=4)
     assert stds[0] == pytest.approx(max(high - made.best, made.best - low) / 2, rel=0.2)
+
+
+def test_an_error_of_common_parameters_is_as_long_as_the_valley():
+    """Two angles of a rotator that all wavelengths share: a diattenuation of 0.7 fits as well."""
+    truth = join(
+        [
+            optics.LinearPolarizer(name="polarizer"),
+            optics.LinearRetarder(retardance=172 * u.deg, mount="hwp", name="hwp"),
+            optics.DiattenuatorRetarder(
+                diattenuation=0.014, retardance=120 * u.deg, mount="rotator", name="rotator"
+            ),
+            optics.WollastonPrism(name="wollaston"),
+        ]
+    )
+    truth["polarizer"].theta.fixed = True
+    plates, rotators = np.meshgrid(np.arange(5, 95, 11.25), [0, 165])
+    frames = QTable({"hwp": plates.ravel() * u.deg, "rotator": rotators.ravel() * u.deg})
+    for seed in (3, 8, 9):
+        data = simulate(truth, LAM, frames, flux=5e5, seed=seed)
+        cal = calibrate(truth, data, cross_validate=False)
+        off = abs(cal.chain["rotator"].diattenuation.value - 0.014)
+        assert off < 3 * cal.covariance.std("rotator.diattenuation"), seed

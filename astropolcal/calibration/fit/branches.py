@@ -60,20 +60,22 @@ ROUNDED = 1e-6
 class BinProblem(Problem):
     """The fit of the parameters given per wavelength, all bins at once.
 
-    As long as no noise is known against which they could weigh, priors are left out.
+    As long as no noise is known against which they could weigh, priors are left out. With
+    ``together`` all wavelengths are one bin.
     """
 
-    def __init__(self, measurement, weighting):
+    def __init__(self, measurement, weighting, together=False):
         super().__init__(measurement, weighting)
         self.noise = self.noise if weighting.is_known else 0.0
-        self.n_bins = len(measurement.wavelength)
+        self.n_bins = 1 if together else len(measurement.wavelength)
+        bins = np.zeros_like(measurement.bins) if together else measurement.bins
         # with a single bin every parameter belongs to it
         self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
         # the data of each bin, padded, and which of them are real
-        counts = np.bincount(measurement.bins, minlength=self.n_bins)
+        counts = np.bincount(bins, minlength=self.n_bins)
         self._present = np.arange(counts.max()) < counts[:, None]
         self._data = np.zeros(self._present.shape, dtype=int)
-        self._data[self._present] = np.argsort(measurement.bins, kind="stable")
+        self._data[self._present] = np.argsort(bins, kind="stable")
         starts = np.array([slot.start for slot in self.slots], dtype=int)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
         self.elements = starts[:, None] + np.arange(self.n_bins)
@@ -369,13 +371,16 @@ def undecided_signs(measurement, view, stds):
 def bent_valleys(measurement, whitened, stds):
     """Return how far parameters of a wavelength may go where chi-square is not a parabola.
 
+    Where none is given per wavelength, these are all parameters, and all wavelengths are one.
+
     Each is an element of the flat vector, a direction, (n_free,) in canonical units, and by how
     much the element may fall and rise. The direction is as long as a standard error: half the way
     at which chi-square has risen by four, common parameters held and all others of the wavelength
     refitted, to the side where it is longer. Where scatter makes the stated error, ``stds``, larger
     than that of white noise, chi-square has to rise by as much more.
     """
-    problem, vector = BinProblem(measurement, measurement.weighting), measurement.vector()
+    together = not any(slot.per_wavelength for slot in measurement.free.slots)
+    problem, vector = BinProblem(measurement, measurement.weighting, together), measurement.vector()
     level, scale, found = measurement.weighting.level, whitened.scale, []
     with np.errstate(divide="ignore", invalid="ignore"):
         times = stds / (level * np.sqrt(np.diag(whitened.covariance())))

@@ -380,7 +380,7 @@ def curved_directions(free, vector, valleys, stds, sky_of):
         others = f" (and at {len(own) - 1} more wavelengths)" if len(own) > 1 else ""
         words = (
             f"{free.names[worst]} is anywhere from {low:.3g} to {high:.3g}{unit}{others}: other "
-            "parameters of its wavelength make up for it, farther than their slopes tell"
+            "parameters make up for it, farther than their slopes tell"
         )
         change = np.sum([direction for _, direction, _ in own], axis=0)
         entry = {"words": words, "parameters": plain(_moved(free, change / free.steps))}
