@@ -89,6 +89,8 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 """
 # share of the light in the aperture that the edge of the images may have on its area
 _MOST_SKY = 0.01
+# degrees by which a derotator may miss the law of what it is said to keep
+_OFF_LAW = 1.0
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -162,6 +164,7 @@ def work(arguments):
     table, centres, scale, detectors = survey_frames(
         files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
+    _warn_of_rotation(table, arguments.rotation, instrument.sky_law)
     frames = ScienceFrames.from_files(
         files,
         instrument,
@@ -367,6 +370,29 @@ def _position_angles(table, arguments):
     if "parallactic" not in table.colnames:
         raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
     return angle + table["parallactic"]
+
+
+def _warn_of_rotation(table, rotation, law):
+    """Warn where the derotator kept still what would have turned with the --rotation."""
+    kept = {"fixed": ("field", "pupil"), "pupil": ("pupil", "field")}.get(rotation, ())
+    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
+    if not (kept and known and set(kept) <= set(law.derotator)):
+        return
+    off = []
+    for f, g in map(law.derotator_law, kept):
+        # half a turn is none
+        twice = 2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"])
+        turns = np.exp(1j * twice.to_value(u.rad))
+        off.append(np.degrees(np.abs(np.angle(turns / turns.sum())).max()) / 2)
+    if off[0] > _OFF_LAW and off[0] > 3 * off[1]:
+        others = {"field": "fixed", "pupil": "pupil"}
+        warnings.warn(
+            f"--rotation {rotation}: the derotator is up to {off[0]:.1f} deg off the law by which "
+            f"it keeps the {kept[0]}, and {off[1]:.1f} deg off that by which it keeps the "
+            f"{kept[1]} (--rotation {others[kept[1]]}): images may be turned wrongly",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
 
 
 # names and keys of degree and angle, their unit, its factor and the form of the number
