@@ -375,7 +375,7 @@ def _position_angles(table, arguments):
 
 
 def _warn_of_rotation(table, rotation, law):
-    """Warn where the derotator kept still what would have turned with the --rotation."""
+    """Warn where the derotator held fixed what --rotation says to have turned."""
     kept = {"fixed": ("field", "pupil"), "pupil": ("pupil", "field")}.get(rotation, ())
     known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
     if not (kept and known and set(kept) <= set(law.derotator)):
