@@ -100,6 +100,15 @@ def test_a_header_that_says_too_little_is_an_error_of_the_file(science, tmp_path
     assert doubt.startswith("no keyword ESO INS4 DROT3 END in 1 frame")
 
 
+def test_frames_of_both_kinds_of_tracking_are_refused_in_any_order(science, tmp_path):
+    one, other = copied(science, tmp_path)[:2]
+    fits.setval(other, "HIERARCH ESO INS4 COMB ROT", value="PUPIL")
+    for files in ([one, other], [other, one]):
+        layout = Small().configured(fits.getheader(files[0])).files
+        with pytest.raises(ObservationError, match="but the first file has another: frames of one"):
+            survey_frames(files, layout)
+
+
 def test_filter_and_size_are_those_of_the_file():
     one = IRDIS_.configured({"ESO INS1 FILT ID": "FILT_BBF_J", "NAXIS1": 400, "NAXIS2": 200})
     assert (one.wavelength, one.files.shape) == ([1.245] * u.um, (1, 200, 400))

@@ -302,7 +302,14 @@ class IrdisLayout(FileLayout):
 
     def from_header(self, header):
         """Return a header with the angles, and the time, in the middle of the exposure."""
-        (row,) = frame_table([header], self.site, self.sky_law)
+        table = frame_table([header], self.site, self.sky_law)
+        (row,), kind = table, table.meta.get("tracking")
+        # of a lamp there is none
+        if kind and self.sky_law.plate_law(kind) != self.tracking:
+            raise ObservationError(
+                f"{_ROTATION} = {kind.upper()}, but the first file has another: frames of one kind "
+                "of tracking are needed"
+            )
         angles = KEYWORDS.keys() & set(row.colnames)
         known = {KEYWORDS[name]: row[name].to_value(u.deg) for name in angles}
         with offline():

@@ -89,6 +89,10 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 """
 # share of the light in the aperture that the edge of the images may have on its area
 _MOST_SKY = 0.01
+# signal to noise of a degree of polarization above which the error of its angle holds
+_CLEAR = 3.0
+# degrees by which a derotator may miss the law of what it is said to keep
+_OFF_LAW = 1.0
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -163,6 +167,7 @@ def work(arguments):
     table, centres, scale, detectors = survey_frames(
         files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
     )
+    _warn_of_rotation(table, arguments.rotation, instrument.sky_law)
     frames = ScienceFrames.from_files(
         files,
         instrument,
@@ -372,6 +377,29 @@ def _position_angles(table, arguments):
     return angle + table["parallactic"]
 
 
+def _warn_of_rotation(table, rotation, law):
+    """Warn where the derotator held fixed what --rotation says to have turned."""
+    kept = {"fixed": ("field", "pupil"), "pupil": ("pupil", "field")}.get(rotation, ())
+    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
+    if not (kept and known and set(kept) <= set(law.derotator)):
+        return
+    off = []
+    for f, g in map(law.derotator_law, kept):
+        # half a turn is none
+        twice = 2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"])
+        turns = np.exp(1j * twice.to_value(u.rad))
+        off.append(np.degrees(np.abs(np.angle(turns / turns.sum())).max()) / 2)
+    if off[0] > _OFF_LAW and off[0] > 3 * off[1]:
+        others = {"field": "fixed", "pupil": "pupil"}
+        warnings.warn(
+            f"--rotation {rotation}: the derotator is up to {off[0]:.1f} deg off the law by which "
+            f"it keeps the {kept[0]}, and {off[1]:.1f} deg off that by which it keeps the "
+            f"{kept[1]} (--rotation {others[kept[1]]}): images may be turned wrongly",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
+
+
 # names and keys of degree and angle, their unit, its factor and the form of the number
 _POLARIZATION = (
     ("DoLP", "degree", "dolp", "s_p", " %", 100, ".2f"),
@@ -428,6 +456,14 @@ def _words(summary, systematic, arguments):
     lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
     found, accuracy, lost = _polarization(star, is_open)
     lines += found
+    # an error to first order, of an angle that hardly any light has
+    known = star["s_p_statistical"] > 0
+    if 2 * (star["dolp"] < _CLEAR * star["s_p_statistical"])[known].sum() > known.sum():
+        line = (
+            f"the degree is below {_CLEAR:g} statistical errors: the statistical error of the "
+            "angle is then too small"
+        )
+        lines.append(common.wrapped(f"    {line}", indent=6))
     if held := summary.get("held"):
         line = f"  without error, as not free in the calibration: {', '.join(held)}"
         lines.append(common.wrapped(line, indent=4))

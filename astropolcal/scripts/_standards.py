@@ -30,7 +30,7 @@ name NAME ?  a star, such as 'HD 293396'
 --radius DEG float  goes with --near (default: 15)
 --site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
 --night YYYY-MM-DD  date of the evening at the site
---min-altitude DEG float  lowest altitude (default: 30)
+--min-altitude DEG float  goes with --night: lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
 --plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
@@ -71,7 +71,7 @@ def _check(arguments):
         raise ParameterError("--radius goes with --near RA,DEC")
     if arguments.limit is not None and arguments.limit < 1:
         raise ParameterError(f"--limit {arguments.limit}: allowed are whole numbers from 1 up")
-    for option in ("kind", "magnitude", "near", "limit"):
+    for option in ("kind", "band", "magnitude", "near", "limit"):
         if arguments.name and getattr(arguments, option) is not None:
             raise ParameterError(f"--{option} selects among stars; it does not go with a NAME")
 

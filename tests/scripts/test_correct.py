@@ -2,6 +2,9 @@
 """``astropolcal correct``."""
 
 import json
+import re
+import warnings
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -271,6 +274,45 @@ def changed(night, folder, *keywords):
     return paths
 
 
+def test_a_derotator_that_kept_something_else_than_stated(night, tmp_path):
+    """While the parallactic angle turns from 20 to 32 deg at an altitude of 70 deg."""
+    plate = instruments.get("charis").sky_law.plate_law()
+    for derotator, stated, others, words in [
+        (
+            (95, 95),
+            "fixed",
+            "pupil",
+            r"3.0 deg off .* keeps the field, and 0.0 deg off .* the pupil",
+        ),
+        ((95, 95), "pupil", "pupil", None),
+        # half a turn is none
+        (
+            (95, 281),
+            "pupil",
+            "fixed",
+            r"3.0 deg off .* keeps the pupil, and 0.0 deg off .* the field",
+        ),
+        ((95, 101), "fixed", "fixed", None),
+        # neither law holds
+        ((95, 98), "fixed", "fixed", None),
+    ]:
+        hwp = [h + plate[0] * p + plate[1] * 70 for h, p in ((0, 20), (45, 32))]
+        keywords = [("PARANG", 20, 32), ("ALTITUDE", 70), ("D_IMRANG", *derotator)]
+        paths = changed(night, tmp_path, *keywords, ("RET-POS1", *hwp))
+        words_of = [*paths, "--calibration", night / "charis.asdf", "-o", tmp_path / "o.fits"]
+        words_of += ["--centre", "69.9,84.7", "--size", "5", "-q", "--rotation", stated]
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            # two frames may be too few for a product
+            with suppress(ObservationError):
+                command(*words_of)
+        told = [str(one.message) for one in told if "--rotation" in str(one.message)]
+        assert len(told) == (words is not None), (derotator, stated, told)
+        if words:
+            assert re.search(words, told[0])
+            assert f"(--rotation {others})" in told[0]
+
+
 @pytest.mark.slow
 def test_frames_of_another_set_up(night, tmp_path):
     calibration = Calibration.read(night / "charis.asdf")
@@ -490,11 +532,17 @@ def test_report_has_units():
         assert lines.count(f"      systematic error: {words}") == 2, (systematic, words)
         # a telescope as published does not err less than one that was calibrated
         assert any("m3.b1, m3.m1" in line for line in lines), (systematic, words)
+        assert "statistical errors:" not in " ".join(lines)
         verdict = lines[lines.index("") + 1]
         is_open = words == "infinite"
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
         assert verdict == (told if is_open else "Usable"), (systematic, words)
         assert lines[-1] == "Written:    o.fits", (systematic, words)
+    # first-order errors of an angle are too small where there is hardly any signal
+    for error, told in ((0.0032, False), (0.0034, True), (np.nan, False)):
+        faint = aperture | {"s_p_statistical": np.array([error])}
+        lines = _correct._words(summary | {"aperture": faint}, None, SimpleNamespace(**outputs))
+        assert ("below 3 statistical errors: the" in " ".join(lines)) == told, error
     # wavelengths at which the aperture has no value are not usable, whatever the frames determine
     summary["wavelength_nm"] = [1200.0, 1600.0]
     for q, told in (
