@@ -83,6 +83,23 @@ def test_static_optic_of_any_axis_between_plate_and_derotator_has_a_name():
         assert found[f"{name}:hwp"] > 0.3, name
 
 
+def test_static_retarder_behind_a_polarizer_that_turns_is_among_the_answers():
+    plate = optics.LinearRetarder(retardance=95 * u.deg, mount="plate", name="plate")
+    plate.retardance.fixed = plate.theta.fixed = False
+    lamp = optics.LinearPolarizer(mount="lamp", name="lamp")
+    chain = join([lamp, plate, optics.LinearPolarizer(name="last")])
+    window = optics.LinearRetarder(retardance=2 * u.deg, theta=25 * u.deg, name="window")
+    truth = insert_optic(chain, window, after="lamp")
+    angles = np.arange(0, 180, 10)
+    frames = {"plate": np.tile(angles, 4), "lamp": np.repeat([0, 45, 90, 135], 18)}
+    frames = QTable({stage: np.array(at) * u.deg for stage, at in frames.items()})
+    for seed in (1, 2):
+        data = simulate(truth, [0.75] * u.um, frames, flux=3e6, seed=seed)
+        (cause,) = diagnose(chain, data).causes
+        words = [cause.effect.title, *(one.effect.title for one, _ in cause.aliases)]
+        assert "retarder that is static downstream of the lamp" in words, seed
+
+
 def test_laws_that_wavelengths_do_not_tell_are_not_asked_for():
     for name, least in [("fringes", 5), ("hwp_retardance_free", 2), ("dichroic_j_band", 5)]:
         assert not EFFECTS[name].is_told(least - 1), name
