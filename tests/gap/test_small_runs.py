@@ -134,6 +134,19 @@ def test_noise_that_is_not_stated_and_larger_than_it_is_rough_is_not_said_to_agr
     assert "no table states the noise" in first
 
 
+@pytest.mark.slow
+def test_wrong_frame_is_found_beside_a_cause_that_hides_it():
+    chain, truth, wavelength, frames = irdis_lamp([1, 2, 3])
+    window = optics.LinearRetarder(retardance=1.5 * u.deg, theta=25 * u.deg, name="window")
+    between = insert_optic(truth, window, after="hwp")
+    frames["hwp"][11] += 1 * u.deg
+    table = simulate(between, wavelength, frames, flux=3e6, seed=1).to_table()
+    table["hwp"][table["frame"] == 11] -= 1 * u.deg
+    found = diagnose(chain, Observations.from_table(table, name="lamp"))
+    assert [(one.frame, one.what) for one in found.frames] == [(11, "hwp angle")]
+    assert "static_retarder:hwp" in answers(found)
+
+
 def test_laws_that_wavelengths_do_not_tell_are_not_asked_for():
     for name, least in [("fringes", 5), ("hwp_retardance_free", 2), ("dichroic_j_band", 5)]:
         assert not EFFECTS[name].is_told(least - 1), name
