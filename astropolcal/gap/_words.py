@@ -8,6 +8,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when, alike
+from astropolcal.gap.selection import REMAINDER
 from astropolcal.words import listed, p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
@@ -355,6 +356,12 @@ def fails(name):
 def _what(content):
     causes, verdict = content["causes"], content["verdict"]
     if verdict == "none":
+        if content["gap_p_value"] < REMAINDER:
+            return (
+                "No cause is found of what the model leaves. It is more than noise as rough as its "
+                f"residuals ({p_words(content['gap_p_value'])}), and no table states the noise: "
+                "neighbouring frames or wavelengths may share it, or something is lacking."
+            )
         return "The model agrees with the measurements: it lacks nothing that these data show."
     # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])

@@ -32,6 +32,8 @@ _SAME = 1e-4
 # law is where it has more than a part of its largest value
 _NEARLY, _AS_MUCH, _PART = 0.9, 0.05, 0.5
 _TWO_SIGMA = 4.0
+# so many standard deviations more than expected noise may gain
+_LUCK = 2.0
 # by this share of what causes explain the model without them may be off, to first order
 _LINEAR = 0.1
 # a direction of which model and lamp leave less than this is theirs
@@ -58,7 +60,7 @@ class Course:
     lowered: float = 0.0
     freedom: int = 0
     #: By how much more than the causes that were found it lowers chi-square, beyond what its larger
-    #: freedom gains from noise; by how much less, in standard deviations of that.
+    #: freedom may gain from noise; by how much less, in standard deviations of that.
     gained: float = -np.inf
     behind: float = np.inf
     #: In which frames and wavelengths it is, in words; empty where it is everywhere.
@@ -235,8 +237,12 @@ def courses(model, base):
         # to first order, as the courses are
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
         freer = max(one.freedom - freedom, 1.0)
-        one.gained = float((one.lowered - lost) / temper - freer - one.chosen)
-        one.behind = float(-one.gained / np.sqrt(2 * freer))
+        # a law of one number is not chosen, but noise scatters as much, and a size for every datum
+        # of a single wavelength takes it all
+        scatter = np.sqrt(2 * freer)
+        luck = max(one.chosen, _LUCK * scatter)
+        one.gained = float((one.lowered - lost) / temper - freer - luck)
+        one.behind = float(-one.gained / scatter)
         one.p_value = float(chi2_above(one.lowered / temper - one.chosen, max(one.freedom, 1)))
         one.std = [np.sqrt(temper) * std for std in one.std]
         known = best.setdefault((one.place, one.kind), one)

@@ -32,7 +32,7 @@ from astropolcal.gap.frames import (
 from astropolcal.gap.model import Model, chains_of, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
-from astropolcal.gap.selection import REMAINDER, explained_by_one, select
+from astropolcal.gap.selection import REMAINDER, beside_one, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.measurement.datasets import as_tables
 from astropolcal.progress import in_one_thread
@@ -52,6 +52,8 @@ _LITTLE, _FEW = 0.05, 4
 # residuals of a smaller mean square, and more probable than this, show that the noise was taken
 # too large: by the roughness of a large gap, before its causes were known
 _TOO_QUIET, _TOO_PROBABLE = 0.8, 0.999
+# above this probability of an unlisted cause frames are looked for again, beside a cause
+_DOUBTFUL = 0.5
 
 
 @dataclass
@@ -350,7 +352,22 @@ def _diagnosed(calibration, observations, library, say, how):
         return select(model, smooth, groups, say, **more)
 
     models = _without(nominal, base, wrong, say)
-    (nominal, base), selection, single = _selected(chosen, whole, models, single, wrong, say)
+    answer = _selected(chosen, whole, models, single, wrong, say)
+    if not wrong and (more := _beside_causes(answer, say)):
+
+        def anew(frames):
+            others = _without(*whole, single + frames, say)
+            return _selected(chosen, whole, others, single, frames, say)
+
+        again = anew(more)
+        # beside what is in the model now fewer may stand out
+        recipes = [group.best.recipe for group in again[1].groups]
+        sure = suspect_frames(answer[0][1].with_effects(recipes))
+        if len(sure) < len(more):
+            more, again = sure, anew(sure)
+        if again[1].model.p_value > REMAINDER and again[1].unlisted < _DOUBTFUL:
+            answer, wrong = again, more
+    (nominal, base), selection, single = answer
     if exchanged:
         share = _share_of(exchanged[0], nominal, base, selection, chosen, say)
         if share < 0.5:
@@ -406,6 +423,16 @@ def _selected(chosen, whole, models, single, wrong, say):
         nominal = base = _with_noise_of(base, selection)
         selection = chosen(base)
     return (nominal, base), selection, single
+
+
+def _beside_causes(answer, say):
+    """Return the frames that stand out once the cause is in the model that hid them."""
+    (_, base), selection, _ = answer
+    if selection.unlisted < _DOUBTFUL or not selection.groups:
+        return []
+    say("looking for frames that are not what the table says beside a cause")
+    models = beside_one(base, selection)
+    return next((found for one in models if (found := suspect_frames(one))), [])
 
 
 def _share_of(effect, nominal, base, selection, chosen, say):

@@ -375,6 +375,12 @@ def explained_by_one(model, library, *, cells=True):
     return False
 
 
+def beside_one(base, selection):
+    """Yield a model with each of the few best causes alone."""
+    for one in _best_of(selection.scan, _WIDTH[0]):
+        yield base.with_effect(*one.recipe, **_QUICK)
+
+
 def _scanned(model, library, cells):
     """Return the evidence beside a model, measured by the residuals that the best cause leaves."""
     found = scan(model, library, cells=cells)

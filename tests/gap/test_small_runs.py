@@ -14,6 +14,7 @@ from astropolcal.gap import diagnose
 from astropolcal.gap.effects import EFFECTS
 from astropolcal.gap.frames import lamp_faults, suspect_frames
 from astropolcal.gap.model import nominal_model
+from astropolcal.gap.report import to_dict
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -81,6 +82,69 @@ def test_static_optic_of_any_axis_between_plate_and_derotator_has_a_name():
         between = insert_optic(truth, window, after="hwp")
         found = answers(diagnose(chain, simulate(between, wavelength, frames, flux=3e6, seed=1)))
         assert found[f"{name}:hwp"] > 0.3, name
+
+
+def turning_plate():
+    """Return chain and frames of a plate that turns between a polarizer that does and one."""
+    plate = optics.LinearRetarder(retardance=95 * u.deg, mount="plate", name="plate")
+    plate.retardance.fixed = plate.theta.fixed = False
+    lamp = optics.LinearPolarizer(mount="lamp", name="lamp")
+    chain = join([lamp, plate, optics.LinearPolarizer(name="last")])
+    angles = np.arange(0, 180, 10)
+    frames = {"plate": np.tile(angles, 4), "lamp": np.repeat([0, 45, 90, 135], 18)}
+    return chain, QTable({stage: np.array(at) * u.deg for stage, at in frames.items()})
+
+
+@pytest.mark.slow
+def test_static_retarder_behind_a_polarizer_that_turns_is_among_the_answers():
+    chain, frames = turning_plate()
+    window = optics.LinearRetarder(retardance=2 * u.deg, theta=25 * u.deg, name="window")
+    truth = insert_optic(chain, window, after="lamp")
+    for seed in (1, 2):
+        data = simulate(truth, [0.75] * u.um, frames, flux=3e6, seed=seed)
+        (cause,) = diagnose(chain, data).causes
+        words = [cause.effect.title, *(one.effect.title for one, _ in cause.aliases)]
+        assert "retarder that is static downstream of the lamp" in words, seed
+
+
+@pytest.mark.slow
+def test_size_for_every_datum_does_not_outdo_the_cause():
+    chain, frames = turning_plate()
+    uneven = optics.HarmonicRotator(harmonic=2, cosine=0.2 * u.deg, mount="plate", name="uneven")
+    back = optics.HarmonicRotator(harmonic=2, cosine=-0.2 * u.deg, mount="plate", name="back")
+    truth = insert_optic(insert_optic(chain, uneven, before="plate"), back, after="plate")
+    for seed in range(8):
+        data = simulate(truth, [0.75] * u.um, frames, flux=3e6, seed=seed)
+        found = answers(diagnose(chain, data, cross_validate=False))
+        assert "hwp_encoder_two_lobe" in found, seed
+
+
+def test_noise_that_is_not_stated_and_larger_than_it_is_rough_is_not_said_to_agree():
+    nominal, _, wavelength, frames = polarimeter(beams=2, n=8)
+    table = simulate(nominal, wavelength, frames, flux=3e6, seed=1).to_table()
+    table.remove_columns([name for name in table.colnames if name.endswith("_err")])
+    # each frame is off by a smooth curve
+    shift = 5e-4 * np.random.default_rng(1).normal(size=(2, len(frames)))
+    curve = np.polynomial.legendre.legval(np.linspace(-1, 1, 8), shift)
+    table["flux_right"] *= 1 + curve.ravel()
+    diagnosis = diagnose(nominal, Observations.from_table(table, name="night"))
+    first = to_dict(diagnosis)["sentences"][0]
+    assert diagnosis.verdict == "none"
+    assert "agrees" not in first
+    assert "no table states the noise" in first
+
+
+@pytest.mark.slow
+def test_wrong_frame_is_found_beside_a_cause_that_hides_it():
+    chain, truth, wavelength, frames = irdis_lamp([1, 2, 3])
+    window = optics.LinearRetarder(retardance=1.5 * u.deg, theta=25 * u.deg, name="window")
+    between = insert_optic(truth, window, after="hwp")
+    frames["hwp"][11] += 1 * u.deg
+    table = simulate(between, wavelength, frames, flux=3e6, seed=1).to_table()
+    table["hwp"][table["frame"] == 11] -= 1 * u.deg
+    found = diagnose(chain, Observations.from_table(table, name="lamp"))
+    assert [(one.frame, one.what) for one in found.frames] == [(11, "hwp angle")]
+    assert "static_retarder:hwp" in answers(found)
 
 
 def test_laws_that_wavelengths_do_not_tell_are_not_asked_for():

@@ -186,6 +186,9 @@ class Roles:
             plates = plates[::-1]
         turning = [o for o in (self.derotator, *plates[:1]) if o is not None]
         self.relay = next(iter(turning), None)
+        # behind a polarizer that does not turn such an optic is a property of the source
+        polarizers = [o for o in self.all("polarizer") if o is not self._own[-1]]
+        turning += [o for o in polarizers if o.stage is not None]
         self._kinds["turning"] = turning
         self.turning = next((o for o in turning if chosen.get("turning") in (None, o.name)), None)
         #: The plate, where the model has nothing in front of it that could polarize.
@@ -247,7 +250,7 @@ def adapted(effects, chains, runs=()):
         An effect that acts on one kind of optic comes once for each such optic: under its own name
         for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
         of what stands downstream of it name the half-wave plate; where there is no such plate,
-        the words name the optic.
+        the words name the optic. A polarizer that turns is such an optic, too.
 
     Examples
     --------
@@ -264,18 +267,22 @@ def adapted(effects, chains, runs=()):
     found = [one for one in found if one.applies(chains)]
     every = [Roles(chain) for chain in chains]
     plates = [o for roles in every for o in roles.all("plate")]
+    relays = [roles.relay.name for roles in every if roles.relay is not None]
+    turning = [o.name for roles in every for o in roles.all("turning")]
     # none is on the stage of a half-wave plate
     own_name = plates and not any(o.stage == "hwp" for o in plates)
     for i, one in enumerate(found):
         words = {}
         if own_name and one.acts_on == "plate":
             words |= {"half-wave plate": one.optic or plates[0].name, f" ({one.optic})": ""}
-        if all(roles.derotator is None for roles in every):
-            relay = next((roles.relay for roles in every if roles.relay), None)
-            words[_BEHIND] = f"downstream of the {relay.name}" if own_name else _BEHIND_PLATE
-        elif one.acts_on == "turning" and one.optic:
-            words[_BEHIND] = f"downstream of the {one.optic}" if own_name else _BEHIND_PLATE
-            words[f" ({one.optic})"] = ""
+        behind = one.optic if one.acts_on == "turning" else None
+        if behind:
+            words[f" ({behind})"] = ""
+        elif all(roles.derotator is None for roles in every):
+            behind = next(iter(relays + turning), None)
+        if behind:
+            is_plate = not own_name and behind in {o.name for o in plates}
+            words[_BEHIND] = _BEHIND_PLATE if is_plate else f"downstream of the {behind}"
         for old, new in words.items():
             if old in one.title + one.place:
                 title, place = (text.replace(old, new) for text in (one.title, one.place))
