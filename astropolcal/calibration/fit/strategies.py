@@ -60,8 +60,9 @@ _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted, or is not better
 # after so many evaluations, or where steps gain less than a share
 _HOPELESS, _GLANCE, _GAIN = 100.0, 15, 1e-4
-# of so many signs not all combinations are tried
-_MANY_SIGNS = 8
+# of so many signs not all combinations are tried; sums of squares of the same minimum, and of what
+# may lead to a better one, over that of the best
+_MANY_SIGNS, _SAME_MINIMUM, _MAY_LEAD = 8, 1.001, 2.0
 # more data than these are fitted without astropy's fitter
 _TALL = 20_000
 # below this the sign of the start is as good
@@ -192,25 +193,25 @@ def joint(measurement, weighting, fitter, search, options=None):
 
 
 def _behind_mirrors(measurement, best, how):
-    """Fit again from where axes and phases lie on the other sides of what priors hold near."""
+    """Fit again from where axes and phases lie on the other sides of what priors hold them near."""
     problem = BinProblem(*few_frames(measurement, best[1]))
     axes, phases = centres(problem)
     if not axes or not phases or len(axes) + len(phases) > _MANY_SIGNS:
         return best
-    found, starts = measurement.vector(), mirrored(measurement.vector(), axes)
-    least, worth = np.sum(problem.residuals(found) ** 2), 2 * problem.noise**2
-    first, done = least, 0
-    while done < len(starts):
-        start, left = starts[done], np.inf
-        # bins that follow common parameters may have other signs there
+    found = measurement.vector()
+    starts, least = mirrored(found, axes), np.sum(problem.residuals(found) ** 2)
+    first, worth = least, 2 * problem.noise**2
+    while starts:
+        start = starts.pop(0)
+        # where a fit leads, wavelengths may have other signs again
         for _ in range(2):
-            start = problem.fit(best_signs(problem, start, phases), evaluations=2 * _GLANCE, gain=_GAIN)[0]
-            before, left = left, np.sum(problem.residuals(start) ** 2)
-            if not 1.001 * least < left < 2 * least:
+            start = best_signs(problem, start, phases)
+            start = problem.fit(start, evaluations=2 * _GLANCE, gain=_GAIN)[0]
+            left = np.sum(problem.residuals(start) ** 2)
+            if not _SAME_MINIMUM < left / least < _MAY_LEAD:
                 break
-        done += 1
         if left < least - worth:
-            found, least, starts, done = start, left, mirrored(start, axes), 0
+            found, least, starts = start, left, mirrored(start, axes)
     if least < first:
         measurement.stand_at(found)
         best = _descend(measurement, best[1], *how, is_searched=True)
