@@ -264,39 +264,24 @@ def test_calibration_recovers_the_retardances():
     assert np.sqrt(np.mean(found.residuals**2)) < 2e-3
 
 
-# half a wave of relay optics mirrors the liquid crystal: what lies on the other side of its prior
-MIRRORED = {
-    "calibration_polarizer.theta": 85.0,
-    "hwp.theta": 1.2,
-    "hwp.retardance": [-155.3, -163.3, -172.3, -176.7],
-    "derotator.theta": -0.5,
-    "derotator.horizontal": [265.2, 248.5, 233.5, 184.4],
-    "derotator.diagonal": [-10.5, 0.3, 9.3, 2.8],
-    "derotator.circular": [-12.1, 0.2, 5.8, 8.1],
-    "relay.diattenuation": [0.1, 0.01, 0.06, -0.08],
-    "relay.retardance": [-89.6, -16.2, 23.4, 88.5],
-    "flc.theta": 1.5,
-    "flc.retardance": [158.6, 179.0, 173.2, 180.9],
-    "flc.switching_angle": 40.7,
-    "wollaston.efficiency": [0.95, 0.94, 0.96, 1.0],
-    "cameras.imbalance": [-0.1, 0.09, 0.0, 0.08],
-}
-
-
 @pytest.mark.slow
-def test_no_fit_ends_where_half_a_wave_mirrors_the_liquid_crystal():
-    truth = VAMPIRES.published()
-    for name, value in MIRRORED.items():
-        optic, key = name.split(".")
-        getattr(truth[optic], key).value = value
+def test_no_fit_stays_where_half_a_wave_mirrors_the_liquid_crystal():
+    truth, start = VAMPIRES.published(), VAMPIRES.chain()
+    relay, flc = np.array([18.0, -53.0, -93.0, 96.0]), np.array([174.0, 179.0, 176.0, 200.0])
+    for chain, sign in ((truth, 1), (start, -1)):
+        # half a wave along the axes of the splitter mirrors the axis of what is behind it
+        turned = relay if sign > 0 else relay - 180 * np.sign(relay)
+        chain["relay"].retardance = turned * u.deg
+        chain["flc"].retardance = (180 + sign * (flc - 180)) * u.deg
+        chain["flc"].theta = sign * 3 * u.deg
+        chain["flc"].switching_angle = (45 + sign * 0.7) * u.deg
+        chain["derotator"].diagonal = [-1, -8, 11, -1] * u.deg
+        chain["derotator"].circular = [2, -9, 8, 9] * u.deg
     frames = both_states(half_wave_plate_cycles(derotator=np.arange(45, 140, 12.5) * u.deg))
-    settings = {"flux": 2.5e5, "seed": 46, "meta": VAMPIRES.published_meta()}
+    settings = {"flux": 2.5e5, "seed": 1, "meta": VAMPIRES.published_meta()}
     night = simulate(truth, VAMPIRES.wavelength, frames, **settings)
-    least = calibrate(truth, night, search=False, cross_validate=False)
-    found = calibrate(VAMPIRES.chain(), night, cross_validate=False)
-    # of 48 data a wavelength, where the wrong minimum is by a tenth higher
-    assert np.sum(found.residuals**2) < 1.01 * np.sum(least.residuals**2)
-    assert abs(found.chain["flc"].theta.value - least.chain["flc"].theta.value) < 0.5
+    found = calibrate(start, night, cross_validate=False).chain
+    assert abs(found["flc"].theta.value - 3) < 0.7
 
 
 @pytest.mark.long

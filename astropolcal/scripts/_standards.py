@@ -30,7 +30,7 @@ name NAME ?  a star, such as 'HD 293396'
 --radius DEG float  goes with --near (default: 15)
 --site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
 --night YYYY-MM-DD  date of the evening at the site
---min-altitude DEG float  goes with --night: lowest altitude (default: 30)
+--min-altitude DEG float =30  goes with --night: lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
 --plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
@@ -63,10 +63,11 @@ def _check(arguments):
     """Refuse options that lack their companion or do nothing."""
     if (arguments.site is None) != (arguments.night is None):
         raise ParameterError("--site and --night go together")
-    for option in ("plot", "min_altitude"):
-        if getattr(arguments, option) is not None and arguments.night is None:
-            raise ParameterError(f"{common.label_of(option)} needs --site and --night")
-    arguments.min_altitude = 30.0 if arguments.min_altitude is None else arguments.min_altitude
+    if arguments.plot and arguments.night is None:
+        raise ParameterError("--plot needs --site and --night")
+    # the default, even if it is stated, does no harm
+    if arguments.min_altitude != 30 and arguments.night is None:
+        raise ParameterError("--min-altitude needs --site and --night")
     if arguments.radius is not None and arguments.near is None:
         raise ParameterError("--radius goes with --near RA,DEC")
     if arguments.limit is not None and arguments.limit < 1:

@@ -298,8 +298,9 @@ def test_frames_come_first_in_every_verdict():
 
 def test_every_verdict_has_its_sentence():
     left = {"where_left": [where(share=0.2)], "left_share": 0.3, "remainder_p_value": 0.0}
+    fits = {"verdict": "none", "causes": [], "gap_p_value": 0.4}
     for changes, words in (
-        ({"verdict": "none", "causes": []}, "The model agrees with the measurements"),
+        (fits, "The model agrees with the measurements"),
         ({}, "The model lacks one effect: title of beam_gain (97 %)."),
         ({"verdict": "unexplained"}, "I do not know what the model lacks: what helps most"),
         ({"verdict": "unexplained", "causes": []}, "none of the 12 causes that were tried"),
@@ -307,7 +308,7 @@ def test_every_verdict_has_its_sentence():
         ({"verdict": "unexplained"} | left, "20 % of what is left follows a pattern."),
         (left, "What is left, 30 % of the gap, is more than noise (p < 1e-6): 20 % of it"),
         ({}, "What is left is noise (p = 0.4), which may hide up to 12 % of the gap (95 %)."),
-        ({"verdict": "none", "causes": []}, "does not show: a gap of up to 0.0123 % (rms, 95 %)."),
+        (fits, "does not show: a gap of up to 0.0123 % (rms, 95 %)."),
         ({"cross_validated": False}, "the frames of the fit"),
         ({"converged": False}, "The nominal fit did not converge"),
         ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),
@@ -381,7 +382,7 @@ def test_what_is_hardly_probable_is_told_in_the_table_only():
     text = _words.text(content(doubtful, verdict="unexplained"))
     assert "Cause 1:" not in text
     assert re.search(r"^1 +1 % +90 % +40 %  beam_gain", text, re.MULTILINE)
-    empty = content(verdict="none", causes=[], where=[])
+    empty = content(verdict="none", causes=[], where=[], gap_p_value=0.4)
     assert "cause" not in _words.text(empty | {"causes": []})
 
 

@@ -536,6 +536,10 @@ def least_bent(problem, branches, ratio, origin):
     least sum of all is found by dynamic programming over pairs of neighbours.
     """
     places, turns = problem.phases()
+    # what priors hold near a centre may have either sign beside each other
+    loose = ~np.isin(places[:, 0], [problem.elements[row, 0] for row, _ in problem.priors])
+    if loose.any():
+        places, turns = places[loose], turns[loose]
     # (n_bins, n_branches, n_phases)
     phases = np.transpose([branch[places] for branch in branches], (2, 0, 1))
     away = _PULL * np.sum(_shortest(phases - origin[places].T[:, None], turns) ** 2, axis=-1)
