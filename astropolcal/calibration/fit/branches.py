@@ -492,10 +492,10 @@ def best_signs(problem, vector, phases):
     With a few steps of all parameters of a wavelength from each, and more from the best; common
     ones are held.
     """
-    tried = [problem.polish(vector, _GLIMPSE)]
-    ways = [range(4 if turns else 2) for *_, turns in phases]
-    for which in list(product(*ways))[1:]:
-        trial = vector.copy()
+    tried, ways = [], [range(4 if turns else 2) for *_, turns in phases]
+    # of the other hand is what no prior holds, too
+    for base, which in product(problem.branches(vector)[:2], product(*ways)):
+        trial = base.copy()
         for k, (places, centre, _) in zip(which, phases, strict=True):
             side = trial[places] - centre
             side = -side if k % 2 else side
