@@ -404,8 +404,7 @@ def _polar_rotation(block):
 
 
 def retardance_vector(matrix):
-    """
-    Return the retardance vector of the retarder within Mueller matrices (..., 4, 4).
+    """Return the retardance vector of the retarder within Mueller matrices (..., 4, 4).
 
     It is a Quantity in radian of shape (..., 3), horizontal, diagonal and circular, of length up
     to pi; at pi, where both signs are the same retarder, the first component that is not zero is
@@ -458,8 +457,7 @@ def coherency_matrix(matrix):
 
 
 def is_physical(matrix, tolerance=1e-9):
-    """
-    Tell which matrices, (..., 4, 4), are Mueller matrices that nature allows.
+    """Tell which matrices, (..., 4, 4), are Mueller matrices that nature allows.
 
     An eigenvalue of the coherency matrix may lie below zero by the tolerance, a fraction of the
     transmission of unpolarized light; one that is negative raises. A matrix is a mixture of at

@@ -105,8 +105,7 @@ class _Step:
 
 
 class Propagator:
-    """
-    The fluxes that a chain predicts, and their derivatives.
+    """The fluxes that a chain predicts, and their derivatives.
 
     Without a beam splitter the left beam is dark.
 
@@ -213,8 +212,7 @@ class Sweep:
         self.fluxes = tuple(fluxes)
 
     def crossings(self, wanted, weights):
-        """
-        Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
+        """Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
 
         A change of the matrix by E changes the sum by a . E s, with the light s that enters the
         optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic upstream

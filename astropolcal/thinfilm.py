@@ -53,8 +53,7 @@ class _Medium:
 
 
 class _Stack:
-    """
-    Amplitudes of a stack on canonical floats; s and p are the first axis.
+    """Amplitudes of a stack on canonical floats; s and p are the first axis.
 
     ``indices`` runs from the ambient to the substrate, ``thicknesses`` over the films. The
     admittance Y of the light, the ratio of its tangential fields, is carried through the films from
@@ -139,8 +138,7 @@ def _wrapped(phase):
 
 @dataclass(frozen=True)
 class Reflection:
-    """
-    What a surface does to the light that it reflects, made by `reflect`.
+    """What a surface does to the light that it reflects, made by `reflect`.
 
     ``r_s`` and ``r_p`` are complex amplitudes of the field across and in the plane of incidence,
     ``transmittance_s`` and ``transmittance_p`` shares of the power that enter the substrate,
@@ -183,8 +181,7 @@ class Reflection:
         return diattenuator_retarder(self.diattenuation, self.retardance)
 
     def derivatives(self):
-        """
-        Return the derivatives of diattenuation and retardance (radian), two in a tuple.
+        """Return the derivatives of diattenuation and retardance (radian), two in a tuple.
 
         Keys are ``incidence`` (per radian), ``n`` and ``k`` of the substrate, and ``n_1``,
         ``k_1``, ``thickness_1`` (per micrometre) and so on of the films, the first being where the

@@ -191,8 +191,7 @@ def mjd_of(value, name="time"):
 
 
 def plain_number(value, kind=float):
-    """
-    Return a number, or the one that a text writes in ASCII digits without separators.
+    """Return a number, or the one that a text writes in ASCII digits without separators.
 
     Python reads ``1_000`` and digits of all scripts as numbers; no file of data means them so.
     What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
@@ -206,8 +205,7 @@ def plain_number(value, kind=float):
 
 
 def iso_date(value, name="date", error=ParameterError, *, months=False):
-    """
-    Return a date in the one form in which dates are kept and compared.
+    """Return a date in the one form in which dates are kept and compared.
 
     It is ``YYYY-MM-DD``, followed by ``T`` and the time of day where it is known, or ``YYYY-MM``
     where ``months`` are enough; in UTC. Taken are texts such as these, ``YYYYMMDD``, Modified

@@ -121,8 +121,7 @@ class ScienceFrames:
         return self.source.names
 
     def moments(self):
-        """
-        Return name, date and mode of each frame; None where they are not known.
+        """Return name, date and mode of each frame; None where they are not known.
 
         Raises
         ------

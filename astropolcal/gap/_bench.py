@@ -73,8 +73,7 @@ _TAKEN_UP = 0.02
 
 @dataclass(frozen=True)
 class Setup:
-    """
-    What is simulated: one cycle of the half-wave plate at each angle of the derotator.
+    """What is simulated: one cycle of the half-wave plate at each angle of the derotator.
 
     ``options`` go to the ``chain`` of the instrument; an instrument with filters keeps its own
     wavelengths. The median ``flux`` per wavelength and frame and the ``read_noise`` per beam and

@@ -93,8 +93,7 @@ class Channels:
     # ---- noise and lamp -----------------------------------------------------------------
 
     def set_noise(self, sigma, residual, saturating, without=None):
-        """
-        Set the noise of both channels, (2, W, F), and fit the lamp, some frames (F,) aside.
+        """Set the noise of both channels, (2, W, F), and fit the lamp, some frames (F,) aside.
 
         The sums of the residual, (2, W, F), tell how the lamp drifts and flickers. What optics
         could do to the sum of a frame, columns (F, k), is taken away first, lest a missing optic be
@@ -338,8 +337,7 @@ def noise(channel, residual, angles, bins, without=None):
 
 
 def expected_fluxes(channel, sweep):
-    """
-    Return the fluxes of both beams as chain and lamp give them, without and with flicker.
+    """Return the fluxes of both beams as chain and lamp give them, without and with flicker.
 
     Both have shape (2, W, F). An effect that depends on the flux must not depend on the noise of
     the datum that it is to explain: sums of both beams do not see the flicker, which is their own,

@@ -212,8 +212,7 @@ def _best(gained):
 
 
 def courses(model, base):
-    """
-    Return the courses in place of all causes of a fitted model, the best first.
+    """Return the courses in place of all causes of a fitted model, the best first.
 
     ``base`` is the model without them. Derivatives are those at the model, and where its causes are
     so large that the base is not what they are to first order, also at the base, where a course may

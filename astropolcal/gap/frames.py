@@ -115,8 +115,7 @@ class FrameFault:
 
 
 def suspect_frames(model):
-    """
-    Return the frames whose data are not what the table says, the most evident first.
+    """Return the frames whose data are not what the table says, the most evident first.
 
     Not those of which only the lamp is off, see `lamp_faults`. There are none where no frame stands
     out, or so many that the model is at fault and not the frames. Where an optic is missing from
@@ -135,8 +134,7 @@ def suspect_frames(model):
 
 
 def single_data(model, known=()):
-    """
-    Return the single data that are far off the wavelengths beside them, the farthest first.
+    """Return the single data that are far off the wavelengths beside them, the farthest first.
 
     Hot pixels and cosmic rays do that; a gap is smooth in wavelength, or in more frames. There are
     none where they are, with those known, in so few frames that `suspect_frames` finds them, or so

@@ -314,8 +314,7 @@ class Model:
         return Model(self.problem, fit, self.added)
 
     def is_physical(self, name):
-        """
-        Return whether the fitted values of an effect are possible.
+        """Return whether the fitted values of an effect are possible.
 
         They are within its limits and the bounds of the optics that have them, whose Mueller
         matrices are physical. A parameter that the fit left at its limit at more than one
@@ -477,8 +476,7 @@ def nominal_calibration(chains, observations):
 
 
 def starting_model(calibration, observations, library, say):
-    """
-    Return the nominal model, that of the discrete alternative that beats it, and which this is.
+    """Return the nominal model, that of the discrete alternative that beats it, and which this is.
 
     Where none does, the second is the nominal model again and the third an empty list; else the
     alternative is followed by its aliases. The fourth says up to or from which frame the model does

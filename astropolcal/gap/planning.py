@@ -140,8 +140,7 @@ class Exposure:
 
 
 def exposures(model, *, flux_matters=False):
-    """
-    Return exposures that the set-ups of the data allow.
+    """Return exposures that the set-ups of the data allow.
 
     New angles, a full turn of the plate, the run again, in another order and backwards, the
     polarizer turned or taken out, and another lamp. Where no half-wave plate modulates two beams,
@@ -251,8 +250,7 @@ def _shuffled(group):
 
 
 def plan(diagnosis, candidates=None):
-    """
-    Return exposures that answer the questions that a diagnosis cannot answer, a list of dict.
+    """Return exposures that answer the questions that a diagnosis cannot answer, a list of dict.
 
     Keys are ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``;
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,

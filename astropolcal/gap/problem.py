@@ -68,8 +68,7 @@ def _mounted(chains):
 
 
 class GapProblem:
-    """
-    Chains against all frames of their datasets, whitened by the noise.
+    """Chains against all frames of their datasets, whitened by the noise.
 
     Parameters may have ``laws``, a basis (W, k) each; ``priors``, the standard deviation of a
     normal prior on their coefficients; ``neutral``, the value about which law, prior and limits
@@ -315,8 +314,7 @@ class GapProblem:
     # ---- fit -------------------------------------------------------------------------
 
     def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
-        """
-        Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
+        """Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
         Damped steps follow valleys to second order (Transtrum & Sethna 2012, arXiv:1201.5885).
         ``rows`` are those that take part, (n_rows,), ``held`` the coefficients that stay; a step

@@ -267,8 +267,7 @@ class Fitted:
         self.model, self.problem = model, model.problem
 
     def sizes(self, name):
-        """
-        Return the fitted parameters of an added effect, ready for JSON.
+        """Return the fitted parameters of an added effect, ready for JSON.
 
         Each is a dictionary of ``value`` and ``std`` (a number, or one per wavelength),
         ``unit``, ``limit``, the largest size that is physical, and ``degree``, that of the
@@ -477,8 +476,7 @@ def accuracies(model, cross_validate=True):
 
 
 def with_causes(model, *, held=False, **options):
-    """
-    Calibrate the chains of a model, with what was found of its causes as priors of their sizes.
+    """Calibrate the chains of a model, with what was found of its causes as priors of their sizes.
 
     Double differences, which are fitted, may not show them, and what is not known of them is not
     known of the other parameters either. Another mirror branch could move them. Their sizes may

@@ -61,8 +61,7 @@ _MOST_BLOCKS = 24
 
 
 def locate(model):
-    """
-    Return where the gap of a fitted model lies, a list of dict, the most telling patterns first.
+    """Return where the gap of a fitted model lies, a list of dict, the most telling patterns first.
 
     Keys are ``axis``, ``detail``, ``share`` of the excess over the noise, ``p_value``, corrected
     for the number of looks (Benjamini & Yekutieli 2001, doi:10.1214/aos/1013699998), and ``kind``,
@@ -364,8 +363,7 @@ def _legendre(values):
 
 
 def badly_separated(observations):
-    """
-    Return the patterns that the plate angles taken separate badly from simpler ones, and a note.
+    """Return the patterns that the plate angles taken separate badly from simpler ones, and a note.
 
     Harmonics whose condition number together with a constant and harmonic 4 is large, and the order
     of frames where the angles always come in the same one. The dataset with the better angles

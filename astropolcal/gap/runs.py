@@ -58,8 +58,7 @@ def distinct(observations, changes=False):
 
 
 def changes(diagnosis, causes):
-    """
-    Return the causes that are in one of several runs only, a list of dict.
+    """Return the causes that are in one of several runs only, a list of dict.
 
     Keys are ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
     ``probability``, ``brought_by`` (optics that only this run has, upstream of the place) and

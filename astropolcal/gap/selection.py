@@ -101,8 +101,7 @@ _LEFT = 0.1
 
 @dataclass
 class Group:
-    """
-    One cause, with all that cannot be distinguished from it.
+    """One cause, with all that cannot be distinguished from it.
 
     ``members`` are candidates, best first, with their probabilities among each other, and
     ``probability`` is that of one of them being a cause. The fit had ``lowered`` chi-square by so
@@ -123,8 +122,7 @@ class Group:
 
 @dataclass
 class Selection:
-    """
-    The causes in the order in which they were added, and the model with all of them.
+    """The causes in the order in which they were added, and the model with all of them.
 
     ``scan`` is the evidence beside the base, ``unlisted`` the probability of a cause that no table
     has, and ``history`` the errors on left-out frames of the base and after each cause. One of the

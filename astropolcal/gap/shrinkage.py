@@ -145,8 +145,7 @@ def _blocks(observations, count=8):
 
 
 def foreseen(model, groups):
-    """
-    Return the prediction errors on left-out frames to first order, without a fit for each group.
+    """Return the prediction errors on left-out frames to first order, without a fit for each group.
 
     With an orthonormal basis N of the derivatives, residuals r of a group become
     :math:`(1 - N N^T)^{-1} r` where the group does not take part in the fit: exact in a linear

@@ -351,8 +351,7 @@ class Instrument(ABC):
         """
 
     def setup(self, observations):
-        """
-        Return ``source`` and ``optics_in`` of a dataset, from its table's meta.
+        """Return ``source`` and ``optics_in`` of a dataset, from its table's meta.
 
         Here the source that they state, and no optional optics.
 
@@ -721,8 +720,7 @@ class Instrument(ABC):
 
 
 class Polarimeter(Instrument):
-    """
-    An instrument whose chain is a source, or a star and the telescope, and its own optics.
+    """An instrument whose chain is a source, or a star and the telescope, and its own optics.
 
     Attributes
     ----------
@@ -747,8 +745,7 @@ class Polarimeter(Instrument):
     sky_law = SkyLaw(plate=(0, 0), derotator={})
 
     def chain(self, source=None, optics_in=(), *, wavelength=None, star="star", target=None):
-        """
-        Return the chain of a source upstream of the instrument or of a star, to be calibrated.
+        """Return the chain of a source upstream of the instrument or of a star, to be calibrated.
 
         As `Instrument.chain`. The first of ``sources`` is the default; ``"polarized"`` is a
         polarizer upstream of the instrument, ``"unpolarized"`` a lamp without one, all others are

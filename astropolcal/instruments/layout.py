@@ -270,8 +270,7 @@ class FileLayout:
         return (slices, rows, columns // 2) if self.beam_files else tuple(self.shape)
 
     def read_out(self, values):
-        """
-        Return how the detector was read out in a frame.
+        """Return how the detector was read out in a frame.
 
         ``values`` of its header are ``em_gain``, ``read_mode`` and ``camera``, as far as they are
         known. With an EM gain above one, gain and read noise are those before the multiplication;
@@ -388,8 +387,7 @@ _MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 
 
 def look_up(headers, column, layout):
-    """
-    Return the first keyword that holds a value for a column, and the value.
+    """Return the first keyword that holds a value for a column, and the value.
 
     Looked through are the headers in turn, for the ``keywords`` and ``alternatives`` of the
     layout. Without a value it is the first keyword (None if the layout knows none) and None, as

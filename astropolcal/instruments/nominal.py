@@ -146,8 +146,7 @@ _FORS2_ZERO = (-0.77, -0.90, 0.595, 1.445)
 
 
 class FORS2(Polarimeter):
-    """
-    VLT/FORS2 with its half-wave plate at any angles, and its Wollaston prism.
+    """VLT/FORS2 with its half-wave plate at any angles, and its Wollaston prism.
 
     Its polarized source is a polarizer upstream of the instrument, such as the prism with which
     ESO measured the zero of the plate. Free are, per wavelength, retardance and zero of the plate
@@ -184,8 +183,7 @@ class FORS2(Polarimeter):
 
 
 class NaCo(Polarimeter):
-    """
-    VLT/NaCo with half-wave plate and Wollaston prism, observing stars.
+    """VLT/NaCo with half-wave plate and Wollaston prism, observing stars.
 
     Free are, per wavelength, the diattenuation of M3, that of the mirrors downstream of it, the
     retardance of the plate and the efficiency of the prism; and the angle of the plate, within
@@ -229,8 +227,7 @@ class NaCo(Polarimeter):
 
 
 class NIRC2(Polarimeter):
-    """
-    Keck II/NIRC2 with half-wave plate, K-mirror and Wollaston prism.
+    """Keck II/NIRC2 with half-wave plate, K-mirror and Wollaston prism.
 
     Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the
     prism; the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror,
@@ -263,8 +260,7 @@ class NIRC2(Polarimeter):
 
 
 class MagAOX(Polarimeter):
-    """
-    Magellan/MagAO-X with half-wave plate, K-mirror and polarizing beam splitter.
+    """Magellan/MagAO-X with half-wave plate, K-mirror and polarizing beam splitter.
 
     Free are, per wavelength, the retardances of plate and K-mirror and the efficiency of the cube;
     the angles of plate and K-mirror; and of stars the diattenuation of the tertiary mirror. The
@@ -360,8 +356,7 @@ class GPI(Polarimeter):
 
 
 class RomanCoronagraph(Polarimeter):
-    """
-    Coronagraph of the Roman Space Telescope with its two Wollaston prisms.
+    """Coronagraph of the Roman Space Telescope with its two Wollaston prisms.
 
     A table has the columns ``roll``, and ``prism``: 0 deg where ``DPAMNAME`` is POL0, 45 deg where
     it is POL45. Its sources are not called stars, as there is no site of the telescope whose sky

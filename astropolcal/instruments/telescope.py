@@ -50,8 +50,7 @@ _WIDTHS = {"": 1.0, "_slope": 1.0, "_curvature": 0.71}
 
 
 def tertiary_mirror(model, wavelength):
-    """
-    Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
+    """Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
 
     ``"free"``: one free diattenuation per wavelength; the retardance, which an unpolarized star
     does not constrain, is fixed at that of the published law. ``"power law"``: the paper's
@@ -138,8 +137,7 @@ def as_exact(chain):
 
 
 def star_source(source, wavelength, name="star", target=None):
-    """
-    Return the source optic of a star.
+    """Return the source optic of a star.
 
     ``"unpolarized standard star"``: q and u are zero with the error of the catalogue, or 0.1 %
     where no source states one; they may change smoothly with the wavelength. ``"polarized standard

@@ -386,8 +386,7 @@ class VAMPIRES(SubaruPolarimeter):
         return {"flc": "out", "pairing": "hwp"} if "flc" in names else {}
 
     def prepare(self, observations):
-        """
-        Return the observations with saturated frames masked.
+        """Return the observations with saturated frames masked.
 
         Where frames are paired by the state of the liquid crystal, a drift of the lamp is the same
         in both and no frame is masked for it. Elsewhere as

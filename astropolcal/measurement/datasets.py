@@ -64,8 +64,7 @@ def as_pairs(chain, observations, positions):
 
 
 class Dataset:
-    """
-    A chain with its observations, on the common grid (micrometre) and the flat vector.
+    """A chain with its observations, on the common grid (micrometre) and the flat vector.
 
     ``positions`` of every stage are in radian, shape (n_frames,), or (nodes, n_frames) at the
     Gauss-Legendre nodes of each exposure, whose fluxes are averaged; by default as the instrument

@@ -256,8 +256,7 @@ def ties_among(ties, names):
 
 
 class FreeParameters:
-    """
-    The free parameters of chains that share optics by name, one chain per dataset.
+    """The free parameters of chains that share optics by name, one chain per dataset.
 
     Refused are shapes that do not fit the common grid of ``n_wavelengths``, parameters that are
     free in one chain and fixed in another, ties that are circular or unknown, and astropy's

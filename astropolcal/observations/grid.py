@@ -371,8 +371,7 @@ _HUGE = 1e100
 
 
 def mask_rows(table, values, label, height=None):
-    """
-    Judge the rows by fluxes and errors, each (N,).
+    """Judge the rows by fluxes and errors, each (N,).
 
     Return codes (0 usable, else 1 + index of the reason) and reasons. What the column
     ``mask_reason`` declares is respected, the rest is warned of, by the row of a table of that
@@ -434,8 +433,7 @@ def _mask_cells(code, bad, reason, reasons, label, first):
 
 
 def beam_variances(flux_right, flux_left, errors):
-    """
-    Return the variances of both beams and their covariance, (F, W) each.
+    """Return the variances of both beams and their covariance, (F, W) each.
 
     ``errors`` are standard deviations under the names of `BEAM_ERRORS`, `SINGLE_ERRORS` or both;
     none give NaN. With S = R + L and D = R - L, var(S) + var(D) = 2 (var(R) + var(L)) and var(S) -
@@ -523,8 +521,7 @@ def derotator_runs(observations):
 
 
 def cycle_numbers(observations, start=None):
-    """
-    Return the number of the half-wave-plate cycle of every frame, from 0, (F,).
+    """Return the number of the half-wave-plate cycle of every frame, from 0, (F,).
 
     That of the column ``cycle``; else a cycle ends where a plate angle (of a beam, in a state of
     a modulator) comes again, the derotator moves, or ``start`` comes, the angle with which a cycle
@@ -627,8 +624,7 @@ def brightness(observations):
 
 
 def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
-    """
-    Mask the frames of an internal source whose brightness leaves its slow drift.
+    """Mask the frames of an internal source whose brightness leaves its slow drift.
 
     The drift is the parabola in the order of the frames with the least absolute deviations. A frame
     is unstable if ln(brightness) is off by more than ``limit`` and by more than ``sigma`` robust

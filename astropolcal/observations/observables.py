@@ -270,8 +270,7 @@ class PerFrameDoubleDifference(Observable):
 
 
 class RatioMethod(Observable):
-    """
-    The ratio method, x = (rho - 1) / (rho + 1), rho^2 = (R+ / L+) / (R- / L-).
+    """The ratio method, x = (rho - 1) / (rho + 1), rho^2 = (R+ / L+) / (R- / L-).
 
     The gains of the beams and the flux of each frame drop out exactly, at any degree of
     polarization (Bagnulo et al. 2009, PASP 121, 993, doi:10.1086/605654). The derivative diverges
@@ -311,8 +310,7 @@ class NormalizedSingleDifference(_NormalizedDifference):
 
 
 class NormalizedTripleDifference(_NormalizedDifference):
-    """
-    Normalized triple difference of the frames A+, B+, A-, B-.
+    """Normalized triple difference of the frames A+, B+, A-, B-.
 
     Both states of a modulator, at half-wave plates 45 deg apart; x = ((XA+ - XB+) - (XA- - XB-)) /
     (sum of all I).
@@ -505,8 +503,7 @@ def pair_frames(
     rows=None,
     name="table",
 ):
-    """
-    Pair the frames whose half-wave-plate angles differ by 45 deg; return indices (P, 2).
+    """Pair the frames whose half-wave-plate angles differ by 45 deg; return indices (P, 2).
 
     All arguments are one per frame, angles as quantities; frames of a pair agree in derotator and
     state. The plus frame, whose angle modulo 90 deg lies in [0, 45), comes first; that of the same
@@ -675,8 +672,7 @@ def _choose(plus, minus, n_frames, share):
 
 
 def frame_groups(observations, kind, rows, label, **limits):
-    """
-    Return the frames of each datum of a table, an array that is read only.
+    """Return the frames of each datum of a table, an array that is read only.
 
     By ``kind``: pairs by ``"hwp"`` or by ``"flc_state"``, (P, 2); ``"both"``, pairs in both states
     of a modulator, (Q, 4): A and B at the plus angle, then at the minus. The limits are those

@@ -162,8 +162,7 @@ def dates_of(tables, error=ObservationError):
 
 
 def complete_table(table, label):
-    """
-    Return a table of single differences and sums as one of beam fluxes.
+    """Return a table of single differences and sums as one of beam fluxes.
 
     Where neither ``frame`` nor ``bin`` is there, each row is a frame of one wavelength; a missing
     ``wavelength`` is that of the meta, ``wavelength`` or ``filter``. Frames of single differences

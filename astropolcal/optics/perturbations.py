@@ -46,8 +46,7 @@ GENERATORS = {
 
 
 class Dependence:
-    """
-    How a perturbation depends on the frame, by a text.
+    """How a perturbation depends on the frame, by a text.
 
     ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
     ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine

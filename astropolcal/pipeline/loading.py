@@ -114,8 +114,7 @@ class SystemMueller:
 
     @property
     def factor(self):
-        """
-        Changes of ``value`` for one standard error along each direction that is determined.
+        """Changes of ``value`` for one standard error along each direction that is determined.
 
         Shape (..., 4, 4, rank). The covariance of any two elements, also of different frames,
         wavelengths or beams, is the sum of the products of theirs. It is large: some megabytes for
@@ -151,8 +150,7 @@ class SystemMueller:
 
     @property
     def covariance_in_gauge(self):
-        """
-        The covariance with open directions held where the calibration has put them.
+        """The covariance with open directions held where the calibration has put them.
 
         Finite everywhere. It is too small for what moves along them, such as the angle of
         polarization where the data know misalignments up to a common turn; a prior on one
@@ -336,8 +334,7 @@ class LoadedCalibration:
 
     @property
     def chain(self):
-        """
-        The calibrated chain, an astropy model: a copy, which may be changed.
+        """The calibrated chain, an astropy model: a copy, which may be changed.
 
         From the sky where the telescope is calibrated, otherwise from the first optic on a stage
         of the instrument.

@@ -45,8 +45,7 @@ class Ended:
 
 
 def ended_tasks(function, tasks, *, workers=None, cluster=None, timeout=None, preload=()):
-    """
-    Yield what became of tasks, `Ended`, in the order in which they end.
+    """Yield what became of tasks, `Ended`, in the order in which they end.
 
     ``function`` and the tasks are pickled; the tasks are drawn as they are begun. Without a
     ``cluster``, the address of a scheduler of dask.distributed, there are so many processes

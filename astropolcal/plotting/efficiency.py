@@ -37,8 +37,7 @@ def plot_polarimetric_efficiency(
     figure=None,
     **settings,
 ):
-    """
-    Draw the polarimetric efficiency of an instrument, see `polarimetric_efficiency`.
+    """Draw the polarimetric efficiency of an instrument, see `polarimetric_efficiency`.
 
     Lines against the derotator angle, at the ``shown`` wavelengths or six; a map of derotator angle
     and wavelength; for a chain from the sky a map of parallactic angle and altitude at this

@@ -391,8 +391,7 @@ def _place_of(effect, chains):
 
 
 def plot_effect_sizes(diagnosis, effect, *, figure=None):
-    """
-    Draw the fitted size of a cause, by its name, with its errors.
+    """Draw the fitted size of a cause, by its name, with its errors.
 
     One panel for what it depends on, if that is a cell that changes from frame to frame: the size
     at the middle wavelength with its 68 % band, and the frames as marks. One panel for each

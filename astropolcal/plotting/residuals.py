@@ -395,8 +395,7 @@ _HEADROOM = 1.05
 
 
 def plot_residuals(calibration, *, figure=None):
-    """
-    Draw a map of the residuals: wavelength against datum, by derotator angle; one per dataset.
+    """Draw a map of the residuals: wavelength against datum, by derotator angle; one per dataset.
 
     Above it stands the rms of each datum, at its right that of each wavelength. All maps have the
     same colours, or where the residuals differ much in size each its own. Grey is what is masked,

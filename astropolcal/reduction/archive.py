@@ -148,8 +148,7 @@ class Index:
         )
 
     def sequences(self, *, gap, cycles=None, target=None):
-        """
-        Yield the sequences, `Sequence`, one after the other, however many there are.
+        """Yield the sequences, `Sequence`, one after the other, however many there are.
 
         Frames of one instrument, object and mode that follow each other within ``gap`` seconds;
         no more than so many ``cycles`` of the half-wave plate. ``target`` is a pattern for the

@@ -256,8 +256,7 @@ def contradictions(ours, theirs, columns, where):
 
 @dataclass(frozen=True)
 class Masters:
-    """
-    Files of a dark and of a flat, either of which may be None.
+    """Files of a dark and of a flat, either of which may be None.
 
     Pixels without a value in either, and those at which the flat is not above zero, are bad. Where
     each camera writes files of its own, these are those of the right beam, and the others stand
@@ -424,8 +423,7 @@ def read_night(files, instrument):
 
 
 def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
-    """
-    Return angles of all frames, places of the star, exposures, and detectors of both beams.
+    """Return angles of all frames, places of the star, exposures, and detectors of both beams.
 
     The places are None where the star is in the middle of each beam.
 

@@ -361,8 +361,7 @@ def tracking_error(values, layout, *, on_sky=True):
 
 
 def check_sequence(hwp, derotator, layout, tolerance=0.5):
-    """
-    Return what is wrong with commanded angles (degree, in the order of the frames), by index.
+    """Return what is wrong with commanded angles (degree, in the order of the frames), by index.
 
     Angles that are not multiples of the layout's step do not fit. The frames are cut into blocks of
     one derotator angle; the angles that most blocks have are the sequence. A block may lack some of

@@ -230,8 +230,7 @@ def rectangles(apertures, shape):
 
 
 def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
-    """
-    Measure the beams of an internal source in all slices of a cube (W, Y, X).
+    """Measure the beams of an internal source in all slices of a cube (W, Y, X).
 
     Pixels without a value are left out, and the sum is scaled to the full area. So are single
     pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The

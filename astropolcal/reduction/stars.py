@@ -45,8 +45,7 @@ def measure_stars(
     companion=0.1,
     max_masked=0.1,
 ):
-    """
-    Measure a star in the beams in all slices of a cube (W, Y, X).
+    """Measure a star in the beams in all slices of a cube (W, Y, X).
 
     The star is found in the mean of the slices. In each slice a Gaussian gives centre and width in
     each beam; all are measured with the same radius, so that light outside of it does not look
@@ -388,8 +387,7 @@ Found = namedtuple("Found", "positions fwhm reason")
 
 
 def find_star(image, good, places, *, fwhm=4.0, companion=0.1):
-    """
-    Find the brightest star that is seen in all beams of an image (Y, X).
+    """Find the brightest star that is seen in all beams of an image (Y, X).
 
     ``places`` are (x, y) of its images from a common point, each met within some pixels: there the
     brightest peak is taken and not the nearest, as beams move on the detector and a companion may
@@ -474,8 +472,7 @@ _DAMPING = (1e-3, 1e-9, 1e9)
 
 
 class GaussianFits(namedtuple("Fits", "amplitude x y background fwhm elongation converged shape")):
-    """
-    What `fit_gaussians` found, one value an image; pixels of the image.
+    """What `fit_gaussians` found, one value an image; pixels of the image.
 
     ``fwhm`` is the geometric mean of the full widths along the two axes, ``elongation`` the long
     axis over the short one; ``shape`` are the elements xx, xy, yy of the inverse covariance matrix,

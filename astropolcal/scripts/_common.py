@@ -240,8 +240,7 @@ def entries(text):
 
 
 def option(entry, types):
-    """
-    Return the names and the settings of ``add_argument`` that an entry describes.
+    """Return the names and the settings of ``add_argument`` that an entry describes.
 
     Before two spaces stand names and value as the help shows them, such as ``-o --output FILE`` or
     ``--kind {a,b}``; the name of a type; ``=DEFAULT``; ``required``; ``?``, ``*`` or ``+`` as in

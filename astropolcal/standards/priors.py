@@ -61,8 +61,7 @@ class UnpolarizedError(NamedTuple):
 
 
 class Interstellar(NamedTuple):
-    """
-    The Serkowski law of a polarized star, with an error of every parameter.
+    """The Serkowski law of a polarized star, with an error of every parameter.
 
     ``errors`` are by name, as quantities where the parameter has a unit. ``covariance`` is of
     p_max, lambda_max, K, theta and rotation in the units of the law; the errors alone give two or

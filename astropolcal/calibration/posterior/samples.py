@@ -375,8 +375,7 @@ class Posterior:
 
     @property
     def converged(self):
-        """
-        Whether to believe the samples.
+        """Whether to believe the samples.
 
         The run is longer than 50 of its longest autocorrelation times, R-hat
         is 1.05 or less, and the effective sample sizes are 400 or more; only

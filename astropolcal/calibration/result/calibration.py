@@ -148,8 +148,7 @@ class Calibration:
 
     @property
     def residuals(self):
-        """
-        Residuals of all data, observed minus model, shape (n_data,).
+        """Residuals of all data, observed minus model, shape (n_data,).
 
         Raises
         ------

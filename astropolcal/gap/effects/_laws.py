@@ -105,8 +105,7 @@ class OfLaw(Effect):
 
 
 class Fringes(OfLaw):
-    """
-    Etalon: retardance that oscillates with the wavenumber.
+    """Etalon: retardance that oscillates with the wavenumber.
 
     The difference of path between the two reflections, in micrometre, decides on the period, and
     no derivative at zero tells it: `of` gives one effect for each.
