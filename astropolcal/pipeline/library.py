@@ -24,6 +24,7 @@ from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -321,6 +322,13 @@ class Library:
             if _meet(other, newest):
                 raise CalibrationFileError(_overlap(other, newest))
         return newest
+
+    def _beside(self, chosen):
+        """Return the entries before and after one, of the same instrument, mode and optics."""
+        kind = attrgetter("validity.instrument", "validity.mode", "validity.optics_in")
+        same = sorted((e for e in self._in_force() if kind(e) == kind(chosen)), key=_start)
+        k = [e.name for e in same].index(chosen.name)
+        return same[max(k - 1, 0) : k] + same[k + 1 : k + 2]
 
     def explain(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
         """

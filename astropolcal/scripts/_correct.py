@@ -91,6 +91,8 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 _MOST_SKY = 0.01
 # signal to noise of a degree of polarization above which the error of its angle holds
 _CLEAR = 3.0
+# by more standard errors calibrations of the same optics differ
+_MOVED = 5.0
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
 # options that `correct` calls the same
@@ -307,9 +309,10 @@ def choose_calibration(arguments, files):
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
-        entry = _of_library(path, arguments, night, beam, files)
+        entry, others = _of_library(path, arguments, night, beam, files)
         path = entry.path
         calibration, digest = _read(path)
+        _warn_of_change(calibration, entry.name, others)
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
     moments = [(file, date, mode) for file, date in night.moments.items()]
@@ -340,7 +343,7 @@ def _library(path, changed):
 
 
 def _of_library(path, arguments, night, beam, files):
-    """Return the calibration that holds for the first and the last frame."""
+    """Return the calibration that holds for the first and the last frame, and those beside it."""
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
@@ -359,7 +362,28 @@ def _of_library(path, arguments, night, beam, files):
             f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
             f"{found[0].path} and {found[1].path}: correct them apart"
         )
-    return found[0]
+    return found[0], library._beside(found[0])
+
+
+def _warn_of_change(calibration, name, others):
+    """Warn where the calibrations before and after it differ by more than the errors of both."""
+    from astropolcal.calibration.result.comparison import moved
+
+    told = []
+    for other in others:
+        optics = {}
+        if np.array_equal(other.calibration.wavelength, calibration.wavelength):
+            optics = moved(calibration, other.calibration)
+        by, most = optics.pop("", 0.0), max(optics, key=optics.get, default=None)
+        if by > _MOVED:
+            told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
+    if told:
+        warnings.warn(
+            f"{name} differs from {' and '.join(told)} standard errors: what changes from one "
+            "calibration to the next is not in the errors (astropolcal health says what changed)",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
 
 
 # ---- the product ----------------------------------------------------------------------------

@@ -734,6 +734,21 @@ def test_library_gives_what_holds_for_the_date(frames_with, library):
         chosen(library, frames_with({"MJD": None}), optics_in=["nbs"])
 
 
+def test_what_changed_between_calibrations_is_told(frames_with, library, tmp_path):
+    files = frames_with({"MJD": 60982.5})
+    # two that are the same say nothing
+    chosen(library, files, optics_in=["nbs"])
+    other = Calibration.read(OLD)
+    for chain in other.chains:
+        chain["hwp"].theta.value += 3.0
+    moved = Library(tmp_path)
+    moved.add(Calibration.read(OLD), name="a.asdf", valid_until="2025-12-01")
+    moved.add(other, name="b.asdf", valid_from="2025-12-01")
+    with pytest.warns(AstropolcalWarning, match=r"a.asdf differs from b.asdf by \d+ \(hwp by"):
+        found = chosen(tmp_path, files, optics_in=["nbs"])
+    assert Path(found["calibration"]).name == "a.asdf"
+
+
 def test_options_are_named_where_a_library_needs_to_know_more(frames_with, tmp_path):
     for mode in ("J", "H"):
         with_validity(Calibration.read(OLD), mode=mode).write(tmp_path / f"{mode}.asdf")
