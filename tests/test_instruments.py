@@ -409,6 +409,7 @@ ALLOWED = {
     ("scripts/_correct.py", "charis"): DEFAULT,
     ("scripts/_efficiency.py", "charis"): DEFAULT,
     ("scripts/_reduce.py", "charis"): DEFAULT,
+    ("scripts/_simulate.py", "charis"): DEFAULT,
 }
 # arguments of argparse whose texts may cite an instrument
 HELP = {"help", "epilog", "description", "metavar"}
