@@ -142,7 +142,8 @@ html_static_path = [
 html_css_files = ["pages.css"]
 html_logo = html_favicon = "_static/logo.svg"
 # the header has the logo
-html_sidebars = {"**": ["components/sst-sidebar-nav.html"]}
+# pages of source are wide, and their navigation would be most of the time of a build
+html_sidebars = {"[!_]**": ["components/sst-sidebar-nav.html"], "_modules/**": []}
 html_theme_options = {
     "logo": {"text": "astropolcal", "alt_text": "Logo of astropolcal"},
     "navbar_start": "components/navbar-logo.html",
