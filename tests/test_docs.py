@@ -149,7 +149,7 @@ def test_metadata_of_the_software_agree(repository):
 # ---- the gallery of models -----------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_optic_has_a_page(gallery):
     for name in OPTICS:
         page = gallery["pages"].optic_page(name, "wavelength", "somewhere")

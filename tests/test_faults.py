@@ -615,7 +615,7 @@ def add_to_library(folder, number, same, out):
         out.put((number, repr(error)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_processes_add_to_one_library(tmp_path):
     calibration()
     for same, n in ((False, 6), (True, 1)):
@@ -646,7 +646,7 @@ def add_for_ever(folder, first):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_writer_does_not_lock_a_library(tmp_path):
     calibration()
     rng = np.random.default_rng(9)

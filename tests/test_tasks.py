@@ -33,7 +33,7 @@ def test_a_process_that_dies_takes_its_task_only():
     assert "exit status 0" in found[0][1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_task_that_takes_too_long_is_given_up():
     started = time.monotonic()
     found = ended(time.sleep, [60, 0.01, 0.02], workers=2, timeout=2)

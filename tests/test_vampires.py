@@ -283,7 +283,7 @@ MIRRORED = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_fit_ends_where_half_a_wave_mirrors_the_liquid_crystal():
     truth = VAMPIRES.chain()
     for name, value in MIRRORED.items():

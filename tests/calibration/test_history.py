@@ -141,7 +141,7 @@ def test_three_together_are_tested_for_one_value(years):
     assert significance(years, ["derotator"]).sigma > 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_chi_square_is_right_over_many_runs():
     chi2 = []
     for seed in range(20):

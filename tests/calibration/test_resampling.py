@@ -242,7 +242,7 @@ def test_calibration_from_a_file_has_no_data(white, tmp_path):
 # --- real data ----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_of_the_real_fit_are_those_of_the_bootstrap(charis_fit):
     """Dataset 3: the residuals are no white noise, and cycles tell by how much, 1.8 times."""
     cal = charis_fit(3, "hwp.theta", "derotator.theta")

@@ -229,7 +229,7 @@ def test_calibration_from_a_file_has_no_data(few, tmp_path):
 # --- real measurements -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_fit):
     """Measured: 1.7 times the covariance's, 0.9 times the bootstrap's, in the median."""
     cal = charis_fit(3, "hwp.theta", "derotator.theta")

@@ -237,7 +237,7 @@ def test_linear_normal_posterior(linear):
     assert abs(correlation) < 5 * (posterior.autocorrelation_times.max() / (32 * 1100)) ** 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_linear_normal_posterior_with_a_prior():
     prior = (0.78, 0.005)
     cal = make_calibration(False, wollaston__efficiency=Normal(*prior))
@@ -718,7 +718,7 @@ def paper(charis_data):
     return quiet_sample(cal, parameters=names, n_steps=800, seed=1, progress=False)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_thicknesses_of_dataset_3_are_degenerate(paper):
     """
     McIntosh et al. (2026, Appendix on MCMC): "perfectly degenerate with each other".

@@ -252,7 +252,7 @@ def test_robust_loss_is_not_pulled(spoiled):
         assert error(loss=loss) < 0.6 * usual, loss
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_robust_fit_of_good_data_is_not_surer_than_least_squares():
     """Weights that follow the residuals let a fit move more than weights that stay."""
     chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)

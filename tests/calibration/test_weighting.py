@@ -147,7 +147,7 @@ def test_levels_are_unbiased(truth, data):
     np.testing.assert_allclose(np.mean(squares, axis=0) / LEVELS**2, 1, atol=4 * error)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_are_right_where_wavelengths_are_unequally_noisy(make, truth):
     """24 runs of 11 parameters: the pulls have unit width, also where one level weighted all."""
     pulls = {None: [], "wavelength": []}

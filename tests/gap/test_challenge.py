@@ -373,7 +373,7 @@ def test_a_run_that_makes_no_sense_is_refused():
             run_challenge(**options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_of_dask_gives_the_same_answers():
     distributed = pytest.importorskip("distributed")
     options = {"seed": 3, "kinds": ["none"], "setup": SMALL}

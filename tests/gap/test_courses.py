@@ -82,7 +82,7 @@ def test_what_is_the_same_in_all_frames_is_no_course():
         assert "frame 0 on" not in one.shape
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
     # as few wavelengths and angles as tell the course from the causes of the table
     for seed, small, course, place, kind in (

@@ -246,7 +246,7 @@ def test_of_two_tables_the_one_that_is_misread_is_named():
     assert "run 2, frame 31: its angle is in no row" in sentences[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_goes_wrong_in_the_middle_of_a_run_is_found():
     """A frame is lost, or the angles of all later ones are in disorder."""
     turn = np.linspace(45, 110, 4) * u.deg

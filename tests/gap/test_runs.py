@@ -56,7 +56,7 @@ BEHIND = ("after:derotator", "retardance_d", "constant", 0.03)
 # ---- wavelengths of their own ------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fault_of_one_of_two_runs_at_other_wavelengths():
     one, other = np.arange(7) == 1, np.arange(7) == 4
     first, second = pair([], [BEHIND])

@@ -140,7 +140,7 @@ def test_a_law_of_any_form_is_one_cause():
     np.testing.assert_allclose(sizes["value"], true["gap_beam_gain"].imbalance.value, atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_only_a_free_law_shows_is_found():
     """Fringes change sign between wavelengths: no smooth law has anything of them."""
     small = Setup(n_derotator=4)

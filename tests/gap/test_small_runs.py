@@ -107,7 +107,7 @@ def test_static_retarder_behind_a_polarizer_that_turns_is_among_the_answers():
         assert "retarder that is static downstream of the lamp" in words, seed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_size_for_every_datum_does_not_outdo_the_cause():
     chain, frames = turning_plate()
     uneven = optics.HarmonicRotator(harmonic=2, cosine=0.2 * u.deg, mount="plate", name="uneven")
