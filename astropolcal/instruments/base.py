@@ -322,6 +322,8 @@ class Instrument(ABC):
     entrance = "hwp"
     max_age = 365 * u.day
     changes = ()
+    # what an instrument without a layout of its files says of headers and of its place
+    transforms, times, site = {}, {}, ()
 
     @abstractmethod
     def chain(self, source="polarized", optics_in=(), *, wavelength=None, **options):
@@ -500,10 +502,10 @@ class Instrument(ABC):
     @property
     def headers(self):
         """Layout that reads the headers of frames, None without keywords."""
-        own = self.keywords
+        own = self.keywords | self.times
         common = {key: word for key, word in COMMON.items() if word not in own.values()}
         common.pop("exposure_time", None)
-        return FileLayout(common | own, (1, 1, 1)) if own else None
+        return FileLayout(common | own, (1, 1, 1), transforms=self.transforms) if own else None
 
     @property
     def has_telescope(self):
@@ -611,7 +613,7 @@ class Instrument(ABC):
     @property
     def location(self):
         """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
-        return None if self.files is None else location_of(self.files.site)
+        return location_of(self.site or getattr(self.files, "site", ()))
 
     @property
     def sky_law(self):
@@ -739,8 +741,7 @@ class Polarimeter(Instrument):
 
     sources = ("polarized", *shared.STARS)
     sky_options = ("wavelength",)
-    site, focus, altitude = (), "nasmyth", "-altitude"
-    transforms, times = {}, {}
+    focus, altitude = "nasmyth", "-altitude"
     #: The plate stays where it is put, and turns with the instrument.
     sky_law = SkyLaw(plate=(0, 0), derotator={})
 
@@ -773,19 +774,6 @@ class Polarimeter(Instrument):
         if self.focus == "cassegrain":
             return [optics.Rotator(mount="parallactic", name="parallactic")]
         return shared.telescope(aluminium(self.grid(wavelength)), self.altitude)
-
-    @property
-    def headers(self):
-        """Layout that reads the headers of frames."""
-        keywords = {key: word for key, word in COMMON.items() if key != "exposure_time"}
-        return FileLayout(
-            keywords | self.keywords | self.times, (1, 1, 1), transforms=self.transforms
-        )
-
-    @property
-    def location(self):
-        """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
-        return location_of(self.site)
 
 
 class SubaruPolarimeter(Polarimeter):
@@ -830,10 +818,4 @@ class SubaruPolarimeter(Polarimeter):
 def aluminium(grid):
     """Return a tertiary mirror whose diattenuation, at first that of aluminium, is free."""
     metal = optics.MetalMirror(material="aluminium")
-    return optics.DiattenuatorRetarder(
-        diattenuation=metal.diattenuation(grid),
-        retardance=metal.retardance(grid),
-        name="m3",
-        fixed={"retardance": True},
-        bounds={"diattenuation": (-0.1, 0.1)},
-    )
+    return shared.free_mirror("m3", metal.diattenuation(grid), metal.retardance(grid), most=0.1)

@@ -25,9 +25,9 @@ from astropy.time import Time
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
+from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
-from astropolcal.instruments.telescope import INTERNAL, PARANAL, STARS, misaligned, star_source
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
@@ -255,7 +255,7 @@ def coating_of(coating, date):
 def _retarder(index, name):
     """Return the half-wave plate or the derotator, by the name of its stage."""
     theta = _DATA.meta[f"{name}_theta_deg"]
-    held = misaligned(theta)
+    held = shared.misaligned(theta)
     held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
     values = {key: _DATA[f"{name}_{key}"][index] for key in ("diattenuation", "retardance")}
     settings = {"theta": theta * u.deg, "mount": name, "name": name}
@@ -265,23 +265,10 @@ def _retarder(index, name):
 def telescope(index, coating):
     """Return the optics from the sky to the half-wave plate."""
     check_choice("coating", coating, COATINGS, InstrumentError)
-    return [
-        optics.Rotator(mount="parallactic", name="parallactic"),
-        _mirror("ut", coating, index),
-        optics.Rotator(mount="altitude", name="altitude"),
-        _mirror("m4", coating, index),
-    ]
-
-
-def _mirror(name, coating, index):
-    return optics.DiattenuatorRetarder(
-        diattenuation=_DATA[f"{name}_diattenuation_{coating}"][index],
-        retardance=_DATA["mirror_retardance"][index],
-        name=name,
-        # an unpolarized star shows the diattenuation of a mirror, never its retardance
-        fixed={"retardance": True},
-        bounds={"diattenuation": (-0.1, 0.1)},
-    )
+    retardance = _DATA["mirror_retardance"][index]
+    values = {name: _DATA[f"{name}_diattenuation_{coating}"][index] for name in ("ut", "m4")}
+    ut, m4 = (shared.free_mirror(*pair, retardance, most=0.1) for pair in values.items())
+    return [*shared.telescope(ut, "altitude"), m4]
 
 
 # ---- files -------------------------------------------------------------------------------------
@@ -346,12 +333,7 @@ KEYWORDS = {
 _LIT = 0.7
 #: Full frames, dark, flat and centred: both halves of the detector side by side.
 LAYOUT = IrdisLayout(
-    keywords=COMMON
-    | KEYWORDS
-    | {
-        "exposures": "ESO DET NDIT",
-        "filter": _FILTER,
-    },
+    keywords=COMMON | KEYWORDS | {"exposures": "ESO DET NDIT", "filter": _FILTER},
     shape=(1, 1024, 2048),
     cube_extension=0,
     weights="error",
@@ -362,7 +344,7 @@ LAYOUT = IrdisLayout(
     saturation=30000.0,
     pixel_scale=12.25,
     tracking=SKY_LAW.plate_law("field"),
-    site=PARANAL,
+    site=shared.PARANAL,
     stacked=True,
     centred=True,
     **side_by_side(1024, 1024, _LIT),
@@ -395,7 +377,7 @@ class IRDIS(Instrument):
         "de Boer et al. 2020, A&A 633, A63, doi:10.1051/0004-6361/201834989",
         "IRDAP, https://github.com/robvanholstein/IRDAP (keywords, limit of saturation)",
     )
-    sources = (*INTERNAL, *STARS)
+    sources = (*shared.INTERNAL, *shared.STARS)
     sky_options = ("wavelength", "date")
     changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were recoated"),)
     #: Names of the filters with coefficients, in the order of ``wavelength``.
@@ -463,13 +445,13 @@ class IRDIS(Instrument):
         analyser = optics.WollastonPrism(efficiency=efficiency, theta=90 * u.deg, name="wollaston")
         common = [_retarder(index, "hwp"), derotator, analyser]
         if source == "polarized":
-            polarizer = optics.LinearPolarizer(name="calibration_polarizer", **misaligned(0))
+            polarizer = optics.LinearPolarizer(name="calibration_polarizer", **shared.misaligned(0))
             return join([polarizer, *common])
         if source == "unpolarized":
             zero = np.zeros(index.size)
             # M4 and the lamp polarize together; only what reaches the plate can be measured
             return join([optics.PolarizedSource(q=zero, u=zero, name="lamp"), *common])
-        light = star_source(source, grid, star, target)
+        light = shared.star_source(source, grid, star, target)
         return join([light, *telescope(index, coating), *common])
 
     def published(self):

@@ -428,9 +428,8 @@ class HiCIAO(SubaruPolarimeter):
     # it had left the telescope before anything of these changed
     changes = ()
 
-    def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the telescope with a tertiary mirror of bare silver."""
-        return shared.telescope(optics.MetalMirror(material="silver", name="m3"))
+    # a tertiary mirror of bare silver
+    telescope_optics = VAMPIRES.telescope_optics
 
 
 class IRCS(SubaruPolarimeter):

@@ -65,13 +65,19 @@ def tertiary_mirror(model, wavelength):
     if model == "metal":
         settings = {"material": "silver", "film_thickness": _FILM_START, "name": "m3"}
         return mounted(_metal(optics.MetalMirror, 500, **settings))
-    mirror = optics.DiattenuatorRetarder(
-        diattenuation=np.full(wavelength.size, 0.01),
-        retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
-        name="m3",
+    retardance = optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength)
+    return mounted(free_mirror("m3", np.full(wavelength.size, 0.01), retardance))
+
+
+def free_mirror(name, diattenuation, retardance, most=1.0):
+    """Return a mirror of free diattenuation; its retardance no unpolarized star shows."""
+    return optics.DiattenuatorRetarder(
+        diattenuation=diattenuation,
+        retardance=retardance,
+        name=name,
         fixed={"retardance": True},
+        bounds={"diattenuation": (-most, most)},
     )
-    return mounted(mirror)
 
 
 def k_mirror(**settings):

@@ -41,24 +41,19 @@ __all__ = ["VAMPIRES"]
 FIELDS = ("MBI 610", "MBI 670", "MBI 720", "MBI 760")
 _BANDS = ("625-50", "Open", "675-50", "725-50", "750-50", "775-50")
 _MODE, _FILTER = "OBS-MOD", "FILTER01"
-_MULTIBAND, _REDUCED, _SINGLE = "IPOL_MBI", "IPOL_MBIR", "IPOL"
 # pixels of a field of 1.1 arcsec, and of the usual window of 3 arcsec
 _FIELD_SIDE, _WINDOW_SIDE = 184, 536
 # part of a side that the rectangles of the internal source have
 _LIT = 0.8
 
 #: Column of the observation table to keyword.
-KEYWORDS = {
-    "hwp": "RET-ANG1",
-    "hwp_true": "RET-POS1",
-    "derotator": "D_IMRANG",
+KEYWORDS = SubaruPolarimeter.keywords | {
     "flc_state": "U_FLC",
     "flc": "U_FLCST",
     "camera": "U_CAMERA",
     "em_gain": "U_EMGAIN",
     "read_mode": "U_DETMOD",
     "filter": _FILTER,
-    "altitude": "ALTITUDE",
     "parallactic": "PA",
 }
 
@@ -78,13 +73,7 @@ _READ_OUTS = {
 
 #: The multiband imager; ``layout_of`` has the other modes.
 LAYOUT = FileLayout(
-    keywords=COMMON
-    | KEYWORDS
-    | {
-        "mjd": "MJD",
-        "time": "UT",
-        "pickoff": _MODE,
-    },
+    keywords=COMMON | KEYWORDS | SubaruPolarimeter.times | {"pickoff": _MODE},
     shape=(len(FIELDS), _FIELD_SIDE, 2 * _FIELD_SIDE),
     cube_extension=0,
     weights="error",
@@ -152,16 +141,13 @@ _DEROTATOR = (281.0, 245.0, 204.0, 176.0)
 _BOUNDS = {"horizontal": (0, 360), "diagonal": (-90, 90), "circular": (-90, 90)}
 
 
-def _silver(name):
-    return optics.MetalMirror(material="silver", incidence=45 * u.deg, name=name)
-
-
 def _mirror(model, grid):
     """Return the tertiary mirror, ready to be calibrated."""
     mirror = subaru.tertiary_mirror(model, grid)
     if model == "free":
-        mirror.diattenuation = _silver("m3").diattenuation(grid)
-        mirror.retardance = _silver("m3").retardance(grid)
+        silver = optics.MetalMirror(material="silver")
+        mirror.diattenuation = silver.diattenuation(grid)
+        mirror.retardance = silver.retardance(grid)
     return mirror
 
 
@@ -310,7 +296,7 @@ class VAMPIRES(SubaruPolarimeter):
 
     def telescope_optics(self, behind):
         """Return the telescope with a tertiary mirror of bare silver."""
-        return subaru.telescope(_silver("m3"))
+        return subaru.telescope(optics.MetalMirror(material="silver", name="m3"))
 
     def published(self):
         """
@@ -340,14 +326,13 @@ class VAMPIRES(SubaruPolarimeter):
 
     def mode_header(self, wavelength):
         """Return mode and filter in the headers of cubes of these wavelengths."""
-        known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
-        known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
-        known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
+        known = [("IPOL_MBI", "Open", FIELDS), ("IPOL_MBIR", "Open", FIELDS[1:])]
+        known += [("IPOL", name, (name,)) for name in _BANDS]
         wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
-        for header, names in known:
+        for mode, band, names in known:
             own = _wavelengths(names).value
             if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
-                return header
+                return {_MODE: mode, _FILTER: band}
         raise InstrumentError(
             f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; "
             f"allowed are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or "
