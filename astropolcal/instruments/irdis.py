@@ -11,7 +11,6 @@ Beams have the names of the halves of the detector. The left one passes +Q, so s
 differences here, right minus left, have the opposite sign of the published ones.
 """
 
-import warnings
 from collections import ChainMap
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.chain import join
-from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
+from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, warn
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
@@ -73,10 +72,8 @@ class _Header:
         if key not in self.header:
             raise ObservationError(f"frame {self.number}: no keyword {key} in its header")
         value = str(self.header[key]).strip()
-        if allowed is not None and value not in allowed:
-            raise ObservationError(
-                f"frame {self.number}: {key} = {value!r}; allowed are {', '.join(allowed)}"
-            )
+        if allowed is not None:
+            check_choice(f"frame {self.number}: {key}", value, allowed, ObservationError)
         return value
 
     def number_of(self, key, low, high=np.inf):
@@ -191,11 +188,10 @@ def _warn_of_starts(frames, motions, tracking, sky_law):
             law = sky_law.plate_law if column == "hwp_true" else sky_law.derotator_law
             on_sky = law(tracking)
         lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
-        warnings.warn(
+        warn(
             f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
             f"is frame {few[0]}: {column} is that of the start; until the middle of the exposure "
             f"it turns by up to {lost:.2g} deg",
-            AstropolcalWarning,
             # _warn_of_starts, frame_table of this module, that of the instrument: who called it
             stacklevel=4,
         )
@@ -231,11 +227,10 @@ def coating_of(coating, date):
         check_choice("coating", coating, COATINGS, InstrumentError)
     if date is None:
         if coating is None:
-            warnings.warn(
+            warn(
                 "irdis: neither date nor coating of the telescope was given; it is the one from "
                 f"{RECOATING} on; give the date of the frames (date, or --date of a command), or "
                 "coating='before' for older ones",
-                AstropolcalWarning,
                 # coating_of, telescope_optics, on_sky: the line that asked for a chain from the sky
                 stacklevel=4,
             )

@@ -6,14 +6,13 @@ On sky a star and the mirrors of the telescope stand before the half-wave plate.
 """
 
 import re
-import warnings
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics, standards
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
+from astropolcal.exceptions import AstropolcalError, InstrumentError, warn
 from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
@@ -242,7 +241,7 @@ def _standard(source, target):
                 "polarization is fitted without a prior"
             ) from error
         words = f"{error}; it is unpolarized according to the table"
-        warnings.warn(words, AstropolcalWarning, stacklevel=2)
+        warn(words)
         return None
     if not source.startswith(known.kind):
         raise InstrumentError(

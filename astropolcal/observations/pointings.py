@@ -21,12 +21,7 @@ from astropy.utils.data import download_file
 from astropy.utils.exceptions import AstropyWarning
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import (
-    AstropolcalError,
-    AstropolcalWarning,
-    ObservationError,
-    ParameterError,
-)
+from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError, warn
 from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
@@ -60,11 +55,10 @@ def offline():
         iers.conf.set_temp("auto_download", False),
         iers.conf.set_temp("auto_max_age", None),
         iers.conf.set_temp("iers_degraded_accuracy", "warn"),
-        warnings.catch_warnings(),
-    ):
         # of what matters `_warn_of_uncovered` warns
-        warnings.simplefilter("ignore", AstropyWarning)
-        warnings.simplefilter("ignore", ErfaWarning)
+        warnings.catch_warnings(action="ignore", category=AstropyWarning),
+        warnings.catch_warnings(action="ignore", category=ErfaWarning),
+    ):
         yield
 
 
@@ -96,12 +90,11 @@ def _warn_of_uncovered(time):
         if np.any(uncovered) and words not in _SAID:
             _SAID.add(words)
             # 0.9 s of time are 13.5 arcsec of hour angle
-            warnings.warn(
+            warn(
                 f"times {words}: UT1 is taken as UTC. As long as leap seconds keep the two within "
                 "0.9 s, the altitude is good to 0.004 deg, and the parallactic angle to 0.004 deg "
                 "over the sine of the zenith distance, 0.2 deg at 1 deg from the zenith. Newer "
                 "tables come with astropy-iers-data, or over the network with --online",
-                AstropolcalWarning,
                 stacklevel=3,
             )
 

@@ -3,7 +3,6 @@
 
 import dataclasses
 import hashlib
-import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -11,7 +10,7 @@ import numpy as np
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError, ParameterError, warn
 from astropolcal.files import one_line
 from astropolcal.observations.grid import beam_variances, build_grid, warn_of_copies
 from astropolcal.observations.observables import PAIRINGS, frame_groups, warn_of_exposures
@@ -735,9 +734,7 @@ def _seen(grid, label):
     if not dark.any():
         return grid
     words = listed([f"{w:.4g}" for w in grid.wavelength[dark].to_value(u.nm)])
-    warnings.warn(
-        f"{label}: no usable cell at {words} nm; left out", AstropolcalWarning, stacklevel=4
-    )
+    warn(f"{label}: no usable cell at {words} nm; left out", stacklevel=4)
     return some_bins(grid, ~dark, label)
 
 

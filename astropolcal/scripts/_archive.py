@@ -170,8 +170,7 @@ def _worked(command, arguments, folder, task):
     if os.path.isdir(getattr(arguments, "calibration", "")):
         arguments.instrument = arguments.instrument or instrument
     said = io.StringIO()
-    with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
+    with redirect_stderr(said), warnings.catch_warnings(record=True, action="always") as warned:
         warnings.filterwarnings("ignore", message="ERFA function")
         module = import_module(f"astropolcal.scripts._{command}")
         with earth(arguments):

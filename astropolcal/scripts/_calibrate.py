@@ -20,7 +20,6 @@ DESCRIPTION = """\
 Fit an instrument's chain of optics to observation tables. Without files,
 the packaged example is calibrated."""
 EXAMPLES = """\
-examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics

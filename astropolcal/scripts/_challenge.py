@@ -17,7 +17,6 @@ DESCRIPTION = """\
 Simulate calibrations with random faults, diagnose each without the key,
 and compare the answers with the truth."""
 EXAMPLES = """\
-examples:
   astropolcal challenge -n 20
   astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
   astropolcal challenge make cases --count 100 --seed 7

@@ -13,7 +13,6 @@ DESCRIPTION = """\
 Find what an instrument's model lacks to explain the measurements: where
 the gap lies, which effect causes it, and how far it shrinks on left-out frames."""
 EXAMPLES = """\
-examples:
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
   astropolcal diagnose run.ecsv --derotator linear  a simpler model

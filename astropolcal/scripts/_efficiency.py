@@ -34,7 +34,6 @@ offset that loses least of it. Without a calibration the published values are
 taken. Without a half-wave plate, the efficiencies of I, Q, U and V in the
 frames that were calibrated."""
 EXAMPLES = """\
-examples:
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
   astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2

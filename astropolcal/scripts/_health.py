@@ -16,7 +16,6 @@ Read all calibrations of a folder; say for each instrument and mode which optics
 are constant, drift or changed and when, what needs care, and when the next
 calibration is due. --html writes a page with figures."""
 EXAMPLES = """\
-examples:
   astropolcal health library/
   astropolcal health library/ --html health.html --goal 0.2
   astropolcal health library/ --event 2029-06-10   the mirror was recoated

@@ -47,7 +47,6 @@ _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 
 EXAMPLES = """\
-examples:
   astropolcal info                     version, instruments and optics
   astropolcal info cal.asdf --full     all of a calibration's summary
   astropolcal info library/            the calibrations of a folder
@@ -62,17 +61,16 @@ def run(arguments):
     path = arguments.file
     if arguments.instruments and path is not None:
         raise AstropolcalError(f"{path}: --instruments goes without a file")
-    if path is None and (arguments.frame or arguments.context):
-        raise AstropolcalError("--frame and --context need a folder of calibrations")
     if arguments.instruments:
         common.say(arguments, *instruments.names())
         return
+    if (arguments.frame or arguments.context) and not (path and Path(path).is_dir()):
+        named = f"{path}: " if path else ""
+        raise AstropolcalError(f"{named}--frame and --context need a folder of calibrations")
     if path is None:
         lines, content = _installation()
     elif Path(path).is_dir():
         lines, content = _library(path, arguments.context, arguments.frame)
-    elif arguments.frame or arguments.context:
-        raise AstropolcalError(f"{path}: --frame and --context are for a folder of calibrations")
     elif Path(path).suffix.lower() == ".asdf":
         lines, content = _calibration(path, arguments)
     # a FITS file, or one that by its name claims to be one

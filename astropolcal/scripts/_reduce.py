@@ -25,7 +25,6 @@ DESCRIPTION = """\
 Measure the fluxes of both beams in extracted cubes. A file that cannot be
 used is left out and listed with the reason."""
 EXAMPLES = """\
-examples:
   astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
   astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
   astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside

@@ -16,7 +16,6 @@ DESCRIPTION = """\
 Sample the posterior of a calibration's parameters with an ensemble of
 walkers, and keep the samples with the calibration."""
 EXAMPLES = """\
-examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
   astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf

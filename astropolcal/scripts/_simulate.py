@@ -21,7 +21,6 @@ DESCRIPTION = """\
 Simulate the beam fluxes of an instrument's chain: the published values,
 or those of a calibration file. With --cubes, simulate its image cubes."""
 EXAMPLES = """\
-examples:
   astropolcal simulate -o run.ecsv                      the packaged example
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
   astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers

@@ -39,7 +39,6 @@ TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.
 
 
 EXAMPLES = """\
-examples:
   astropolcal standards --kind polarized --band H --magnitude 4,8
   astropolcal standards --site subaru --night 2025-11-03 --plot night.png
   astropolcal standards HD30675

@@ -143,8 +143,7 @@ class TelescopeInformation:
 
     def error(self, name):
         """Return the standard error of a parameter, infinite if the frames do not determine it."""
-        if name not in self.names:
-            raise ParameterError(f"no parameter {name!r}; there are {', '.join(self.names)}")
+        check_choice("parameter", name, self.names, ParameterError)
         place = self.names.index(name)
         return float(np.sqrt(self.covariance[place, place]))
 
