@@ -22,15 +22,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments import layout
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import SubaruPolarimeter
-from astropolcal.instruments.layout import (
-    COMMON,
-    EM_EXCESS_NOISE,
-    FileLayout,
-    ReadOut,
-    side_by_side,
-)
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 from astropolcal.units import wavelengths_of
@@ -60,20 +54,20 @@ KEYWORDS = SubaruPolarimeter.keywords | {
 # two ORCA-Quest since 2023, by read mode; before that two EMCCDs iXon Ultra 897
 _FULL = 65535.0
 _READ_OUTS = {
-    "slow 1": ReadOut(0.105, 0.245, _FULL),
-    "slow 2": ReadOut(0.105, 0.220, _FULL),
-    "fast 1": ReadOut(0.103, 0.403, _FULL),
-    "fast 2": ReadOut(0.103, 0.399, _FULL),
-    "slow": ReadOut(0.105, 0.245, _FULL),
-    "fast": ReadOut(0.103, 0.403, _FULL),
-    "em": ReadOut(4.5, 89.0, _FULL, EM_EXCESS_NOISE),
-    "conventional": ReadOut(4.5, 9.6, 40000.0),
+    "slow 1": layout.ReadOut(0.105, 0.245, _FULL),
+    "slow 2": layout.ReadOut(0.105, 0.220, _FULL),
+    "fast 1": layout.ReadOut(0.103, 0.403, _FULL),
+    "fast 2": layout.ReadOut(0.103, 0.399, _FULL),
+    "slow": layout.ReadOut(0.105, 0.245, _FULL),
+    "fast": layout.ReadOut(0.103, 0.403, _FULL),
+    "em": layout.ReadOut(4.5, 89.0, _FULL, layout.EM_EXCESS_NOISE),
+    "conventional": layout.ReadOut(4.5, 9.6, 40000.0),
 }
 
 
 #: The multiband imager; ``layout_of`` has the other modes.
-LAYOUT = FileLayout(
-    keywords=COMMON | KEYWORDS | SubaruPolarimeter.times | {"pickoff": _MODE},
+LAYOUT = layout.FileLayout(
+    keywords=layout.COMMON | KEYWORDS | SubaruPolarimeter.times | {"pickoff": _MODE},
     shape=(len(FIELDS), _FIELD_SIDE, 2 * _FIELD_SIDE),
     cube_extension=0,
     weights="error",
@@ -90,7 +84,7 @@ LAYOUT = FileLayout(
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
     optics={"flc": ("flc", {r"(?i)^\s*in": "in", r"(?i)^\s*out": "out"})},
-    **side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
+    **layout.side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
 )
 
 
@@ -126,7 +120,7 @@ def layout_of(header):
     keywords = LAYOUT.keywords | ({"filter": _MODE} if multiband else {})
     shape = (len(slices_of(header)), side, 2 * side)
     # raw frames of a filter: a cube of exposures in one state
-    places = side_by_side(side, side, _LIT) | {"stacked": not multiband}
+    places = layout.side_by_side(side, side, _LIT) | {"stacked": not multiband}
     return replace(LAYOUT, keywords=keywords, shape=shape, **places)
 
 
