@@ -210,7 +210,8 @@ def add_command(commands, name, module):
     """Add the subcommand whose texts, ``OPTIONS`` and ``run`` a module has; return its parser."""
     # texts are shown as they are written
     form = argparse.RawDescriptionHelpFormatter
-    texts = {"help": module.HELP, "description": module.DESCRIPTION}
+    first = module.DESCRIPTION.partition(".\n")[0]
+    texts = {"help": first[0].lower() + first[1:], "description": module.DESCRIPTION}
     texts["epilog"] = f"examples:\n{module.EXAMPLES}"
     parser = place = commands.add_parser(name, formatter_class=form, **texts)
     parser.set_defaults(run=module.run, **getattr(module, "DEFAULTS", {}))

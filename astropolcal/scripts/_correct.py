@@ -24,11 +24,11 @@ from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.units import check_seed, plain_number
 from astropolcal.words import counted
 
-HELP = "correct science cubes with a calibration and write Stokes parameters"
 DESCRIPTION = """\
-Solve for the Stokes parameters of the light that entered the telescope, by
-least squares over all frames, and write them with their errors. The cubes must
-be without sky background: it is not subtracted."""
+Correct science cubes with a calibration and write Stokes parameters.
+They are those of the light that entered the telescope, by least squares over
+all frames, with their errors. The cubes must be without sky background: it is
+not subtracted."""
 EXAMPLES = """\
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png

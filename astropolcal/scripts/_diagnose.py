@@ -8,10 +8,10 @@ from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.scripts import _common as common
 
-HELP = "find what a model lacks to explain the measurements"
 DESCRIPTION = """\
-Find what an instrument's model lacks to explain the measurements: where
-the gap lies, which effect causes it, and how far it shrinks on left-out frames."""
+Find what a model lacks to explain the measurements.
+That is where the gap lies, which effect causes it, and how far it shrinks on
+left-out frames."""
 EXAMPLES = """\
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration

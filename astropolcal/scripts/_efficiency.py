@@ -19,13 +19,12 @@ from astropolcal.units import iso_date
 from astropolcal.words import counted
 
 _TITLE = "Polarimetric efficiency of {}"
-HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
 DESCRIPTION = """\
-Share of the linear polarization that an observation measures, over
-wavelength, derotator angle, altitude and parallactic angle; and the derotator
-offset that loses least of it. Without a calibration the published values are
-taken. Without a half-wave plate, the efficiencies of I, Q, U and V in the
-frames that were calibrated."""
+Polarimetric efficiency over wavelength, derotator angle and pointing.
+It is the share of the linear polarization that an observation measures; and the
+derotator offset that loses least of it. Without a calibration the published
+values are taken. Without a half-wave plate, the efficiencies of I, Q, U and V
+in the frames that were calibrated."""
 EXAMPLES = """\
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png

@@ -21,11 +21,10 @@ from astropolcal.scripts import _common as common
 from astropolcal.version import version
 from astropolcal.words import counted
 
-HELP = "say what a calibration, a folder of them, a table, cube or product holds"
 DESCRIPTION = """\
-Say what a calibration file, a folder of calibrations, an observation table, an
-image cube or a corrected product holds; of a calibration also how good it is
-and for what it is valid. Without a file, what this installation knows."""
+Say what a calibration, a folder of them, a table, cube or product holds.
+Of a calibration also how good it is and for what it is valid. Without a file,
+what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only

@@ -11,10 +11,9 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
-HELP = "sample the posterior of a calibration's parameters"
 DESCRIPTION = """\
-Sample the posterior of a calibration's parameters with an ensemble of
-walkers, and keep the samples with the calibration."""
+Sample the posterior of a calibration's parameters.
+An ensemble of walkers does so; the samples are kept with the calibration."""
 EXAMPLES = """\
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2

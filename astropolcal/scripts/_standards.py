@@ -13,12 +13,10 @@ from astropolcal.standards.priors import assumed_polarization
 from astropolcal.standards.visibility import SITES, location
 from astropolcal.words import counted, did_you_mean
 
-HELP = "list polarimetric standard stars and when they are observable"
-DESCRIPTION = (
-    "List the polarimetric standard stars of the catalogue. With a site and a night,\n"
-    "those that rise above the limit, the best for the diattenuation of the telescope\n"
-    "first. With a name, all that is known of that star."
-)
+DESCRIPTION = """\
+List polarimetric standard stars and when they are observable.
+With a site and a night, those that rise above the limit, the best for the
+diattenuation of the telescope first. With a name, all that is known of a star."""
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
 --kind {polarized,unpolarized}  only stars of this kind
