@@ -437,9 +437,8 @@ class Probe:
 
 
 #: Every rule, in the order in which they are checked.
-RULES = (
-    *("class", "documentation", "wavelengths", "sources", "names", "bounds", "physical", "on sky"),
-    *("mounts", "headers", "setup", "published", "round trip", "predicts", "calibrates"),
+RULES = tuple(
+    name.removeprefix("check_").replace("_", " ") for name in vars(Probe) if name[:6] == "check_"
 )
 
 
