@@ -288,11 +288,7 @@ def one_line(problem, longest=_LONGEST_REASON):
 
 def printable(text):
     """Return a text without control characters and marks that turn writing; ends of lines stay."""
-    lines = str(text).split("\n")
-    return "\n".join(
-        line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
-        for line in lines
-    )
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in str(text))
 
 
 def plain(value, where="value"):

@@ -168,10 +168,9 @@ def node_from_priors(chains):
     Normal, Uniform and frozen continuous distributions of `scipy.stats` are allowed.
     """
     # one entry a parameter: chains share the optics that stand in several of them
-    table = parameter_table(chains).items()
     return [
         {"parameter": name} | prior_node(parameters[0].prior, name)
-        for name, parameters in table
+        for name, parameters in parameter_table(chains).items()
         if parameters[0].prior is not None
     ]
 

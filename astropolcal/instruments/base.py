@@ -743,8 +743,7 @@ class Polarimeter(Instrument):
         source = self.sources[0] if source is None else source
         self.check_choices(source, optics_in)
         grid = self.grid(wavelength)
-        light = self.light(source, grid, star, target)
-        return join([*light, *self.inner(source, optics_in, grid)])
+        return join([*self.light(source, grid, star, target), *self.inner(source, optics_in, grid)])
 
     def light(self, source, grid, star, target):
         """Return the polarizer, or a star and the telescope."""

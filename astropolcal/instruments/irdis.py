@@ -235,8 +235,7 @@ def coating_of(coating, date):
                 stacklevel=4,
             )
         return coating or "after"
-    several = np.ndim(date) > 0
-    found = sorted({coating_on(day) for day in (date if several else [date])})
+    found = sorted({coating_on(day) for day in (date if np.ndim(date) else [date])})
     if len(found) != 1:
         words = f"of before and of after the recoating of {RECOATING}" if found else "none"
         raise InstrumentError(f"the dates are {words}; those of one coating are needed")

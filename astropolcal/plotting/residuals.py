@@ -56,9 +56,8 @@ class DataGrid:
         self.is_star = is_star(self.part.observations.source) and bool(sky)
         # the stage by which data are grouped, and drawn where the sky does not move
         self.turning = self._turning()
-        self.angle = np.zeros(len(self.part.frames))
-        if self.turning is not None:
-            self.angle = np.rad2deg(self.position(self.turning)[0])
+        still = self.turning is None
+        self.angle = np.zeros(len(self.part.frames)) if still else self.degrees(self.turning)
         # what the data are drawn against, in degree, and how that is called
         self.abscissa, self.label = self.angle, f"{_stage_words(self.turning)} (°)"
         if self.is_star:

@@ -438,8 +438,7 @@ def write_calibration(calibration, arguments, content):
         figures = save_all(calibration, arguments.plots)
     if arguments.json:
         write_json(content(), arguments.json)
-    named = [arguments.output, arguments.json]
-    return written_lines(named, len(figures), arguments.plots) + kept
+    return written_lines([arguments.output, arguments.json], len(figures), arguments.plots) + kept
 
 
 # ---- inputs ---------------------------------------------------------------------------------

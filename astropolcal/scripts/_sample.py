@@ -59,8 +59,7 @@ def run(arguments):
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
     # recognized by content, so that their order does not matter
-    tables = common.read_datasets(arguments.files)
-    calibration = calibration.with_observations(tables)
+    calibration = calibration.with_observations(common.read_datasets(arguments.files))
     # names of parameters that are wrong, then packages that are missing, are refused at once
     if arguments.parameters:
         LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)
