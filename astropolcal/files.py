@@ -37,14 +37,10 @@ _LONGEST_REASON = 240
 # bytes of a name that the usual file systems take
 _LONGEST_NAME = 255
 _STALE_SECONDS = 24 * 3600
-_ADVICE = {
-    errno.ENOSPC: "free some space or name another folder",
-    errno.EDQUOT: "free some space or name another folder",
-    errno.EFBIG: "the file is larger than this system allows; name another folder",
-    errno.EACCES: "name a folder that you may write to",
-    errno.EPERM: "name a folder that you may write to",
-    errno.EROFS: "name a folder that you may write to",
-}
+_ADVICE = {errno.EFBIG: "the file is larger than this system allows; name another folder"}
+_ADVICE |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space or name another folder")
+_MAY_NOT = (errno.EACCES, errno.EPERM, errno.EROFS)
+_ADVICE |= dict.fromkeys(_MAY_NOT, "name a folder that you may write to")
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
 _KINDS = {
     stat.S_IFIFO: "a pipe",

@@ -36,16 +36,8 @@ SINGLE_ERRORS = ("single_difference_err", "single_sum_err")
 REQUIRED = ("frame", "bin", "wavelength")
 BEAMS = ("flux_right", "flux_left")
 """Columns of two beams; of one beam at a time it is ``flux``."""
-CELL_COLUMNS = (
-    "bin",
-    "wavelength",
-    *BEAMS,
-    *BEAM_ERRORS,
-    *SINGLE_ERRORS,
-    "flux",
-    "flux_err",
-    "mask_reason",
-)
+CELL_COLUMNS = (*BEAMS, *BEAM_ERRORS, *SINGLE_ERRORS, "flux", "flux_err")
+CELL_COLUMNS += ("bin", "wavelength", "mask_reason")
 _ANGLES = ("hwp", "derotator", "parallactic", "altitude")
 # relative; beyond what files round away, far below what is between two bins
 _SAME_WAVELENGTH = 1e-6

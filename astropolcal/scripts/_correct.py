@@ -429,17 +429,11 @@ def _summary(result, star, arguments, n_frames):
     for kind in ("statistical", "systematic"):
         error = star.fractional_errors(kind)
         spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
-    summary = {
-        "output": str(arguments.output),
-        "calibration": result.provenance["calibration"],
-        "calibration_hash": result.provenance["calibration_hash"],
-        "mode": result.mode,
-        "observable": result.observable,
-        "components": result.components,
-        "n_frames": n_frames,
-        "north_up": result.north_up,
+    same = ("mode", "observable", "components", "north_up", "condition")
+    summary = {"output": str(arguments.output), "n_frames": n_frames}
+    summary |= {key: result.provenance[key] for key in ("calibration", "calibration_hash")}
+    summary |= {key: getattr(result, key) for key in same} | {
         "wavelength_nm": result.wavelength.to_value(u.nm),
-        "condition": result.condition,
         "poorly_determined": {str(i): words for i, words in enumerate(result.weak) if words},
         "leakage_q": result.leakage[:, 1],
         "leakage_u": result.leakage[:, 2],

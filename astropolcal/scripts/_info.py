@@ -207,17 +207,11 @@ def _observations(path):
     paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
     pairs = observations.pairs() if paired else ()
-    content = {
-        "file": str(path),
-        "instrument": observations.instrument,
-        "source": observations.source,
-        "n_frames": observations.n_frames,
-        "n_wavelengths": observations.n_bins,
-        "n_masked": int(observations.mask.sum()),
-        "n_pairs": len(pairs),
-        "wavelength_nm": observations.wavelength.to_value(u.nm),
-        "content_hash": observations.content_hash,
-    }
+    same = ("instrument", "source", "n_frames", "content_hash")
+    content = {"file": str(path)} | {key: getattr(observations, key) for key in same}
+    content |= {"n_masked": int(observations.mask.sum()), "n_pairs": len(pairs)}
+    content |= {"n_wavelengths": observations.n_bins}
+    content |= {"wavelength_nm": observations.wavelength.to_value(u.nm)}
     lines = [*observations.summary().splitlines(), f"Next: {common.following('calibrate', path)}"]
     return _wrapped(lines, content, indent=2)
 
@@ -254,16 +248,12 @@ def _describe_product(path, product):
     made, wavelength = product.provenance, product.wavelength.to_value(u.nm)
     # frames have a key of their own
     frames = list(made.get("frames", []))
-    content = {
-        "file": str(path),
-        "type": "corrected product",
-        "components": product.components,
+    same = ("components", "mode", "observable", "north_up")
+    content = {"file": str(path), "type": "corrected product"}
+    content |= {key: getattr(product, key) for key in same} | {
         "shape": list(product.stokes.shape),
         "unit": product.unit.to_string(),
         "wavelength_nm": wavelength,
-        "mode": product.mode,
-        "observable": product.observable,
-        "north_up": product.north_up,
         # at a wavelength all components must be
         "n_determined": int(np.sum(product.determined.all(axis=-1))),
         "statistical": product.covariance is not None,

@@ -90,6 +90,7 @@ def _check_options(arguments):
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
+    given = {key: getattr(arguments, key) for key in ("parameters", "seed", "checkpoint")}
     try:
         with warnings.catch_warnings():
             if not common.is_quiet(arguments):
@@ -97,12 +98,10 @@ def _sample(calibration, arguments):
                 warnings.filterwarnings("ignore", message="the chain (is|has)")
             return sample(
                 calibration,
-                parameters=arguments.parameters,
                 n_walkers=arguments.walkers,
                 n_steps=arguments.steps,
                 burn_in=None if arguments.burn == "auto" else arguments.burn,
-                seed=arguments.seed,
-                checkpoint=arguments.checkpoint,
+                **given,
                 # as for all commands, and not at all where that is not wanted
                 progress=False,
             )

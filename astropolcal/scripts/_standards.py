@@ -167,15 +167,9 @@ def _many(arguments):
     if arguments.near:
         radius = 15.0 if arguments.radius is None else arguments.radius
         near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
-    found = standards.search(
-        **near,
-        kind=arguments.kind,
-        band=arguments.band,
-        magnitude=arguments.magnitude,
-        site=site,
-        night=arguments.night,
-        min_altitude=arguments.min_altitude * u.deg,
-    )
+    given = {key: getattr(arguments, key) for key in ("kind", "band", "magnitude", "night")}
+    lowest = arguments.min_altitude * u.deg
+    found = standards.search(**near, **given, site=site, min_altitude=lowest)
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")
