@@ -7,16 +7,6 @@ so that figures can be made in a pipeline without a window system. Matplotlib
 is imported when the first figure is drawn.
 """
 
-from astropolcal.plotting import (
-    accuracy,
-    efficiency,
-    gap,
-    identifiability,
-    parameters,
-    posterior,
-    residuals,
-    saving,
-)
 from astropolcal.plotting.accuracy import *
 from astropolcal.plotting.efficiency import *
 from astropolcal.plotting.gap import *
@@ -26,5 +16,4 @@ from astropolcal.plotting.posterior import *
 from astropolcal.plotting.residuals import *
 from astropolcal.plotting.saving import *
 
-_PARTS = (accuracy, efficiency, gap, identifiability, parameters, posterior, residuals, saving)
-__all__ = sorted(name for part in _PARTS for name in part.__all__)
+__all__ = sorted(name for name in globals() if name.startswith(("plot_", "save_")))

@@ -197,18 +197,16 @@ def _record(calibration, path, file, dataset):
 
 def _write(diagnosis, content, arguments, instrument):
     """Write what was asked for."""
+    from astropolcal.gap.report import with_causes, write_html
+
     if arguments.json:
         common.write_json(content, arguments.json)
     if arguments.report:
-        from astropolcal.gap.report import write_html
-
         stage("drawing")
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
     if arguments.save and not content["misread"]:
-        from astropolcal.gap.report import with_causes
-
         calibration = with_causes(diagnosis.improved, instrument=instrument)
         calibration.write(arguments.save, overwrite=True)
 
