@@ -352,8 +352,7 @@ def _parameter_node(optic, key):
     if parameter.unit != declared:
         raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
     # astropy gives the value of an array of one as a number
-    value = np.reshape(parameter.value, parameter.shape)
-    value = np.array(value, dtype=float)
+    value = np.array(np.reshape(parameter.value, parameter.shape), dtype=float)
     if value.ndim > 1 or not np.isfinite(value).all():
         raise CalibrationFileError(
             f"{label} = {value} must be a finite number, or one per wavelength"

@@ -315,8 +315,7 @@ def _filled(comparison):
 
 def _measured(table, label, beams):
     """Return the unit of the fluxes, and fluxes and errors in it, by name."""
-    flux_unit = getattr(table[beams[0]], "unit", None)
-    flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
+    flux_unit = getattr(table[beams[0]], "unit", None) or u.dimensionless_unscaled
     strange = isinstance(flux_unit, u.UnrecognizedUnit) or not isinstance(flux_unit, u.UnitBase)
     # magnitudes are a unit like others for astropy
     if strange or flux_unit.is_equivalent(u.dex):

@@ -180,8 +180,7 @@ def _worked(command, arguments, folder, task):
                     return {k: v for k, v in before.items() if k not in _OF_ENTRY}
             module.work(arguments)
     doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
-    with open(arguments.json, encoding="utf-8") as stream:
-        summary = json.load(stream)
+    summary = json.loads(Path(arguments.json).read_text(encoding="utf-8"))
     state = os.stat(product)
     return {
         "product": os.path.basename(product),
