@@ -22,7 +22,7 @@ from astropy.utils.exceptions import AstropyWarning
 from erfa import ErfaWarning
 
 from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError, warn
-from astropolcal.files import one_line
+from astropolcal.files import one_line, understood
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import MOVES, PLACES, finite_position
@@ -271,14 +271,10 @@ def _target(observations):
             angle = observations.meta.get(key)
         if angle is None:
             return None
-        try:
+        with understood(observations.name, ObservationError, key, reads=False):
             found.append(angle if isinstance(angle, u.Quantity) else sky_angle(key, angle) * u.deg)
-        except (TypeError, ValueError) as error:
-            raise ObservationError(f"{observations.name}: {key}: {one_line(error)}") from None
-    try:
+    with understood(observations.name, ObservationError, "position", reads=False):
         return SkyCoord(*found)
-    except ValueError as error:
-        raise ObservationError(f"{observations.name}: {one_line(error)}") from None
 
 
 # ---- exposures -------------------------------------------------------------------------------
