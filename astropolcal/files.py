@@ -42,12 +42,8 @@ _ADVICE |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space or name 
 _MAY_NOT = (errno.EACCES, errno.EPERM, errno.EROFS)
 _ADVICE |= dict.fromkeys(_MAY_NOT, "name a folder that you may write to")
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
-_KINDS = {
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
+_KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+_KINDS |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "a device")
 
 
 def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
