@@ -6,7 +6,6 @@ A chain is what astropy's ``|`` makes of optics, written in the order the
 light travels. Nothing here depends on which optics they are.
 """
 
-import warnings
 from functools import reduce
 from itertools import accumulate
 from operator import or_
@@ -15,7 +14,7 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import AstropolcalWarning, ChainError, ObservationError, ParameterError
+from astropolcal.exceptions import ChainError, ObservationError, ParameterError, warn
 from astropolcal.mueller import phase_of, turned
 from astropolcal.optics import COORDINATES, Optic
 from astropolcal.optics.laws import law_of
@@ -366,9 +365,8 @@ def warn_beyond(chain, positions):
         for key, law in leaf._follows.items():
             words = law.beyond(positions)
             if words:
-                warnings.warn(
+                warn(
                     f"the law of {leaf.name}.{key} is extrapolated: {words}",
-                    AstropolcalWarning,
                     stacklevel=3,
                 )
 

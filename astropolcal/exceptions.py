@@ -8,6 +8,8 @@ builtin that a Python user expects (`ValueError` for a bad value, `KeyError`
 never, because it mangles its message).
 """
 
+import warnings
+
 from astropy.utils.exceptions import AstropyUserWarning
 
 __all__ = [
@@ -83,3 +85,8 @@ class GapError(AstropolcalError, ValueError):
 
 class AstropolcalWarning(AstropyUserWarning):
     """Something was masked, ignored or doubtful; the result says what."""
+
+
+def warn(words, stacklevel=2):
+    """Warn who called the function that calls this one, or so many levels up."""
+    warnings.warn(words, AstropolcalWarning, stacklevel=stacklevel + 1)

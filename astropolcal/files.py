@@ -37,21 +37,13 @@ _LONGEST_REASON = 240
 # bytes of a name that the usual file systems take
 _LONGEST_NAME = 255
 _STALE_SECONDS = 24 * 3600
-_ADVICE = {
-    errno.ENOSPC: "free some space or name another folder",
-    errno.EDQUOT: "free some space or name another folder",
-    errno.EFBIG: "the file is larger than this system allows; name another folder",
-    errno.EACCES: "name a folder that you may write to",
-    errno.EPERM: "name a folder that you may write to",
-    errno.EROFS: "name a folder that you may write to",
-}
+_ADVICE = {errno.EFBIG: "the file is larger than this system allows; name another folder"}
+_ADVICE |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space or name another folder")
+_MAY_NOT = (errno.EACCES, errno.EPERM, errno.EROFS)
+_ADVICE |= dict.fromkeys(_MAY_NOT, "name a folder that you may write to")
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
-_KINDS = {
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
+_KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+_KINDS |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "a device")
 
 
 def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
@@ -288,11 +280,7 @@ def one_line(problem, longest=_LONGEST_REASON):
 
 def printable(text):
     """Return a text without control characters and marks that turn writing; ends of lines stay."""
-    lines = str(text).split("\n")
-    return "\n".join(
-        line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
-        for line in lines
-    )
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in str(text))
 
 
 def plain(value, where="value"):

@@ -15,7 +15,6 @@ import lzma
 import math
 import os
 import re
-from contextlib import contextmanager
 
 import numpy as np
 
@@ -45,11 +44,9 @@ _PACKINGS = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
 _NEEDS_MEMORY = (b"\xfd7zXZ",)
 
 
-@contextmanager
 def readable_fits(path, error=ObservationError):
     """Turn any failure with a FITS file into one line that names it, see ``understood``."""
-    with understood(path, error, "not a readable FITS file"):
-        yield
+    return understood(path, error, "not a readable FITS file")
 
 
 def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):

@@ -16,26 +16,14 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import (
-    leaves,
-    stages,
-    states_of,
-    system_mueller,
-    with_beam,
-)
+from astropolcal.chain import leaves, stages, states_of, system_mueller, with_beam
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.parameters import limits
 from astropolcal.mueller import is_physical
 from astropolcal.observations.grid import is_star
-from astropolcal.optics import (
-    COORDINATES,
-    LinearPolarizer,
-    Optic,
-    PolarizedSource,
-    StateAnalyser,
-)
+from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource, StateAnalyser
 from astropolcal.simulation import simulate
 from astropolcal.units import check_seed
 
@@ -449,9 +437,8 @@ class Probe:
 
 
 #: Every rule, in the order in which they are checked.
-RULES = (
-    *("class", "documentation", "wavelengths", "sources", "names", "bounds", "physical", "on sky"),
-    *("mounts", "headers", "setup", "published", "round trip", "predicts", "calibrates"),
+RULES = tuple(
+    name.removeprefix("check_").replace("_", " ") for name in vars(Probe) if name[:6] == "check_"
 )
 
 
@@ -552,9 +539,8 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
             report.skipped[rule] = "there are no chains"
         else:
             try:
-                with warnings.catch_warnings():
-                    # what an instrument warns of is for its users, not a breach of a rule
-                    warnings.simplefilter("ignore")
+                # what an instrument warns of is for its users, not a breach of a rule
+                with warnings.catch_warnings(action="ignore"):
                     getattr(probe, f"check_{rule.replace(' ', '_')}")()
             except Absent as absent:
                 report.skipped[rule] = str(absent)

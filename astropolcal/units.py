@@ -173,9 +173,8 @@ def mjd_of(value, name="time"):
     unit that lie where such dates do.
     """
     if isinstance(value, str | Time):
-        with warnings.catch_warnings():
-            # leap seconds of years to come are not known, and do not matter here
-            warnings.simplefilter("ignore", ErfaWarning)
+        # leap seconds of years to come are not known, and do not matter here
+        with warnings.catch_warnings(action="ignore", category=ErfaWarning):
             value = Time(iso_date(value, name)) if isinstance(value, str) else value
             found = np.asarray(value.utc.mjd)
     else:
@@ -215,9 +214,8 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
     if _is_iso(value):
         return value
     try:
-        with warnings.catch_warnings():
-            # leap seconds of years far off are not known, and do not matter here
-            warnings.simplefilter("ignore", ErfaWarning)
+        # leap seconds of years far off are not known, and do not matter here
+        with warnings.catch_warnings(action="ignore", category=ErfaWarning):
             text = _date_text(value)
             if _MJD.fullmatch(text):
                 return Time(float(text), format="mjd", scale="utc").isot.removesuffix(

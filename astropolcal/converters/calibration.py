@@ -19,23 +19,7 @@ from astropolcal.calibration.identifiability.analysis import Identifiability
 from astropolcal.calibration.result.calibration import DatasetRecord, validity_of
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
-from astropolcal.converters import CALIBRATION_TAG, CALIBRATION_TAGS
-from astropolcal.converters.nodes import (
-    check_posterior,
-    checksum,
-    node_from_posterior,
-    node_from_priors,
-    node_from_table,
-    node_from_value,
-    plain,
-    posterior_from_node,
-    restore_priors,
-    table_from_node,
-    unit_from_text,
-    unit_text,
-    value_from_node,
-    without_priors,
-)
+from astropolcal.converters import CALIBRATION_TAG, CALIBRATION_TAGS, nodes
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import FreeParameters, Tie, are_outside, parameter_table
@@ -59,26 +43,26 @@ def node_from_calibration(calibration):
     check_calibration(calibration)
     chains, posterior = calibration.chains, calibration.posterior
     covariance = calibration.covariance
-    priors = node_from_priors(chains)
+    priors = nodes.node_from_priors(chains)
     # an optic's node cannot hold priors; copies: to write a calibration must not change it
-    chains = [without_priors(chain) for chain in chains] if priors else chains
+    chains = [nodes.without_priors(chain) for chain in chains] if priors else chains
     node = {
         "chains": [{"optics": leaves(chain)} for chain in chains],
-        "wavelength": node_from_value(calibration.wavelength),
+        "wavelength": nodes.node_from_value(calibration.wavelength),
         "covariance": {
             "names": list(covariance.names),
-            "units": [unit_text(unit) for unit in covariance.units],
+            "units": [nodes.unit_text(unit) for unit in covariance.units],
             "matrix": covariance.matrix.copy(),
         },
         "identifiability": _identifiability_node(calibration.identifiability),
         "datasets": [
-            plain(vars(record) | {"accuracy": None}, record.name)
-            | {"accuracy": node_from_table(record.accuracy)}
+            nodes.plain(vars(record) | {"accuracy": None}, record.name)
+            | {"accuracy": nodes.node_from_table(record.accuracy)}
             for record in calibration.datasets
         ],
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
-        **{key: plain(getattr(calibration, key), key) for key in _PLAIN},
+        **{key: nodes.plain(getattr(calibration, key), key) for key in _PLAIN},
     }
     for chain, entry in zip(chains, node["chains"], strict=True):
         # a chain of one optic is that optic, which has its own name
@@ -91,7 +75,7 @@ def node_from_calibration(calibration):
         # row by row: some versions of asdf cannot read an empty matrix
         node["covariance"]["open"] = [row.copy() for row in covariance.null]
     node |= {"priors": priors} if priors else {}
-    node |= {} if posterior is None else {"posterior": node_from_posterior(posterior)}
+    node |= {} if posterior is None else {"posterior": nodes.node_from_posterior(posterior)}
     versions = {name: installed(name) for name in ("asdf", "asdf-astropy", "astropy")}
     return node | {
         "checksum": _checksum(node),
@@ -111,11 +95,11 @@ def _dates(calibration):
 
 
 def _checksum(node):
-    return checksum({key: value for key, value in node.items() if key not in _DERIVED})
+    return nodes.checksum({key: value for key, value in node.items() if key not in _DERIVED})
 
 
 def _identifiability_node(finding):
-    node = plain(vars(finding), "identifiability")
+    node = nodes.plain(vars(finding), "identifiability")
     # row by row: some versions of asdf cannot read an empty matrix
     node["null_vectors"] = [row.copy() for row in finding.null_vectors]
     for direction in (*node["directions"], *node["near_null"]):
@@ -127,7 +111,7 @@ def _identifiability_node(finding):
 
 
 def _tie_node(name, tie):
-    offset = node_from_value(tie.offset)
+    offset = nodes.node_from_value(tie.offset)
     return {"target": name, "source": tie.source, "factor": float(tie.factor), "offset": offset}
 
 
@@ -135,8 +119,8 @@ def _stage_node(stage):
     values = stage["parameters"].items()
     return {
         "title": stage["title"],
-        "parameters": [{"name": name} | node_from_value(value) for name, value in values],
-        "residual_rms": plain(stage["residual_rms"], "residual_rms"),
+        "parameters": [{"name": name} | nodes.node_from_value(value) for name, value in values],
+        "residual_rms": nodes.plain(stage["residual_rms"], "residual_rms"),
     }
 
 
@@ -157,26 +141,27 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         if "name" in entry:
             chain.name = entry["name"]
     # before the calibration is made: its free parameters bind the priors
-    restore_priors(chains, node.get("priors", []))
+    nodes.restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
         chains=chains,
-        wavelength=value_from_node(node["wavelength"]),
+        wavelength=nodes.value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
         datasets=[
             DatasetRecord(
                 **entry
-                | {"meta": plain(entry["meta"]), "accuracy": table_from_node(entry["accuracy"])}
+                | {"meta": nodes.plain(entry["meta"])}
+                | {"accuracy": nodes.table_from_node(entry["accuracy"])}
             )
             for entry in node["datasets"]
         ],
         ties={
-            name: Tie(entry["source"], entry["factor"], value_from_node(entry["offset"]))
+            name: Tie(entry["source"], entry["factor"], nodes.value_from_node(entry["offset"]))
             for name, entry in _by_name(node["ties"], "target").items()
         },
         stages=[_stage(entry) for entry in node["stages"]],
-        **{key: plain(node[key]) for key in _PLAIN},
-        posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
+        **{key: nodes.plain(node[key]) for key in _PLAIN},
+        posterior=nodes.posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
     _check_validity(calibration, node["validity"])
@@ -209,7 +194,7 @@ MIGRATIONS = {CALIBRATION_TAGS[0]: _to_1_1}
 
 
 def _covariance(node):
-    units = [unit_from_text(text) for text in node["units"]]
+    units = [nodes.unit_from_text(text) for text in node["units"]]
     shape = np.shape(node.get("factor", [[0.0] * len(units)]))
     if len(shape) != 2 or shape[1] != len(units):
         # it would be laid out anew, and mean something else
@@ -226,7 +211,7 @@ def _covariance(node):
 
 
 def _identifiability(node):
-    found, vectors = plain(node), node["null_vectors"]
+    found, vectors = nodes.plain(node), node["null_vectors"]
     found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
     for direction in (*found.setdefault("directions", []), *found.setdefault("near_null", [])):
         entries = _by_name(direction["parameters"]).items()
@@ -245,10 +230,10 @@ def _by_name(entries, key="name"):
 
 
 def _stage(node):
-    parameters = node["parameters"]
+    entries = _by_name(node["parameters"]).items()
     return {
         "title": node["title"],
-        "parameters": {k: value_from_node(entry) for k, entry in _by_name(parameters).items()},
+        "parameters": {name: nodes.value_from_node(entry) for name, entry in entries},
         "residual_rms": node["residual_rms"],
     }
 
@@ -304,7 +289,7 @@ def check_calibration(calibration):
     for record in calibration.datasets:
         if record.accuracy is not None:
             _check_accuracy(record.accuracy, f"the accuracy of {record.name}")
-    check_posterior(calibration.posterior, calibration.covariance)
+    nodes.check_posterior(calibration.posterior, calibration.covariance)
 
 
 def _check_optics(calibration, free):

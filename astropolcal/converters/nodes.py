@@ -168,10 +168,9 @@ def node_from_priors(chains):
     Normal, Uniform and frozen continuous distributions of `scipy.stats` are allowed.
     """
     # one entry a parameter: chains share the optics that stand in several of them
-    table = parameter_table(chains).items()
     return [
         {"parameter": name} | prior_node(parameters[0].prior, name)
-        for name, parameters in table
+        for name, parameters in parameter_table(chains).items()
         if parameters[0].prior is not None
     ]
 
@@ -353,8 +352,7 @@ def _parameter_node(optic, key):
     if parameter.unit != declared:
         raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
     # astropy gives the value of an array of one as a number
-    value = np.reshape(parameter.value, parameter.shape)
-    value = np.array(value, dtype=float)
+    value = np.array(np.reshape(parameter.value, parameter.shape), dtype=float)
     if value.ndim > 1 or not np.isfinite(value).all():
         raise CalibrationFileError(
             f"{label} = {value} must be a finite number, or one per wavelength"

@@ -10,27 +10,17 @@ from importlib.metadata import entry_points
 
 from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
-from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
-from astropolcal.instruments.charis import CHARIS
-from astropolcal.instruments.irdis import IRDIS
-from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments import base, charis, irdis, layout, vampires
+from astropolcal.instruments.base import *
+from astropolcal.instruments.charis import *
+from astropolcal.instruments.irdis import *
+from astropolcal.instruments.layout import *
 from astropolcal.instruments.nominal import NOMINAL
-from astropolcal.instruments.vampires import VAMPIRES
+from astropolcal.instruments.vampires import *
 from astropolcal.words import did_you_mean
 
-__all__ = [
-    "CHARIS",
-    "IRDIS",
-    "VAMPIRES",
-    "FileLayout",
-    "Instrument",
-    "ReadOut",
-    "SkyLaw",
-    "add_nuisance",
-    "get",
-    "names",
-    "register",
-]
+_PARTS = (base, charis, irdis, layout, vampires)
+__all__ = sorted(["get", "names", "register", *(n for part in _PARTS for n in part.__all__)])
 
 _REGISTRY = {}
 
@@ -60,7 +50,7 @@ def register(cls):
     >>> "charis" in names()
     True
     """
-    if not (isinstance(cls, type) and issubclass(cls, Instrument) and cls.name):
+    if not (isinstance(cls, type) and issubclass(cls, base.Instrument) and cls.name):
         raise InstrumentError(f"{cls!r} is not an Instrument with a name")
     if _REGISTRY.get(cls.name, cls) is not cls:
         raise InstrumentError(f"an instrument {cls.name!r} is registered already")
@@ -135,5 +125,5 @@ def get(name):
     )
 
 
-for _cls in (CHARIS, IRDIS, VAMPIRES, *NOMINAL):
+for _cls in (charis.CHARIS, irdis.IRDIS, vampires.VAMPIRES, *NOMINAL):
     register(_cls)

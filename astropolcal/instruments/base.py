@@ -27,20 +27,8 @@ from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.layout import COMMON, FileLayout
-from astropolcal.observations.grid import (
-    is_star,
-    mask_incomplete_cycles,
-    mask_saturated,
-    mask_unstable_lamp,
-    plain_source,
-)
-from astropolcal.observations.pointings import (
-    TRACKING,
-    angle_change,
-    location_of,
-    sky_angles,
-    sky_positions,
-)
+from astropolcal.observations import grid as tables
+from astropolcal.observations import pointings
 from astropolcal.observations.reading import common_wavelengths
 from astropolcal.units import wavelengths_of
 from astropolcal.words import check_choice
@@ -87,7 +75,7 @@ class SkyLaw:
     ((-0.5, 1.0), (0.0, 0.5))
     """
 
-    plate: object = TRACKING
+    plate: object = pointings.TRACKING
     # what keeps the pupil, or the image, still at a Nasmyth focus
     derotator: dict = field(default_factory=lambda: {"pupil": (0.0, 0.5), "field": (0.5, 0.5)})
 
@@ -322,6 +310,8 @@ class Instrument(ABC):
     entrance = "hwp"
     max_age = 365 * u.day
     changes = ()
+    # what an instrument without a layout of its files says of headers and of its place
+    transforms, times, site = {}, {}, ()
 
     @abstractmethod
     def chain(self, source="polarized", optics_in=(), *, wavelength=None, **options):
@@ -387,8 +377,8 @@ class Instrument(ABC):
         underscores do not matter, and a ``"standard star"`` is a ``"star"``.
         """
         allowed = {name: name for name in self.sources} if spellings is None else spellings
-        known = {plain_source(word): name for word, name in allowed.items()}
-        word = plain_source(observations.source)
+        known = {tables.plain_source(word): name for word, name in allowed.items()}
+        word = tables.plain_source(observations.source)
         if word not in known:
             what = f"{observations.name}: source of the table's meta"
             check_choice(what, observations.source, allowed, InstrumentError)
@@ -500,10 +490,10 @@ class Instrument(ABC):
     @property
     def headers(self):
         """Layout that reads the headers of frames, None without keywords."""
-        own = self.keywords
+        own = self.keywords | self.times
         common = {key: word for key, word in COMMON.items() if word not in own.values()}
         common.pop("exposure_time", None)
-        return FileLayout(common | own, (1, 1, 1)) if own else None
+        return FileLayout(common | own, (1, 1, 1), transforms=self.transforms) if own else None
 
     @property
     def has_telescope(self):
@@ -574,7 +564,7 @@ class Instrument(ABC):
             Here of a star ``star``, the name of its source optic, and ``target``, as far as
             `chain` takes them.
         """
-        if not is_star(observations.source):
+        if not tables.is_star(observations.source):
             return {}
         known, told = inspect.signature(self.chain).parameters, shared.star_options(observations)
         return {key: value for key, value in told.items() if key in known}
@@ -600,18 +590,18 @@ class Instrument(ABC):
         ObservationError
             If a star has no pointing, or nothing would be left.
         """
-        observations = mask_saturated(observations)
-        if not is_star(observations.source):
-            return mask_unstable_lamp(observations)
+        observations = tables.mask_saturated(observations)
+        if not tables.is_star(observations.source):
+            return tables.mask_unstable_lamp(observations)
         # raises here, with the name of the table, rather than in the middle of a fit
-        sky_angles(observations, self.location)
+        pointings.sky_angles(observations, self.location)
         # on sky seeing and transparency change within seconds: only whole cycles cancel them
-        return mask_incomplete_cycles(observations)
+        return tables.mask_incomplete_cycles(observations)
 
     @property
     def location(self):
         """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
-        return None if self.files is None else location_of(self.files.site)
+        return pointings.location_of(self.site or getattr(self.files, "site", ()))
 
     @property
     def sky_law(self):
@@ -705,10 +695,10 @@ class Instrument(ABC):
         if {"parallactic", "altitude"} & set(wanted):
             # the caller may know the law better, as a diagnosis that tries another sign
             exposure = {"law": self.plate_law(observations)} | exposure
-            sky = sky_positions(observations, self.location, **exposure)
+            sky = pointings.sky_positions(observations, self.location, **exposure)
             # the table need not have the parallactic angle as a column
             steady = sky["parallactic"].reshape(-1, observations.n_frames).mean(axis=0)
-            sky["parallactic_rate"] = angle_change(observations, steady)
+            sky["parallactic_rate"] = pointings.angle_change(observations, steady)
         # the pointing tells some of the stages, columns of the table the others
         return {s: sky[s] if s in sky else observations.position(s) for s in wanted}
 
@@ -739,8 +729,7 @@ class Polarimeter(Instrument):
 
     sources = ("polarized", *shared.STARS)
     sky_options = ("wavelength",)
-    site, focus, altitude = (), "nasmyth", "-altitude"
-    transforms, times = {}, {}
+    focus, altitude = "nasmyth", "-altitude"
     #: The plate stays where it is put, and turns with the instrument.
     sky_law = SkyLaw(plate=(0, 0), derotator={})
 
@@ -754,8 +743,7 @@ class Polarimeter(Instrument):
         source = self.sources[0] if source is None else source
         self.check_choices(source, optics_in)
         grid = self.grid(wavelength)
-        light = self.light(source, grid, star, target)
-        return join([*light, *self.inner(source, optics_in, grid)])
+        return join([*self.light(source, grid, star, target), *self.inner(source, optics_in, grid)])
 
     def light(self, source, grid, star, target):
         """Return the polarizer, or a star and the telescope."""
@@ -773,19 +761,6 @@ class Polarimeter(Instrument):
         if self.focus == "cassegrain":
             return [optics.Rotator(mount="parallactic", name="parallactic")]
         return shared.telescope(aluminium(self.grid(wavelength)), self.altitude)
-
-    @property
-    def headers(self):
-        """Layout that reads the headers of frames."""
-        keywords = {key: word for key, word in COMMON.items() if key != "exposure_time"}
-        return FileLayout(
-            keywords | self.keywords | self.times, (1, 1, 1), transforms=self.transforms
-        )
-
-    @property
-    def location(self):
-        """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
-        return location_of(self.site)
 
 
 class SubaruPolarimeter(Polarimeter):
@@ -830,10 +805,4 @@ class SubaruPolarimeter(Polarimeter):
 def aluminium(grid):
     """Return a tertiary mirror whose diattenuation, at first that of aluminium, is free."""
     metal = optics.MetalMirror(material="aluminium")
-    return optics.DiattenuatorRetarder(
-        diattenuation=metal.diattenuation(grid),
-        retardance=metal.retardance(grid),
-        name="m3",
-        fixed={"retardance": True},
-        bounds={"diattenuation": (-0.1, 0.1)},
-    )
+    return shared.free_mirror("m3", metal.diattenuation(grid), metal.retardance(grid), most=0.1)

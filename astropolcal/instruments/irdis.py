@@ -11,7 +11,6 @@ Beams have the names of the halves of the detector. The left one passes +Q, so s
 differences here, right minus left, have the opposite sign of the published ones.
 """
 
-import warnings
 from collections import ChainMap
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,10 +23,10 @@ from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.chain import join
-from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
+from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, warn
+from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
 from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
-from astropolcal.instruments.telescope import INTERNAL, PARANAL, STARS, misaligned, star_source
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
@@ -73,10 +72,8 @@ class _Header:
         if key not in self.header:
             raise ObservationError(f"frame {self.number}: no keyword {key} in its header")
         value = str(self.header[key]).strip()
-        if allowed is not None and value not in allowed:
-            raise ObservationError(
-                f"frame {self.number}: {key} = {value!r}; allowed are {', '.join(allowed)}"
-            )
+        if allowed is not None:
+            check_choice(f"frame {self.number}: {key}", value, allowed, ObservationError)
         return value
 
     def number_of(self, key, low, high=np.inf):
@@ -191,11 +188,10 @@ def _warn_of_starts(frames, motions, tracking, sky_law):
             law = sky_law.plate_law if column == "hwp_true" else sky_law.derotator_law
             on_sky = law(tracking)
         lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
-        warnings.warn(
+        warn(
             f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
             f"is frame {few[0]}: {column} is that of the start; until the middle of the exposure "
             f"it turns by up to {lost:.2g} deg",
-            AstropolcalWarning,
             # _warn_of_starts, frame_table of this module, that of the instrument: who called it
             stacklevel=4,
         )
@@ -231,17 +227,15 @@ def coating_of(coating, date):
         check_choice("coating", coating, COATINGS, InstrumentError)
     if date is None:
         if coating is None:
-            warnings.warn(
+            warn(
                 "irdis: neither date nor coating of the telescope was given; it is the one from "
                 f"{RECOATING} on; give the date of the frames (date, or --date of a command), or "
                 "coating='before' for older ones",
-                AstropolcalWarning,
                 # coating_of, telescope_optics, on_sky: the line that asked for a chain from the sky
                 stacklevel=4,
             )
         return coating or "after"
-    several = np.ndim(date) > 0
-    found = sorted({coating_on(day) for day in (date if several else [date])})
+    found = sorted({coating_on(day) for day in (date if np.ndim(date) else [date])})
     if len(found) != 1:
         words = f"of before and of after the recoating of {RECOATING}" if found else "none"
         raise InstrumentError(f"the dates are {words}; those of one coating are needed")
@@ -255,7 +249,7 @@ def coating_of(coating, date):
 def _retarder(index, name):
     """Return the half-wave plate or the derotator, by the name of its stage."""
     theta = _DATA.meta[f"{name}_theta_deg"]
-    held = misaligned(theta)
+    held = shared.misaligned(theta)
     held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
     values = {key: _DATA[f"{name}_{key}"][index] for key in ("diattenuation", "retardance")}
     settings = {"theta": theta * u.deg, "mount": name, "name": name}
@@ -265,23 +259,10 @@ def _retarder(index, name):
 def telescope(index, coating):
     """Return the optics from the sky to the half-wave plate."""
     check_choice("coating", coating, COATINGS, InstrumentError)
-    return [
-        optics.Rotator(mount="parallactic", name="parallactic"),
-        _mirror("ut", coating, index),
-        optics.Rotator(mount="altitude", name="altitude"),
-        _mirror("m4", coating, index),
-    ]
-
-
-def _mirror(name, coating, index):
-    return optics.DiattenuatorRetarder(
-        diattenuation=_DATA[f"{name}_diattenuation_{coating}"][index],
-        retardance=_DATA["mirror_retardance"][index],
-        name=name,
-        # an unpolarized star shows the diattenuation of a mirror, never its retardance
-        fixed={"retardance": True},
-        bounds={"diattenuation": (-0.1, 0.1)},
-    )
+    retardance = _DATA["mirror_retardance"][index]
+    values = {name: _DATA[f"{name}_diattenuation_{coating}"][index] for name in ("ut", "m4")}
+    ut, m4 = (shared.free_mirror(*pair, retardance, most=0.1) for pair in values.items())
+    return [*shared.telescope(ut, "altitude"), m4]
 
 
 # ---- files -------------------------------------------------------------------------------------
@@ -346,12 +327,7 @@ KEYWORDS = {
 _LIT = 0.7
 #: Full frames, dark, flat and centred: both halves of the detector side by side.
 LAYOUT = IrdisLayout(
-    keywords=COMMON
-    | KEYWORDS
-    | {
-        "exposures": "ESO DET NDIT",
-        "filter": _FILTER,
-    },
+    keywords=COMMON | KEYWORDS | {"exposures": "ESO DET NDIT", "filter": _FILTER},
     shape=(1, 1024, 2048),
     cube_extension=0,
     weights="error",
@@ -362,7 +338,7 @@ LAYOUT = IrdisLayout(
     saturation=30000.0,
     pixel_scale=12.25,
     tracking=SKY_LAW.plate_law("field"),
-    site=PARANAL,
+    site=shared.PARANAL,
     stacked=True,
     centred=True,
     **side_by_side(1024, 1024, _LIT),
@@ -395,7 +371,7 @@ class IRDIS(Instrument):
         "de Boer et al. 2020, A&A 633, A63, doi:10.1051/0004-6361/201834989",
         "IRDAP, https://github.com/robvanholstein/IRDAP (keywords, limit of saturation)",
     )
-    sources = (*INTERNAL, *STARS)
+    sources = (*shared.INTERNAL, *shared.STARS)
     sky_options = ("wavelength", "date")
     changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were recoated"),)
     #: Names of the filters with coefficients, in the order of ``wavelength``.
@@ -463,13 +439,13 @@ class IRDIS(Instrument):
         analyser = optics.WollastonPrism(efficiency=efficiency, theta=90 * u.deg, name="wollaston")
         common = [_retarder(index, "hwp"), derotator, analyser]
         if source == "polarized":
-            polarizer = optics.LinearPolarizer(name="calibration_polarizer", **misaligned(0))
+            polarizer = optics.LinearPolarizer(name="calibration_polarizer", **shared.misaligned(0))
             return join([polarizer, *common])
         if source == "unpolarized":
             zero = np.zeros(index.size)
             # M4 and the lamp polarize together; only what reaches the plate can be measured
             return join([optics.PolarizedSource(q=zero, u=zero, name="lamp"), *common])
-        light = star_source(source, grid, star, target)
+        light = shared.star_source(source, grid, star, target)
         return join([light, *telescope(index, coating), *common])
 
     def published(self):

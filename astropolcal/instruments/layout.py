@@ -363,19 +363,8 @@ COMMON = {
 #: Columns that are angles of a stage.
 ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 #: Columns that are text, whatever they look like.
-TEXTS = (
-    "date",
-    "time",
-    "right_ascension",
-    "declination",
-    "object",
-    "instrument",
-    "filter",
-    "pickoff",
-    "flc",
-    "flc_state",
-    "read_mode",
-)
+TEXTS = ("date", "time", "right_ascension", "declination", "object", "instrument")
+TEXTS += ("filter", "pickoff", "flc", "flc_state", "read_mode")
 #: Beyond these, in degree, an angle in a header cannot be right.
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
 # an exposure of zero seconds has no rate

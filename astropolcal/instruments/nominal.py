@@ -238,12 +238,7 @@ class NIRC2(Polarimeter):
     aliases = ("Keck/NIRC2", "NIRC2-Pol")
     # nominal centres of J, H and Kp; the band L has a plate of its own
     wavelength = [1.248, 1.633, 2.124] * u.um
-    keywords = {
-        "hwp": "PCUPR",
-        "derotator": "OBRT",
-        "parallactic": "PARANG",
-        "altitude": "EL",
-    }
+    keywords = {"hwp": "PCUPR", "derotator": "OBRT", "parallactic": "PARANG", "altitude": "EL"}
     references = (
         "NIRC2Pol-DPP, https://github.com/UCSB-Exoplanet-Polarimetry-Lab/NIRC2Pol-DPP",
         "Lewis et al. 2026, announced there",
@@ -428,9 +423,8 @@ class HiCIAO(SubaruPolarimeter):
     # it had left the telescope before anything of these changed
     changes = ()
 
-    def telescope_optics(self, behind=(), *, wavelength=None):
-        """Return the telescope with a tertiary mirror of bare silver."""
-        return shared.telescope(optics.MetalMirror(material="silver", name="m3"))
+    # a tertiary mirror of bare silver
+    telescope_optics = VAMPIRES.telescope_optics
 
 
 class IRCS(SubaruPolarimeter):
@@ -455,10 +449,7 @@ class FastPDI(SubaruPolarimeter):
     # nominal centres of Y, J and H
     wavelength = [1.03, 1.24, 1.63] * u.um
     keywords = SubaruPolarimeter.keywords | {"flc_state": "U_FLCSTT"}
-    references = (
-        "fastpdi_dpp, https://github.com/scexao-org/fastpdi_dpp",
-        _PLATE_AND_DEROTATOR,
-    )
+    references = ("fastpdi_dpp, https://github.com/scexao-org/fastpdi_dpp", _PLATE_AND_DEROTATOR)
     optional_optics = ("flc",)
     # what tables say of a liquid crystal is the same
     setup, meta_without = VAMPIRES.setup, VAMPIRES.meta_without
@@ -479,10 +470,7 @@ class REACH(SubaruPolarimeter):
     name = "reach"
     aliases = ("SCExAO/REACH", "Subaru/SCExAO/REACH")
     wavelength = [1.05, 1.25, 1.60] * u.um
-    references = (
-        "pyird, https://github.com/prvjapan/pyird",
-        _PLATE_AND_DEROTATOR,
-    )
+    references = ("pyird, https://github.com/prvjapan/pyird", _PLATE_AND_DEROTATOR)
 
 
 #: Every instrument above.

@@ -6,14 +6,13 @@ On sky a star and the mirrors of the telescope stand before the half-wave plate.
 """
 
 import re
-import warnings
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics, standards
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
+from astropolcal.exceptions import AstropolcalError, InstrumentError, warn
 from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
@@ -65,13 +64,19 @@ def tertiary_mirror(model, wavelength):
     if model == "metal":
         settings = {"material": "silver", "film_thickness": _FILM_START, "name": "m3"}
         return mounted(_metal(optics.MetalMirror, 500, **settings))
-    mirror = optics.DiattenuatorRetarder(
-        diattenuation=np.full(wavelength.size, 0.01),
-        retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
-        name="m3",
+    retardance = optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength)
+    return mounted(free_mirror("m3", np.full(wavelength.size, 0.01), retardance))
+
+
+def free_mirror(name, diattenuation, retardance, most=1.0):
+    """Return a mirror of free diattenuation; its retardance no unpolarized star shows."""
+    return optics.DiattenuatorRetarder(
+        diattenuation=diattenuation,
+        retardance=retardance,
+        name=name,
         fixed={"retardance": True},
+        bounds={"diattenuation": (-most, most)},
     )
-    return mounted(mirror)
 
 
 def k_mirror(**settings):
@@ -236,7 +241,7 @@ def _standard(source, target):
                 "polarization is fitted without a prior"
             ) from error
         words = f"{error}; it is unpolarized according to the table"
-        warnings.warn(words, AstropolcalWarning, stacklevel=2)
+        warn(words)
         return None
     if not source.startswith(known.kind):
         raise InstrumentError(

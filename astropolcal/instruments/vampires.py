@@ -22,15 +22,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments import layout
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import SubaruPolarimeter
-from astropolcal.instruments.layout import (
-    COMMON,
-    EM_EXCESS_NOISE,
-    FileLayout,
-    ReadOut,
-    side_by_side,
-)
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 from astropolcal.units import wavelengths_of
@@ -41,50 +35,39 @@ __all__ = ["VAMPIRES"]
 FIELDS = ("MBI 610", "MBI 670", "MBI 720", "MBI 760")
 _BANDS = ("625-50", "Open", "675-50", "725-50", "750-50", "775-50")
 _MODE, _FILTER = "OBS-MOD", "FILTER01"
-_MULTIBAND, _REDUCED, _SINGLE = "IPOL_MBI", "IPOL_MBIR", "IPOL"
 # pixels of a field of 1.1 arcsec, and of the usual window of 3 arcsec
 _FIELD_SIDE, _WINDOW_SIDE = 184, 536
 # part of a side that the rectangles of the internal source have
 _LIT = 0.8
 
 #: Column of the observation table to keyword.
-KEYWORDS = {
-    "hwp": "RET-ANG1",
-    "hwp_true": "RET-POS1",
-    "derotator": "D_IMRANG",
+KEYWORDS = SubaruPolarimeter.keywords | {
     "flc_state": "U_FLC",
     "flc": "U_FLCST",
     "camera": "U_CAMERA",
     "em_gain": "U_EMGAIN",
     "read_mode": "U_DETMOD",
     "filter": _FILTER,
-    "altitude": "ALTITUDE",
     "parallactic": "PA",
 }
 
 # two ORCA-Quest since 2023, by read mode; before that two EMCCDs iXon Ultra 897
 _FULL = 65535.0
 _READ_OUTS = {
-    "slow 1": ReadOut(0.105, 0.245, _FULL),
-    "slow 2": ReadOut(0.105, 0.220, _FULL),
-    "fast 1": ReadOut(0.103, 0.403, _FULL),
-    "fast 2": ReadOut(0.103, 0.399, _FULL),
-    "slow": ReadOut(0.105, 0.245, _FULL),
-    "fast": ReadOut(0.103, 0.403, _FULL),
-    "em": ReadOut(4.5, 89.0, _FULL, EM_EXCESS_NOISE),
-    "conventional": ReadOut(4.5, 9.6, 40000.0),
+    "slow 1": layout.ReadOut(0.105, 0.245, _FULL),
+    "slow 2": layout.ReadOut(0.105, 0.220, _FULL),
+    "fast 1": layout.ReadOut(0.103, 0.403, _FULL),
+    "fast 2": layout.ReadOut(0.103, 0.399, _FULL),
+    "slow": layout.ReadOut(0.105, 0.245, _FULL),
+    "fast": layout.ReadOut(0.103, 0.403, _FULL),
+    "em": layout.ReadOut(4.5, 89.0, _FULL, layout.EM_EXCESS_NOISE),
+    "conventional": layout.ReadOut(4.5, 9.6, 40000.0),
 }
 
 
 #: The multiband imager; ``layout_of`` has the other modes.
-LAYOUT = FileLayout(
-    keywords=COMMON
-    | KEYWORDS
-    | {
-        "mjd": "MJD",
-        "time": "UT",
-        "pickoff": _MODE,
-    },
+LAYOUT = layout.FileLayout(
+    keywords=layout.COMMON | KEYWORDS | SubaruPolarimeter.times | {"pickoff": _MODE},
     shape=(len(FIELDS), _FIELD_SIDE, 2 * _FIELD_SIDE),
     cube_extension=0,
     weights="error",
@@ -101,7 +84,7 @@ LAYOUT = FileLayout(
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
     optics={"flc": ("flc", {r"(?i)^\s*in": "in", r"(?i)^\s*out": "out"})},
-    **side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
+    **layout.side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
 )
 
 
@@ -137,7 +120,7 @@ def layout_of(header):
     keywords = LAYOUT.keywords | ({"filter": _MODE} if multiband else {})
     shape = (len(slices_of(header)), side, 2 * side)
     # raw frames of a filter: a cube of exposures in one state
-    places = side_by_side(side, side, _LIT) | {"stacked": not multiband}
+    places = layout.side_by_side(side, side, _LIT) | {"stacked": not multiband}
     return replace(LAYOUT, keywords=keywords, shape=shape, **places)
 
 
@@ -152,16 +135,13 @@ _DEROTATOR = (281.0, 245.0, 204.0, 176.0)
 _BOUNDS = {"horizontal": (0, 360), "diagonal": (-90, 90), "circular": (-90, 90)}
 
 
-def _silver(name):
-    return optics.MetalMirror(material="silver", incidence=45 * u.deg, name=name)
-
-
 def _mirror(model, grid):
     """Return the tertiary mirror, ready to be calibrated."""
     mirror = subaru.tertiary_mirror(model, grid)
     if model == "free":
-        mirror.diattenuation = _silver("m3").diattenuation(grid)
-        mirror.retardance = _silver("m3").retardance(grid)
+        silver = optics.MetalMirror(material="silver")
+        mirror.diattenuation = silver.diattenuation(grid)
+        mirror.retardance = silver.retardance(grid)
     return mirror
 
 
@@ -310,7 +290,7 @@ class VAMPIRES(SubaruPolarimeter):
 
     def telescope_optics(self, behind):
         """Return the telescope with a tertiary mirror of bare silver."""
-        return subaru.telescope(_silver("m3"))
+        return subaru.telescope(optics.MetalMirror(material="silver", name="m3"))
 
     def published(self):
         """
@@ -340,14 +320,13 @@ class VAMPIRES(SubaruPolarimeter):
 
     def mode_header(self, wavelength):
         """Return mode and filter in the headers of cubes of these wavelengths."""
-        known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
-        known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
-        known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
+        known = [("IPOL_MBI", "Open", FIELDS), ("IPOL_MBIR", "Open", FIELDS[1:])]
+        known += [("IPOL", name, (name,)) for name in _BANDS]
         wavelength = np.atleast_1d(wavelengths_of(wavelength)).to_value(u.nm)
-        for header, names in known:
+        for mode, band, names in known:
             own = _wavelengths(names).value
             if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
-                return header
+                return {_MODE: mode, _FILTER: band}
         raise InstrumentError(
             f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; "
             f"allowed are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or "

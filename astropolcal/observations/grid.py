@@ -19,7 +19,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table, vstack
 
-from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.exceptions import ObservationError, warn
 from astropolcal.observations.pointings import angle_or_zero, axes_apart, frame_names
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
 from astropolcal.units import angle_to_rad
@@ -36,16 +36,8 @@ SINGLE_ERRORS = ("single_difference_err", "single_sum_err")
 REQUIRED = ("frame", "bin", "wavelength")
 BEAMS = ("flux_right", "flux_left")
 """Columns of two beams; of one beam at a time it is ``flux``."""
-CELL_COLUMNS = (
-    "bin",
-    "wavelength",
-    *BEAMS,
-    *BEAM_ERRORS,
-    *SINGLE_ERRORS,
-    "flux",
-    "flux_err",
-    "mask_reason",
-)
+CELL_COLUMNS = (*BEAMS, *BEAM_ERRORS, *SINGLE_ERRORS, "flux", "flux_err")
+CELL_COLUMNS += ("bin", "wavelength", "mask_reason")
 _ANGLES = ("hwp", "derotator", "parallactic", "altitude")
 # relative; beyond what files round away, far below what is between two bins
 _SAME_WAVELENGTH = 1e-6
@@ -164,11 +156,10 @@ def warn_of_copies(grid, label):
         if np.isfinite(cell).any() and (first := seen.setdefault(cell.tobytes(), number)) != number:
             copies.append((number, first))
     if copies and grid.errors:
-        warnings.warn(
+        warn(
             f"{label}: {counted(len(copies), 'frame')} with exactly the fluxes of another one "
             "(first: frame {} those of frame {}); copies make all errors too small, remove "
             "them".format(*copies[0]),
-            AstropolcalWarning,
             stacklevel=3,
         )
 
@@ -285,10 +276,9 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
             f"{bin_numbers[two]} is also that of bin {bin_numbers[one]}; one bin each is allowed"
         )
     if not np.array_equal(order, np.arange(len(order))):
-        warnings.warn(
+        warn(
             f"{label}: the wavelengths of its bins do not ascend; here they do, and values per "
             "wavelength have to",
-            AstropolcalWarning,
             stacklevel=4,
         )
     return by_bin[order] * unit, order
@@ -325,8 +315,7 @@ def _filled(comparison):
 
 def _measured(table, label, beams):
     """Return the unit of the fluxes, and fluxes and errors in it, by name."""
-    flux_unit = getattr(table[beams[0]], "unit", None)
-    flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
+    flux_unit = getattr(table[beams[0]], "unit", None) or u.dimensionless_unscaled
     strange = isinstance(flux_unit, u.UnrecognizedUnit) or not isinstance(flux_unit, u.UnitBase)
     # magnitudes are a unit like others for astropy
     if strange or flux_unit.is_equivalent(u.dex):
@@ -349,12 +338,10 @@ def _measured(table, label, beams):
         right, left, difference, total = (values[name] ** 2 for name in errors)
         off = np.abs((difference + total) / (2 * (right + left)) - 1)
         if np.nanmedian(off) > _AT_ODDS:
-            warnings.warn(
+            warn(
                 f"{label}: the squares of {' and '.join(SINGLE_ERRORS)} add up to "
                 f"{np.nanmedian((difference + total) / (right + left)):.3g} times those of "
-                f"{' and '.join(BEAM_ERRORS)}, not to twice as much; the latter are used alone",
-                AstropolcalWarning,
-                stacklevel=2,
+                f"{' and '.join(BEAM_ERRORS)}, not to twice as much; the latter are used alone"
             )
             values = {name: v for name, v in values.items() if name not in SINGLE_ERRORS}
     return flux_unit, values
@@ -426,7 +413,7 @@ def _mask_cells(code, bad, reason, reasons, label, first):
         reasons.append(reason)
     code[bad] = reasons.index(reason) + 1
     message = f"{label}: {counted(int(bad.sum()), 'cell')} masked, {reason} (first: {first})"
-    warnings.warn(message, AstropolcalWarning, stacklevel=2)
+    warn(message)
 
 
 # ---- errors of the beams -------------------------------------------------------------------------
@@ -548,26 +535,25 @@ def cycle_numbers(observations, start=None):
     return cycle
 
 
-def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
+def mask_incomplete_cycles(observations):
     """
-    Mask the frames of cycles that lack an angle of the half-wave plate.
+    Mask the frames of cycles that lack one of the angles 0, 45, 22.5, 67.5 deg of the plate.
 
     They give q without u, or neither. A frame masked at all wavelengths counts as missing. Without
     a half-wave plate all frames stay.
     """
     if "hwp" not in observations.frame_columns:
         return observations
-    wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
+    wanted = np.deg2rad([0, 45, 22.5, 67.5])
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
     # (frames, wanted angles)
     there = (axes_apart(plate[:, None], wanted) < _PLATE_STEPS) & ~lost[:, None]
     complete = np.array([there[cycle == c].any(axis=0).all() for c in range(cycle.max() + 1)])
     if not complete.any():
-        shown = ", ".join(f"{angle:g}" for angle in np.rad2deg(wanted))
         raise ObservationError(
             f"{observations.name}: none of its {len(complete)} half-wave-plate cycles has all "
-            f"of the angles {shown} deg"
+            "of the angles 0, 45, 22.5, 67.5 deg"
         )
     return _masked(observations, ~complete[cycle] & ~lost, "incomplete half-wave-plate cycle")
 
@@ -616,23 +602,21 @@ def brightness(observations):
     masked.
     """
     total = np.where(observations.mask, np.nan, observations.flux_right + observations.flux_left)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # frames and bins without any cell
+    # frames and bins without any cell
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         # each bin by its own median, so that faint wavelengths count as bright ones do
         relative = total / np.nanmedian(total, axis=0)
         return np.nanmedian(relative, axis=1)
 
 
-def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
+def mask_unstable_lamp(observations):
     """Mask the frames of an internal source whose brightness leaves its slow drift.
 
     The drift is the parabola in the order of the frames with the least absolute deviations. A frame
-    is unstable if ln(brightness) is off by more than ``limit`` and by more than ``sigma`` robust
-    standard deviations. Where at least half of the frames at one derotator angle are, all frames of
+    is unstable if ln(brightness) is off by more than 0.1 and by more than 6 robust standard
+    deviations. Where at least half of the frames at one derotator angle are, all frames of
     that angle are masked, as pairs are formed within it.
     """
-    if not (limit > 0 and sigma > 0):
-        raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
     if observations.single_beam:
         # its flux follows the modulation, not only the lamp
         return observations
@@ -643,7 +627,7 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     off = np.abs(logarithm - drift)
     spread = MAD_TO_SIGMA * np.nanmedian(off)
     # NaN, a frame masked already, is not far
-    far = np.nan_to_num(off) > max(limit, sigma * spread)
+    far = np.nan_to_num(off) > max(0.1, 6 * spread)
     run = derotator_runs(observations)
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]
     return _masked(observations, far, "unstable lamp")
@@ -676,10 +660,9 @@ def _masked(observations, frames, reason):
         return observations
     result = observations.with_mask(np.asarray(new), reason)
     names = np.array(frame_names(observations.frames))[new]
-    warnings.warn(
+    warn(
         f"{observations.name}: {len(names)} of {counted(observations.n_frames, 'frame')} masked, "
         f"{reason}: frame {listed(names, most=_MOST_NAMED)}",
-        AstropolcalWarning,
         stacklevel=3,
     )
     return result

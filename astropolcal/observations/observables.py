@@ -15,13 +15,12 @@ must differ by 45 degrees modulo 180, the derotator must be static and the
 modulator must be in the same state. Among the candidates the nearest in time wins.
 """
 
-import warnings
 from abc import ABC, abstractmethod
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.exceptions import ObservationError, warn
 from astropolcal.observations.pointings import angle_or_zero, axes_apart, clock, frame_names
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import angle_to_rad
@@ -547,10 +546,9 @@ def pair_frames(
         width *= 4
     if left.size:
         shown = [f"{labels[i]} (hwp {np.rad2deg(hwp[i]):g} deg)" for i in sorted(left.tolist())]
-        warnings.warn(
+        warn(
             f"{name}: {len(left)} of {n_frames} frames left out, their partner 45 deg of half-wave "
             f"plate away is missing or used: frame {listed(shown, most=_MAX_NAMED)}",
-            AstropolcalWarning,
             stacklevel=3,
         )
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
@@ -647,11 +645,9 @@ def pair_states(
     order = np.lexsort(_nearness(i, j, steps, exposure))
     chosen, used = _choose(i[order], j[order], len(state), share)
     if not used.all():
-        warnings.warn(
+        warn(
             f"{name}: {np.sum(~used)} of {len(state)} frames left out, their partner in the other "
-            "state of the modulator is used",
-            AstropolcalWarning,
-            stacklevel=2,
+            "state of the modulator is used"
         )
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
 
@@ -718,10 +714,9 @@ def warn_of_exposures(observations, groups, label):
         names, each = frame_names(frames), frames["exposure_time"]
         ends = np.sort(uneven[0][[exposure[uneven[0]].argmin(), exposure[uneven[0]].argmax()]])
         shown = " and ".join(f"{names[i]} ({each[i]:g})" for i in ends)
-        warnings.warn(
+        warn(
             f"{label}: exposures differ in {len(uneven)} of {counted(len(groups), 'group')} of "
             f"frames whose light is taken to be the same, such as {shown}",
-            AstropolcalWarning,
             stacklevel=3,
         )
 

@@ -21,13 +21,8 @@ from astropy.utils.data import download_file
 from astropy.utils.exceptions import AstropyWarning
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import (
-    AstropolcalError,
-    AstropolcalWarning,
-    ObservationError,
-    ParameterError,
-)
-from astropolcal.files import one_line
+from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError, warn
+from astropolcal.files import one_line, understood
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import MOVES, PLACES, finite_position
@@ -60,11 +55,10 @@ def offline():
         iers.conf.set_temp("auto_download", False),
         iers.conf.set_temp("auto_max_age", None),
         iers.conf.set_temp("iers_degraded_accuracy", "warn"),
-        warnings.catch_warnings(),
-    ):
         # of what matters `_warn_of_uncovered` warns
-        warnings.simplefilter("ignore", AstropyWarning)
-        warnings.simplefilter("ignore", ErfaWarning)
+        warnings.catch_warnings(action="ignore", category=AstropyWarning),
+        warnings.catch_warnings(action="ignore", category=ErfaWarning),
+    ):
         yield
 
 
@@ -96,12 +90,11 @@ def _warn_of_uncovered(time):
         if np.any(uncovered) and words not in _SAID:
             _SAID.add(words)
             # 0.9 s of time are 13.5 arcsec of hour angle
-            warnings.warn(
+            warn(
                 f"times {words}: UT1 is taken as UTC. As long as leap seconds keep the two within "
                 "0.9 s, the altitude is good to 0.004 deg, and the parallactic angle to 0.004 deg "
                 "over the sine of the zenith distance, 0.2 deg at 1 deg from the zenith. Newer "
                 "tables come with astropy-iers-data, or over the network with --online",
-                AstropolcalWarning,
                 stacklevel=3,
             )
 
@@ -278,14 +271,10 @@ def _target(observations):
             angle = observations.meta.get(key)
         if angle is None:
             return None
-        try:
+        with understood(observations.name, ObservationError, key, reads=False):
             found.append(angle if isinstance(angle, u.Quantity) else sky_angle(key, angle) * u.deg)
-        except (TypeError, ValueError) as error:
-            raise ObservationError(f"{observations.name}: {key}: {one_line(error)}") from None
-    try:
+    with understood(observations.name, ObservationError, "position", reads=False):
         return SkyCoord(*found)
-    except ValueError as error:
-        raise ObservationError(f"{observations.name}: {one_line(error)}") from None
 
 
 # ---- exposures -------------------------------------------------------------------------------

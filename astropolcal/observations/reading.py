@@ -46,8 +46,8 @@ def read_ecsv(path):
         )
     with understood(path, ObservationError, "not a readable ECSV table"):
         _check_header(path, text)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # doubtful units and types are errors below
+        # doubtful units and types are errors below
+        with warnings.catch_warnings(action="ignore"):
             try:
                 table = QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
             except ValueError:

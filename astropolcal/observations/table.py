@@ -3,7 +3,6 @@
 
 import dataclasses
 import hashlib
-import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -11,18 +10,12 @@ import numpy as np
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError, ParameterError, warn
 from astropolcal.files import one_line
+from astropolcal.observations import reading
 from astropolcal.observations.grid import beam_variances, build_grid, warn_of_copies
 from astropolcal.observations.observables import PAIRINGS, frame_groups, warn_of_exposures
 from astropolcal.observations.pointings import frame_coordinate
-from astropolcal.observations.reading import (
-    complete_table,
-    numeric_column,
-    read_ecsv,
-    stated_date,
-    write_table,
-)
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad, canonical_unit
 from astropolcal.words import check_choice, counted, html, listed
@@ -83,7 +76,7 @@ class Observations:
         self.name = str(name)
         self.path = None if path is None else Path(path)
         # in one form, as dates are compared as text
-        date = stated_date(self.meta, self._label)
+        date = reading.stated_date(self.meta, self._label)
         self.meta |= {} if date is None else {"date": date}
         # from the grid and not from the file: a mask set later holds for them as well
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
@@ -130,7 +123,7 @@ class Observations:
         ...
         astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
         """
-        table = read_ecsv(path)
+        table = reading.read_ecsv(path)
         # it goes to terminals, pages and figures
         name = one_line(Path(path).stem, None) if name is None else name
         found = cls.from_table(table, name=name, path=path)
@@ -170,7 +163,7 @@ class Observations:
         astropolcal.exceptions.ObservationError: x: missing columns wavelength, flux_right, flux_left; it has frame, bin, hwp
         """  # noqa: E501
         label = str(name if path is None else path)
-        table = complete_table(table, label)
+        table = reading.complete_table(table, label)
         grid = _seen(build_grid(table, label), label)
         return cls(grid, getattr(table, "meta", {}), name, path)
 
@@ -387,7 +380,7 @@ class Observations:
             raise ObservationError(
                 f"{self._label}: column {column} is not an angle; a unit such as deg is needed"
             )
-        return numeric_column(frames, column, self._label, u.rad)
+        return reading.numeric_column(frames, column, self._label, u.rad)
 
     @property
     def _label(self):
@@ -678,7 +671,7 @@ class Observations:
         True
         """
         # a plain Table gives a header that people can read, unlike a QTable
-        write_table(Table(self.to_table()), path, overwrite)
+        reading.write_table(Table(self.to_table()), path, overwrite)
 
 
 def _span(angles):
@@ -735,9 +728,7 @@ def _seen(grid, label):
     if not dark.any():
         return grid
     words = listed([f"{w:.4g}" for w in grid.wavelength[dark].to_value(u.nm)])
-    warnings.warn(
-        f"{label}: no usable cell at {words} nm; left out", AstropolcalWarning, stacklevel=4
-    )
+    warn(f"{label}: no usable cell at {words} nm; left out", stacklevel=4)
     return some_bins(grid, ~dark, label)
 
 

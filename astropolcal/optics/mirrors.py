@@ -10,6 +10,7 @@ diag(1, 1, -1, -1). See `astropolcal.thinfilm` for signs and phases.
 """
 
 from abc import abstractmethod
+from contextlib import suppress
 
 import astropy.units as u
 import numpy as np
@@ -212,11 +213,9 @@ def _material_name(value, label):
         get_material(value)
         return value
     name = getattr(value, "name", None)
-    try:
+    with suppress(ParameterError):
         if name and get_material(name) is value:
             return name
-    except ParameterError:
-        pass
     raise ParameterError(
         f"{label} = {value!r}; allowed is the name of a material, which register_material "
         "gives to one of your own"

@@ -18,18 +18,8 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
+from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import (
-    UNITS,
-    _elliptical_retarder,
-    _linear_retarder,
-    _rotate,
-    _rotation_matrix,
-    blank,
-    retardance_slope,
-    rotation_generator,
-    turn,
-)
 from astropolcal.optics._modelling import Setting, phase
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import BEAMS, EllipticalRetarder, _BeamOptic
@@ -111,15 +101,15 @@ class _Modulated(FrameOptic):
 
 
 class _Rotation(_Modulated):
-    _of = staticmethod(_rotation_matrix)
+    _of = staticmethod(mueller._rotation_matrix)
 
     def _slope(self, angle):
-        return turn(_rotation_matrix(angle))
+        return mueller.turn(mueller._rotation_matrix(angle))
 
 
 class _Retardation(_Modulated):
-    _of = staticmethod(_linear_retarder)
-    _slope = staticmethod(retardance_slope)
+    _of = staticmethod(mueller._linear_retarder)
+    _slope = staticmethod(mueller.retardance_slope)
 
 
 class _Gain(_Modulated):
@@ -251,7 +241,7 @@ class DriftRetarder(FrameOptic):
         return horizontal + horizontal_rate * x, diagonal + diagonal_rate * x, 0.0
 
     def _matrix(self, coordinate, *values):
-        return _elliptical_retarder(*self._vector(coordinate, *values))
+        return mueller._elliptical_retarder(*self._vector(coordinate, *values))
 
     def _derivatives(self, coordinate, *values):
         vector = self._vector(coordinate, *values)
@@ -384,12 +374,12 @@ class FerroelectricLiquidCrystal(FrameOptic):
     )
 
     def _matrix(self, coordinate, retardance, switching_angle):
-        return _rotate(_linear_retarder(retardance), coordinate * switching_angle)
+        return mueller._rotate(mueller._linear_retarder(retardance), coordinate * switching_angle)
 
     def _derivatives(self, coordinate, retardance, switching_angle):
-        slope = _rotate(retardance_slope(retardance), coordinate * switching_angle)
+        slope = mueller._rotate(mueller.retardance_slope(retardance), coordinate * switching_angle)
         # the axis stands at s alpha: a turn of it, s times
-        turning = rotation_generator(self._matrix(coordinate, retardance, switching_angle))
+        turning = mueller.rotation_generator(self._matrix(coordinate, retardance, switching_angle))
         return slope, np.asarray(coordinate)[..., None, None] * turning
 
 
@@ -490,7 +480,7 @@ class StrayLight(_Referenced):
         return share, np.where(source > _LEAST_OF_SOURCE, share**2, 0.0)
 
     def _matrix(self, coordinate, *added):
-        out = blank(coordinate, *added)
+        out = mueller.blank(coordinate, *added)
         out += np.eye(4)
         share, _ = self._share(coordinate, added[0])
         for row, value in enumerate(added):
@@ -499,7 +489,7 @@ class StrayLight(_Referenced):
         return out
 
     def _derivatives(self, coordinate, *added):
-        slopes = [blank(coordinate, *added) for _ in added]
+        slopes = [mueller.blank(coordinate, *added) for _ in added]
         share, slope = self._share(coordinate, added[0])
         for row, value in enumerate(added):
             slopes[row][..., row, 0] += share
@@ -612,8 +602,8 @@ class StateAnalyser(FrameOptic):
     def _parts(self, *values):
         """Return the values, and the matrices of ideal polarizers with and without efficiency."""
         x, eta, t = (v[..., None, None] for v in np.broadcast_arrays(*values))
-        crossed = UNITS[0, 1] + UNITS[1, 0]
-        return x, t, crossed, UNITS[0, 0] + UNITS[1, 1] + eta * crossed
+        crossed = mueller.UNITS[0, 1] + mueller.UNITS[1, 0]
+        return x, t, crossed, mueller.UNITS[0, 0] + mueller.UNITS[1, 1] + eta * crossed
 
     def _matrix(self, *values):
         x, t, _, passed = self._parts(*values)

@@ -5,18 +5,9 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
+from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import MGF2, QUARTZ
-from astropolcal.mueller import (
-    UNITS,
-    _diattenuator_retarder,
-    _elliptical_retarder,
-    _linear_retarder,
-    blank,
-    diattenuator_retarder_slopes,
-    retardance_slope,
-    transverse_share,
-)
 from astropolcal.optics._modelling import Setting, phase
 from astropolcal.optics.core import Optic, _LinearOptic
 from astropolcal.words import check_choice
@@ -60,7 +51,7 @@ class LinearPolarizer(_LinearOptic):
     (0.5, -0.5)
     """
 
-    _constant = 0.5 * UNITS[:2, :2].sum(axis=(0, 1))
+    _constant = 0.5 * mueller.UNITS[:2, :2].sum(axis=(0, 1))
 
 
 class _Diattenuating(Optic):
@@ -72,10 +63,11 @@ class _Diattenuating(Optic):
     )
 
     def _matrix(self, dispersion, diattenuation, retardance=0.0):
-        return _diattenuator_retarder(diattenuation, retardance)
+        return mueller._diattenuator_retarder(diattenuation, retardance)
 
     def _derivatives(self, dispersion, diattenuation, retardance=0.0):
-        return diattenuator_retarder_slopes(diattenuation, retardance)[: len(self.own_names)]
+        slopes = mueller.diattenuator_retarder_slopes(diattenuation, retardance)
+        return slopes[: len(self.own_names)]
 
 
 class Diattenuator(_Diattenuating):
@@ -164,8 +156,8 @@ class VectorDiattenuator(Optic):
     diagonal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along U")
 
     def _matrix(self, dispersion, horizontal, diagonal):
-        out = blank(horizontal, diagonal)
-        transverse = transverse_share(np.hypot(horizontal, diagonal))
+        out = mueller.blank(horizontal, diagonal)
+        transverse = mueller.transverse_share(np.hypot(horizontal, diagonal))
         # (1 - t) / d^2, written so that nothing is divided by zero without diattenuation
         share = 1 / (1 + transverse)
         out[..., 0, 0] = 1.0
@@ -184,9 +176,9 @@ class VectorDiattenuator(Optic):
 
 def _vector_slope(own, other, i):
     """Return the derivative to component i (0 along Q, 1 along U) of a diattenuation vector."""
-    out = blank(own)
+    out = mueller.blank(own)
     j = 1 - i
-    transverse = transverse_share(np.hypot(own, other))
+    transverse = mueller.transverse_share(np.hypot(own, other))
     share = 1 / (1 + transverse)
     # dt/dD_i; and of 1 / (1 + t)
     fall = -own / np.maximum(transverse, np.sqrt(np.finfo(float).eps))
@@ -224,7 +216,7 @@ class Depolarizer(_LinearOptic):
     retained_v = Parameter(default=1.0, bounds=(0, 1), description="share of V that survives")
 
     # the intensity is kept
-    _constant = UNITS[0, 0]
+    _constant = mueller.UNITS[0, 0]
     _elements = tuple((1.0, ((i, i),)) for i in (1, 2, 3))
 
 
@@ -257,10 +249,10 @@ class LinearRetarder(Optic):
     retardance = phase("phase between the two axes")
 
     def _matrix(self, dispersion, retardance):
-        return _linear_retarder(retardance)
+        return mueller._linear_retarder(retardance)
 
     def _derivatives(self, dispersion, retardance):
-        return (retardance_slope(retardance),)
+        return (mueller.retardance_slope(retardance),)
 
 
 class TwoLayerWaveplate(Optic):
@@ -318,10 +310,10 @@ class TwoLayerWaveplate(Optic):
         return w_sio2 * dispersion[0] + w_mgf2 * dispersion[1], tuple(dispersion)
 
     def _matrix(self, dispersion, *thicknesses):
-        return _linear_retarder(self._law("retardance", dispersion, *thicknesses)[0])
+        return mueller._linear_retarder(self._law("retardance", dispersion, *thicknesses)[0])
 
     def _derivatives(self, dispersion, *thicknesses):
-        slope = retardance_slope(self._law("retardance", dispersion, *thicknesses)[0])
+        slope = mueller.retardance_slope(self._law("retardance", dispersion, *thicknesses)[0])
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
@@ -374,7 +366,7 @@ class EllipticalRetarder(Optic):
     circular = phase("right circular retardance")
 
     def _matrix(self, dispersion, horizontal, diagonal, circular):
-        return _elliptical_retarder(horizontal, diagonal, circular)
+        return mueller._elliptical_retarder(horizontal, diagonal, circular)
 
     def _derivatives(self, dispersion, horizontal, diagonal, circular):
         # M = cos x 1 + sinc [d] + versine d d^T with x = |d|; by d_i that is d_i times the slope
@@ -390,7 +382,7 @@ class EllipticalRetarder(Optic):
     @staticmethod
     def _slope(i, vector, sinc, versine, common):
         """Derivative to component i; ``common`` is that through the length, over d_i."""
-        out = blank(vector[..., 0])
+        out = mueller.blank(vector[..., 0])
         block = out[..., 1:, 1:]
         block += vector[..., i, None, None] * common + sinc * _CROSS[i].reshape(3, 3)
         block[..., i, :] += versine[..., 0] * vector
@@ -508,7 +500,7 @@ class WollastonPrism(_BeamOptic, _LinearOptic):
     efficiency = Parameter(default=1.0, bounds=(0, 1), description="modulation efficiency")
 
     # half of unpolarized light goes into each beam
-    _constant = 0.5 * (UNITS[0, 0] + UNITS[1, 1])
+    _constant = 0.5 * (mueller.UNITS[0, 0] + mueller.UNITS[1, 1])
 
     @property
     def _elements(self):

@@ -398,8 +398,7 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     parameter that changes with the wavelength; crosses mark where the data do not tell the size.
     """
     names = [cause.name for cause in diagnosis.causes]
-    if effect not in names:
-        raise ParameterError(f"effect = {effect!r} is not a cause; these are: {', '.join(names)}")
+    check_choice("cause", effect, names, ParameterError)
     if diagnosis.content is None:
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:

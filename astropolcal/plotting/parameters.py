@@ -12,14 +12,7 @@ from astropy.modeling import Parameter
 from astropy.time import Time
 
 from astropolcal import instruments
-from astropolcal.calibration.uncertainty.derived import (
-    METALS,
-    mirror_names,
-    mirror_values,
-    of_law,
-    of_optic,
-    retardances_of,
-)
+from astropolcal.calibration.uncertainty import derived
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import named_by_date, parameter_history, significance
@@ -47,7 +40,7 @@ def _entries(calibration):
     for i, chain in enumerate(calibration.chains):
         laws = ((o.name, key, law.of) for o in leaves(chain) for key, law in o._follows.items())
         for optic, key in ((optic, key) for optic, key, of in laws if of == ("wavelength",)):
-            found = of_optic(calibration, i, optic, [key])
+            found = derived.of_optic(calibration, i, optic, [key])
             value, std = np.asarray(found.value), np.asarray(found.std)
             std = np.where(found.is_determined, std, np.nan)
             own = {"value": value, "std": std, "at_bound": np.zeros(value.shape, dtype=bool)}
@@ -94,7 +87,7 @@ def _draw_law(axes, calibration, leaf, known, look):
     # a law is smooth between the wavelengths unless its parameters are given at these
     if lam.size > 1 and not any(getattr(leaf, key).size > 1 for key in leaf.param_names):
         lam = np.linspace(lam[0], lam[-1], 201)
-    found = of_law(calibration, leaf.name, "retardance", lam * u.nm)
+    found = derived.of_law(calibration, leaf.name, "retardance", lam * u.nm)
     value, std = (x.to_value(u.deg) for x in (found.value, found.std))
     own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
     free = {key: entry for key, entry in own.items() if not entry["fixed"]}
@@ -241,7 +234,7 @@ def plot_retardances(calibration, *, figure=None):
 def _has_retardance(leaf, key, known):
     """Return whether an optic retards in this way: a law, or a parameter that is not fixed at 0."""
     if key in leaf.param_names:
-        if key not in retardances_of(leaf):
+        if key not in derived.retardances_of(leaf):
             return False
         entry = known[f"{leaf.name}.{key}"]
         # a component that is held at zero is one that the retarder does not have
@@ -341,8 +334,8 @@ def _per_wavelength(known):
 def other_parameters(calibration):
     """Return the free parameters given per wavelength that no other figure shows."""
     optics = _optics(calibration).values()
-    shown = {f"{leaf.name}.{key}" for leaf in optics for key in retardances_of(leaf)}
-    shown |= {f"{name}.diattenuation" for name in mirror_names(calibration)}
+    shown = {f"{leaf.name}.{key}" for leaf in optics for key in derived.retardances_of(leaf)}
+    shown |= {f"{name}.diattenuation" for name in derived.mirror_names(calibration)}
     names = _per_wavelength(calibration.parameter_values())
     return [n for n in names if n not in shown and not n.endswith(".efficiency")]
 
@@ -372,7 +365,7 @@ def _draw_all(figure, calibration, title, panels, draw):
 
 # ---- mirrors --------------------------------------------------------------------------------
 # dashes of their own: a thin metal line must not look like a fit
-_METAL_LOOKS = dict(zip(METALS, ((st.SKY, "--"), (st.ORANGE, "-."), (st.GREEN, ":")), strict=True))
+_METAL_LOOKS = ((st.SKY, "--"), (st.ORANGE, "-."), (st.GREEN, ":"))
 _MIRROR_LAW_ALONE = "fitted law, not determined: a choice of the law"
 
 
@@ -424,10 +417,10 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     >>> [axes.get_title() for axes in plot_mirrors(cal).axes]
     ['fold_mirror']
     """
-    names = mirror_names(calibration) if names is None else list(names)
+    names = derived.mirror_names(calibration) if names is None else list(names)
     if not names:
         raise ChainError("the calibration has no mirror to draw")
-    tables = [mirror_values(calibration, name) for name in names]
+    tables = [derived.mirror_values(calibration, name) for name in names]
     # an empty dict is a wish to see none
     if reference is None:
         reference = {}
@@ -454,9 +447,9 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
         st.heading(figure, calibration, "Mirrors")
         entries = st.legend_entries(panels.ravel())
         # sorting is stable: what was calibrated stays in its order, the metals come last
-        for label in sorted(entries, key=lambda label: label in METALS):
+        for label in sorted(entries, key=lambda label: label in derived.METALS):
             handle = entries[label] = entries.pop(label)
-            handle.set_label(f"{label} (bare, 45°)" if label in METALS else label)
+            handle.set_label(f"{label} (bare, 45°)" if label in derived.METALS else label)
         st.legend_outside(figure, list(entries.values()), columns=2)
     return figure
 
@@ -464,7 +457,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
 def _draw_mirror(axes, calibration, table, key, reference):
     table = table[np.argsort(table["wavelength"])]
     lam, name = st.nanometres(table["wavelength"]), table.meta["name"]
-    for metal, (color, line) in _METAL_LOOKS.items():
+    for metal, (color, line) in zip(derived.METALS, _METAL_LOOKS, strict=True):
         value = table[f"{key}_{metal}"].value
         st.draw_line(axes, lam, value, color=color, linestyle=line, label=metal)
     for i, (label, mirror) in enumerate(reference.items()):

@@ -159,8 +159,7 @@ def _finish_corner(figure, posterior, columns, samples, marks):
 
 
 def _heading(posterior, marked):
-    walkers = posterior.chain.shape[1]
-    lines = [f"Posterior: {posterior.n_steps} steps of {walkers} walkers"]
+    lines = [f"Posterior: {posterior.n_steps} steps of {posterior.chain.shape[1]} walkers"]
     lines.append(f"{int(posterior.n_times)} times the longest autocorrelation time τ")
     # fewer autocorrelation times than these say nothing of convergence
     if posterior.n_times < ENOUGH:

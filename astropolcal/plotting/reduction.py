@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import understood
 from astropolcal.plotting import _style as st
 from astropolcal.reduction.cubes import BEAMS
 from astropolcal.reduction.frames import open_cube
@@ -233,12 +234,7 @@ def save_quicklook(reduction, folder):
     folder, beams = Path(folder), reduction.instrument.files.beams
     if tuple(beams) != BEAMS:
         raise ParameterError(f"figures of the beams {', '.join(beams)}; they are of right and left")
-    try:
-        folder.mkdir(exist_ok=True)
-    except FileNotFoundError:
-        raise ObservationError(f"{folder}: there is no folder {folder.parent}") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ObservationError(f"{folder}: cannot be made: {reason}") from None
+    with understood(folder, ObservationError, "cannot be made", reads=False):
+        folder.mkdir(parents=True, exist_ok=True)
     plots = {"apertures.png": plot_apertures, "run.png": plot_run}
     return [st.save(plot(reduction), folder / n, ObservationError) for n, plot in plots.items()]

@@ -56,9 +56,8 @@ class DataGrid:
         self.is_star = is_star(self.part.observations.source) and bool(sky)
         # the stage by which data are grouped, and drawn where the sky does not move
         self.turning = self._turning()
-        self.angle = np.zeros(len(self.part.frames))
-        if self.turning is not None:
-            self.angle = np.rad2deg(self.position(self.turning)[0])
+        still = self.turning is None
+        self.angle = np.zeros(len(self.part.frames)) if still else self.degrees(self.turning)
         # what the data are drawn against, in degree, and how that is called
         self.abscissa, self.label = self.angle, f"{_stage_words(self.turning)} (°)"
         if self.is_star:
@@ -119,12 +118,15 @@ class DataGrid:
             # where the states of a modulator make the difference the plate is static
             still = now and len(set(angles)) == 1
             label = angles[0] if still else f" {st.MINUS} ".join(angles)
-            moving = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
-            moves = any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in moving.values())
-            positions = None if moves else {s: a.mean(axis=1) for s, a in moving.items()}
             label = f"{label}, {now}" if now else label
-            found.append(Series(label, np.flatnonzero(member), positions))
+            found.append(Series(label, np.flatnonzero(member), self._others(member)))
         return found
+
+    def _others(self, member):
+        """Return the mean positions of all stages but the one that turns, None where one moves."""
+        known = {s: a[:, member] for s, a in self.part.positions.items() if s != self.turning}
+        moves = any(np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE) for a in known.values())
+        return None if moves else {stage: a.mean(axis=1) for stage, a in known.items()}
 
     def _other_series(self):
         """Return the data by the settings of all stages but the one that turns."""
@@ -138,19 +140,13 @@ class DataGrid:
         devices = (stage.partition("=")[0] for stage in stages(self.chain) if "=" in stage)
         for device in dict.fromkeys(devices):
             labels += [f", {device} {state}" for state in table[device][first]]
+        # states are of frames, and what a single beam shows hangs on its group
+        drawn = not any(stage in COORDINATES for stage in stages(self.chain))
+        drawn &= self.observable.name != "intensity"
         found = []
         for label in dict.fromkeys(labels.tolist()):
             member = labels == label
-            at = {stage: a[:, member] for stage, a in self.part.positions.items()}
-            moving = any(
-                np.ptp(a, axis=1).max() > np.deg2rad(SAME_ANGLE)
-                for stage, a in at.items()
-                if stage != self.turning
-            )
-            # states are of frames, and what a single beam shows hangs on its group
-            drawn = not moving and not any(stage in COORDINATES for stage in stages(self.chain))
-            drawn &= self.observable.name != "intensity"
-            positions = {stage: a.mean(axis=1) for stage, a in at.items()} if drawn else None
+            positions = self._others(member) if drawn else None
             found.append(Series(label[2:] or "all", np.flatnonzero(member), positions))
         return found
 

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """All figures of a calibration as files."""
 
-import warnings
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -10,10 +9,10 @@ import numpy as np
 
 from astropolcal.exceptions import (
     AstropolcalError,
-    AstropolcalWarning,
     CalibrationFileError,
     ChainError,
     ObservationError,
+    warn,
 )
 from astropolcal.files import understood
 from astropolcal.plotting._style import save
@@ -103,7 +102,7 @@ def save_all(calibration, folder):
         # a package that is not installed, or a parameter that did not move, costs one figure, not
         # all
         except AstropolcalError as error:
-            warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=2)
+            warn(f"{path} is not drawn: {error}")
         else:
             paths.append(save(figure, path))
     return paths

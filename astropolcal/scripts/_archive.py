@@ -170,8 +170,7 @@ def _worked(command, arguments, folder, task):
     if os.path.isdir(getattr(arguments, "calibration", "")):
         arguments.instrument = arguments.instrument or instrument
     said = io.StringIO()
-    with redirect_stderr(said), warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
+    with redirect_stderr(said), warnings.catch_warnings(record=True, action="always") as warned:
         warnings.filterwarnings("ignore", message="ERFA function")
         module = import_module(f"astropolcal.scripts._{command}")
         with earth(arguments):
@@ -181,8 +180,7 @@ def _worked(command, arguments, folder, task):
                     return {k: v for k, v in before.items() if k not in _OF_ENTRY}
             module.work(arguments)
     doubts = [str(each.message) for each in warned] + said.getvalue().splitlines()
-    with open(arguments.json, encoding="utf-8") as stream:
-        summary = json.load(stream)
+    summary = json.loads(Path(arguments.json).read_text(encoding="utf-8"))
     state = os.stat(product)
     return {
         "product": os.path.basename(product),

@@ -15,12 +15,10 @@ from astropolcal.observations.observables import get_observable
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 
-HELP = "fit an instrument's chain of optics to observation tables"
 DESCRIPTION = """\
-Fit an instrument's chain of optics to observation tables. Without files,
-the packaged example is calibrated."""
+Fit an instrument's chain of optics to observation tables.
+Without files, the packaged example is calibrated."""
 EXAMPLES = """\
-examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics

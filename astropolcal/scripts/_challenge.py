@@ -12,12 +12,10 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
-HELP = "test the diagnosis, or another tool, on sealed simulated data"
 DESCRIPTION = """\
-Simulate calibrations with random faults, diagnose each without the key,
-and compare the answers with the truth."""
+Test the diagnosis, or another tool, on sealed simulated data.
+Their faults are random, and the answers are compared with the truth."""
 EXAMPLES = """\
-examples:
   astropolcal challenge -n 20
   astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
   astropolcal challenge make cases --count 100 --seed 7

@@ -9,7 +9,6 @@ import shlex
 import stat
 import sys
 import textwrap
-import warnings
 from contextlib import suppress
 from functools import partial
 from itertools import product
@@ -22,12 +21,7 @@ from astropy.modeling import models
 
 from astropolcal import instruments
 from astropolcal.chain import find_optic, follow, leaves, remove_optic
-from astropolcal.exceptions import (
-    AstropolcalError,
-    AstropolcalWarning,
-    InstrumentError,
-    ParameterError,
-)
+from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError, warn
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import sky_angle
@@ -214,10 +208,11 @@ def _are_same(path, other):
 
 def add_command(commands, name, module):
     """Add the subcommand whose texts, ``OPTIONS`` and ``run`` a module has; return its parser."""
-    examples = getattr(module, "EXAMPLES", None)
-    # texts with examples are shown as they are written
-    form = argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter
-    texts = {"help": module.HELP, "description": module.DESCRIPTION, "epilog": examples}
+    # texts are shown as they are written
+    form = argparse.RawDescriptionHelpFormatter
+    first = module.DESCRIPTION.partition(".\n")[0]
+    texts = {"help": first[0].lower() + first[1:], "description": module.DESCRIPTION}
+    texts["epilog"] = f"examples:\n{module.EXAMPLES}"
     parser = place = commands.add_parser(name, formatter_class=form, **texts)
     parser.set_defaults(run=module.run, **getattr(module, "DEFAULTS", {}))
     for entry in entries(module.OPTIONS):
@@ -388,13 +383,8 @@ def check_suffix(option, path, *suffixes):
 
 def wrapped(line, indent=0):
     """Break a line at 80 columns, the further ones indented; words stay whole."""
-    return textwrap.fill(
-        line,
-        WIDTH,
-        subsequent_indent=" " * indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    whole = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(line, WIDTH, subsequent_indent=" " * indent, **whole)
 
 
 def write_json(content, path):
@@ -432,7 +422,7 @@ def faults_of(calibration, name):
     faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
     if faults:
         words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+        warn(words, stacklevel=3)
     return faults
 
 
@@ -448,8 +438,7 @@ def write_calibration(calibration, arguments, content):
         figures = save_all(calibration, arguments.plots)
     if arguments.json:
         write_json(content(), arguments.json)
-    named = [arguments.output, arguments.json]
-    return written_lines(named, len(figures), arguments.plots) + kept
+    return written_lines([arguments.output, arguments.json], len(figures), arguments.plots) + kept
 
 
 # ---- inputs ---------------------------------------------------------------------------------
@@ -542,7 +531,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
         # zero is the same in all units
         if parameter.unit and re.fullmatch(r"[-+.\deE\s]+", value) and float(value):
             message = f"--fix {text}: no unit is given, {parameter.unit} is taken"
-            warnings.warn(message, AstropolcalWarning, stacklevel=2)
+            warn(message)
     for text in prior:
         name, _, value = text.partition("=")
         for parameter in _valued(chains, name, f"--prior {text}"):

@@ -4,7 +4,6 @@
 import argparse
 import copy
 import os
-import warnings
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,10 +13,10 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
-    AstropolcalWarning,
     CalibrationFileError,
     ObservationError,
     ParameterError,
+    warn,
 )
 from astropolcal.files import one_line
 from astropolcal.scripts import _common as common
@@ -25,13 +24,12 @@ from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.units import check_seed, plain_number
 from astropolcal.words import counted
 
-HELP = "correct science cubes with a calibration and write Stokes parameters"
 DESCRIPTION = """\
-Solve for the Stokes parameters of the light that entered the telescope, by
-least squares over all frames, and write them with their errors. The cubes must
-be without sky background: it is not subtracted."""
+Correct science cubes with a calibration and write Stokes parameters.
+They are those of the light that entered the telescope, by least squares over
+all frames, with their errors. The cubes must be without sky background: it is
+not subtracted."""
 EXAMPLES = """\
-examples:
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
   astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \\
@@ -276,12 +274,10 @@ def _warn_of_sky(images, light, radius):
     share = np.where(level > noise, sky * np.pi * radius**2 / light[good], 0.0)
     worst = max(share, default=0.0)
     if worst > _MOST_SKY:
-        warnings.warn(
+        warn(
             f"the edge of the images has {100 * worst:.2g} % of the light within {radius:g} pixels "
             "of the star, on the same area: a sky background changes I, and so q and u, and must "
-            "be subtracted from the cubes before",
-            AstropolcalWarning,
-            stacklevel=2,
+            "be subtracted from the cubes before"
         )
 
 
@@ -378,10 +374,9 @@ def _warn_of_change(calibration, name, others):
         if by > _MOVED:
             told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
     if told:
-        warnings.warn(
+        warn(
             f"{name} differs from {' and '.join(told)} standard errors: what changes from one "
             "calibration to the next is not in the errors (astropolcal health says what changed)",
-            AstropolcalWarning,
             stacklevel=3,
         )
 
@@ -415,12 +410,10 @@ def _warn_of_rotation(table, rotation, law):
         off.append(np.degrees(np.abs(np.angle(turns / turns.sum())).max()) / 2)
     if off[0] > _OFF_LAW and off[0] > 3 * off[1]:
         others = {"field": "fixed", "pupil": "pupil"}
-        warnings.warn(
+        warn(
             f"--rotation {rotation}: the derotator is up to {off[0]:.1f} deg off the law by which "
             f"it keeps the {kept[0]}, and {off[1]:.1f} deg off that by which it keeps the "
-            f"{kept[1]} (--rotation {others[kept[1]]}): images may be turned wrongly",
-            AstropolcalWarning,
-            stacklevel=2,
+            f"{kept[1]} (--rotation {others[kept[1]]}): images may be turned wrongly"
         )
 
 
@@ -436,17 +429,11 @@ def _summary(result, star, arguments, n_frames):
     for kind in ("statistical", "systematic"):
         error = star.fractional_errors(kind)
         spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
-    summary = {
-        "output": str(arguments.output),
-        "calibration": result.provenance["calibration"],
-        "calibration_hash": result.provenance["calibration_hash"],
-        "mode": result.mode,
-        "observable": result.observable,
-        "components": result.components,
-        "n_frames": n_frames,
-        "north_up": result.north_up,
+    same = ("mode", "observable", "components", "north_up", "condition")
+    summary = {"output": str(arguments.output), "n_frames": n_frames}
+    summary |= {key: result.provenance[key] for key in ("calibration", "calibration_hash")}
+    summary |= {key: getattr(result, key) for key in same} | {
         "wavelength_nm": result.wavelength.to_value(u.nm),
-        "condition": result.condition,
         "poorly_determined": {str(i): words for i, words in enumerate(result.weak) if words},
         "leakage_q": result.leakage[:, 1],
         "leakage_u": result.leakage[:, 2],

@@ -8,12 +8,11 @@ from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.scripts import _common as common
 
-HELP = "find what a model lacks to explain the measurements"
 DESCRIPTION = """\
-Find what an instrument's model lacks to explain the measurements: where
-the gap lies, which effect causes it, and how far it shrinks on left-out frames."""
+Find what a model lacks to explain the measurements.
+That is where the gap lies, which effect causes it, and how far it shrinks on
+left-out frames."""
 EXAMPLES = """\
-examples:
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
   astropolcal diagnose run.ecsv --derotator linear  a simpler model
@@ -198,18 +197,16 @@ def _record(calibration, path, file, dataset):
 
 def _write(diagnosis, content, arguments, instrument):
     """Write what was asked for."""
+    from astropolcal.gap.report import with_causes, write_html
+
     if arguments.json:
         common.write_json(content, arguments.json)
     if arguments.report:
-        from astropolcal.gap.report import write_html
-
         stage("drawing")
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
     if arguments.save and not content["misread"]:
-        from astropolcal.gap.report import with_causes
-
         calibration = with_causes(diagnosis.improved, instrument=instrument)
         calibration.write(arguments.save, overwrite=True)
 

@@ -8,15 +8,8 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from astropolcal import instruments
+from astropolcal import efficiency, instruments
 from astropolcal.chain import stages
-from astropolcal.efficiency import (
-    best_derotator,
-    demodulation,
-    has_derotator,
-    has_plate,
-    polarimetric_efficiency,
-)
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.observations import pointing
 from astropolcal.observations.pointings import offline
@@ -26,15 +19,13 @@ from astropolcal.units import iso_date
 from astropolcal.words import counted
 
 _TITLE = "Polarimetric efficiency of {}"
-HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
 DESCRIPTION = """\
-Share of the linear polarization that an observation measures, over
-wavelength, derotator angle, altitude and parallactic angle; and the derotator
-offset that loses least of it. Without a calibration the published values are
-taken. Without a half-wave plate, the efficiencies of I, Q, U and V in the
-frames that were calibrated."""
+Polarimetric efficiency over wavelength, derotator angle and pointing.
+It is the share of the linear polarization that an observation measures; and the
+derotator offset that loses least of it. Without a calibration the published
+values are taken. Without a half-wave plate, the efficiencies of I, Q, U and V
+in the frames that were calibrated."""
 EXAMPLES = """\
-examples:
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
   astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2
@@ -71,7 +62,7 @@ def run(arguments):
     arguments.parallactic = arguments.parallactic or 0.0
     instrument, (chain, *others), grid, settings = _chains(arguments)
     found = None
-    if not has_plate(chain):
+    if not efficiency.has_plate(chain):
         chains = [chain, *others]
         content, lines, found = _any_modulation(arguments, instrument, chains, grid, settings)
     else:
@@ -125,9 +116,9 @@ def _any_modulation(arguments, instrument, chains, grid, settings):
     for stage, angle in pointing.items():
         frames[stage] = np.full(len(frames), angle.value) * angle.unit
     # what lacks Q or U is refused; a V that is hardly modulated would only add its noise to them
-    found = demodulation(chain, grid, frames, components="IQU")
+    found = efficiency.demodulation(chain, grid, frames, components="IQU")
     with suppress(ParameterError):
-        whole = demodulation(chain, grid, frames)
+        whole = efficiency.demodulation(chain, grid, frames)
         # from which efficiency on V is solved for, too
         found = whole if whole.efficiency[:, 3].min() > 0.1 else found
     rows = _rows(arguments.wavelength, grid)
@@ -161,14 +152,14 @@ def _on_sky(instrument, chain, grid, arguments):
 
 def _table(arguments, instrument, chain, grid):
     """Return the table of an instrument with a half-wave plate, and what is printed of it."""
-    turns = has_derotator(chain)
+    turns = efficiency.has_derotator(chain)
     if arguments.derotator and not turns:
         raise ParameterError(f"--derotator: {instrument.name} has none in this chain")
     derotator = np.array(arguments.derotator or np.arange(0, 91, 15), dtype=float)
     rows, pointing = _rows(arguments.wavelength, grid), _pointing(arguments, chain)
     settings = {"instrument": instrument, "mode": _mode(arguments, instrument)} | pointing
     settings["derotator"] = derotator * u.deg if turns else None
-    values = np.atleast_2d(polarimetric_efficiency(chain, grid, **settings))[:, rows]
+    values = np.atleast_2d(efficiency.polarimetric_efficiency(chain, grid, **settings))[:, rows]
     content = {"instrument": instrument.name}
     content |= {f"{key}_deg": a.value for key, a in pointing.items()}
     # absent where there is none, not empty
@@ -232,7 +223,9 @@ def _best(arguments, instrument, chain, grid):
     target = common.sky_position(arguments.target, "--target")
     altitude, parallactic = pointing(target, _times(arguments.night), instrument.location)
     mode = _mode(arguments, instrument)
-    best = best_derotator(chain, grid, altitude, parallactic, law=mode, instrument=instrument)
+    best = efficiency.best_derotator(
+        chain, grid, altitude, parallactic, law=mode, instrument=instrument
+    )
     # north of the zenith the angle passes 180 deg, and goes on at -180 deg
     turned = np.unwrap(parallactic.to_value(u.deg), period=360)
     # the offset whose worst moment is the best
@@ -277,20 +270,20 @@ def _times(text):
 
 def _draw(arguments, instrument, chain, grid, found):
     """Draw what was found: the efficiencies of any modulator, of derotator offsets, or the map."""
-    from astropolcal.plotting import efficiency
+    from astropolcal.plotting import efficiency as figures
     from astropolcal.plotting._style import save
 
     title = _TITLE.format(instrument.name)
-    if not has_plate(chain):
-        figure = efficiency.plot_efficiencies(found, grid, title=title)
+    if not efficiency.has_plate(chain):
+        figure = figures.plot_efficiencies(found, grid, title=title)
     elif found is not None:
         title = f"{title}\ntarget {arguments.target}, {arguments.night}"
-        figure = efficiency.plot_derotator_offsets(found, title=title)
+        figure = figures.plot_derotator_offsets(found, title=title)
     else:
         settings = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
         shown = None if arguments.wavelength is None else arguments.wavelength * u.um
         # one angle a figure, the last that was asked for
         settings |= {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
         settings |= {"instrument": instrument, "mode": _mode(arguments, instrument)}
-        figure = efficiency.plot_polarimetric_efficiency(chain, grid, title=title, **settings)
+        figure = figures.plot_polarimetric_efficiency(chain, grid, title=title, **settings)
     save(figure, arguments.output)

@@ -10,13 +10,11 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
-HELP = "what changed over all calibrations of an instrument, and what needs care"
 DESCRIPTION = """\
-Read all calibrations of a folder; say for each instrument and mode which optics
-are constant, drift or changed and when, what needs care, and when the next
-calibration is due. --html writes a page with figures."""
+What changed over all calibrations of an instrument, and what needs care.
+For each instrument and mode in a folder of calibrations: which optics are
+constant, drift or changed and when, and when the next calibration is due."""
 EXAMPLES = """\
-examples:
   astropolcal health library/
   astropolcal health library/ --html health.html --goal 0.2
   astropolcal health library/ --event 2029-06-10   the mirror was recoated

@@ -21,11 +21,10 @@ from astropolcal.scripts import _common as common
 from astropolcal.version import version
 from astropolcal.words import counted
 
-HELP = "say what a calibration, a folder of them, a table, cube or product holds"
 DESCRIPTION = """\
-Say what a calibration file, a folder of calibrations, an observation table, an
-image cube or a corrected product holds; of a calibration also how good it is
-and for what it is valid. Without a file, what this installation knows."""
+Say what a calibration, a folder of them, a table, cube or product holds.
+Of a calibration also how good it is and for what it is valid. Without a file,
+what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only
@@ -47,7 +46,6 @@ _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 
 EXAMPLES = """\
-examples:
   astropolcal info                     version, instruments and optics
   astropolcal info cal.asdf --full     all of a calibration's summary
   astropolcal info library/            the calibrations of a folder
@@ -62,17 +60,16 @@ def run(arguments):
     path = arguments.file
     if arguments.instruments and path is not None:
         raise AstropolcalError(f"{path}: --instruments goes without a file")
-    if path is None and (arguments.frame or arguments.context):
-        raise AstropolcalError("--frame and --context need a folder of calibrations")
     if arguments.instruments:
         common.say(arguments, *instruments.names())
         return
+    if (arguments.frame or arguments.context) and not (path and Path(path).is_dir()):
+        named = f"{path}: " if path else ""
+        raise AstropolcalError(f"{named}--frame and --context need a folder of calibrations")
     if path is None:
         lines, content = _installation()
     elif Path(path).is_dir():
         lines, content = _library(path, arguments.context, arguments.frame)
-    elif arguments.frame or arguments.context:
-        raise AstropolcalError(f"{path}: --frame and --context are for a folder of calibrations")
     elif Path(path).suffix.lower() == ".asdf":
         lines, content = _calibration(path, arguments)
     # a FITS file, or one that by its name claims to be one
@@ -210,17 +207,11 @@ def _observations(path):
     paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
     pairs = observations.pairs() if paired else ()
-    content = {
-        "file": str(path),
-        "instrument": observations.instrument,
-        "source": observations.source,
-        "n_frames": observations.n_frames,
-        "n_wavelengths": observations.n_bins,
-        "n_masked": int(observations.mask.sum()),
-        "n_pairs": len(pairs),
-        "wavelength_nm": observations.wavelength.to_value(u.nm),
-        "content_hash": observations.content_hash,
-    }
+    same = ("instrument", "source", "n_frames", "content_hash")
+    content = {"file": str(path)} | {key: getattr(observations, key) for key in same}
+    content |= {"n_masked": int(observations.mask.sum()), "n_pairs": len(pairs)}
+    content |= {"n_wavelengths": observations.n_bins}
+    content |= {"wavelength_nm": observations.wavelength.to_value(u.nm)}
     lines = [*observations.summary().splitlines(), f"Next: {common.following('calibrate', path)}"]
     return _wrapped(lines, content, indent=2)
 
@@ -257,16 +248,12 @@ def _describe_product(path, product):
     made, wavelength = product.provenance, product.wavelength.to_value(u.nm)
     # frames have a key of their own
     frames = list(made.get("frames", []))
-    content = {
-        "file": str(path),
-        "type": "corrected product",
-        "components": product.components,
+    same = ("components", "mode", "observable", "north_up")
+    content = {"file": str(path), "type": "corrected product"}
+    content |= {key: getattr(product, key) for key in same} | {
         "shape": list(product.stokes.shape),
         "unit": product.unit.to_string(),
         "wavelength_nm": wavelength,
-        "mode": product.mode,
-        "observable": product.observable,
-        "north_up": product.north_up,
         # at a wavelength all components must be
         "n_determined": int(np.sum(product.determined.all(axis=-1))),
         "statistical": product.covariance is not None,

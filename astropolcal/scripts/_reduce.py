@@ -20,12 +20,10 @@ _PASSED_ON = ("source", "raw", "dark", "flat", "workers", "cluster", "resume", "
 # a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
 
-HELP = "measure both beams in FITS cubes and write an observation table"
 DESCRIPTION = """\
-Measure the fluxes of both beams in extracted cubes. A file that cannot be
-used is left out and listed with the reason."""
+Measure both beams in FITS cubes and write an observation table.
+A file that cannot be used is left out and listed with the reason."""
 EXAMPLES = """\
-examples:
   astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
   astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
   astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside

@@ -11,12 +11,10 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
-HELP = "sample the posterior of a calibration's parameters"
 DESCRIPTION = """\
-Sample the posterior of a calibration's parameters with an ensemble of
-walkers, and keep the samples with the calibration."""
+Sample the posterior of a calibration's parameters.
+An ensemble of walkers does so; the samples are kept with the calibration."""
 EXAMPLES = """\
-examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
   astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf
@@ -61,8 +59,7 @@ def run(arguments):
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
     # recognized by content, so that their order does not matter
-    tables = common.read_datasets(arguments.files)
-    calibration = calibration.with_observations(tables)
+    calibration = calibration.with_observations(common.read_datasets(arguments.files))
     # names of parameters that are wrong, then packages that are missing, are refused at once
     if arguments.parameters:
         LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)
@@ -93,6 +90,7 @@ def _check_options(arguments):
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
+    given = {key: getattr(arguments, key) for key in ("parameters", "seed", "checkpoint")}
     try:
         with warnings.catch_warnings():
             if not common.is_quiet(arguments):
@@ -100,12 +98,10 @@ def _sample(calibration, arguments):
                 warnings.filterwarnings("ignore", message="the chain (is|has)")
             return sample(
                 calibration,
-                parameters=arguments.parameters,
                 n_walkers=arguments.walkers,
                 n_steps=arguments.steps,
                 burn_in=None if arguments.burn == "auto" else arguments.burn,
-                seed=arguments.seed,
-                checkpoint=arguments.checkpoint,
+                **given,
                 # as for all commands, and not at all where that is not wanted
                 progress=False,
             )

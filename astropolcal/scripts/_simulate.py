@@ -16,12 +16,10 @@ from astropolcal.words import counted
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
 
-HELP = "simulate an observation table or image cubes, with photon and read noise"
 DESCRIPTION = """\
-Simulate the beam fluxes of an instrument's chain: the published values,
-or those of a calibration file. With --cubes, simulate its image cubes."""
+Simulate an observation table or image cubes, with photon and read noise.
+The chain has the published values, or those of a calibration file."""
 EXAMPLES = """\
-examples:
   astropolcal simulate -o run.ecsv                      the packaged example
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
   astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers

@@ -13,12 +13,10 @@ from astropolcal.standards.priors import assumed_polarization
 from astropolcal.standards.visibility import SITES, location
 from astropolcal.words import counted, did_you_mean
 
-HELP = "list polarimetric standard stars and when they are observable"
-DESCRIPTION = (
-    "List the polarimetric standard stars of the catalogue. With a site and a night,\n"
-    "those that rise above the limit, the best for the diattenuation of the telescope\n"
-    "first. With a name, all that is known of that star."
-)
+DESCRIPTION = """\
+List polarimetric standard stars and when they are observable.
+With a site and a night, those that rise above the limit, the best for the
+diattenuation of the telescope first. With a name, all that is known of a star."""
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
 --kind {polarized,unpolarized}  only stars of this kind
@@ -39,7 +37,6 @@ TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.
 
 
 EXAMPLES = """\
-examples:
   astropolcal standards --kind polarized --band H --magnitude 4,8
   astropolcal standards --site subaru --night 2025-11-03 --plot night.png
   astropolcal standards HD30675
@@ -170,15 +167,9 @@ def _many(arguments):
     if arguments.near:
         radius = 15.0 if arguments.radius is None else arguments.radius
         near = {"center": common.sky_position(arguments.near, "--near"), "radius": radius * u.deg}
-    found = standards.search(
-        **near,
-        kind=arguments.kind,
-        band=arguments.band,
-        magnitude=arguments.magnitude,
-        site=site,
-        night=arguments.night,
-        min_altitude=arguments.min_altitude * u.deg,
-    )
+    given = {key: getattr(arguments, key) for key in ("kind", "band", "magnitude", "night")}
+    lowest = arguments.min_altitude * u.deg
+    found = standards.search(**near, **given, site=site, min_altitude=lowest)
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")

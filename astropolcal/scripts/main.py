@@ -28,7 +28,6 @@ _COMMANDS = (
 )
 _DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
 _EXAMPLES = """\
-examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     fit a model to a table
   astropolcal diagnose cal.asdf run.ecsv         find what the model lacks
@@ -97,7 +96,7 @@ def build_parser():
     from astropolcal.scripts._common import add_command
 
     form = argparse.RawDescriptionHelpFormatter
-    texts = {"description": _DESCRIPTION, "epilog": _EXAMPLES}
+    texts = {"description": _DESCRIPTION, "epilog": f"examples:\n{_EXAMPLES}"}
     parser = _OneLineParser(prog="astropolcal", formatter_class=form, **texts)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     words = "print what completes commands, options and files in a shell (needs shtab)"

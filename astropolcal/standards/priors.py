@@ -137,8 +137,7 @@ def _degrees(star):
     """Return wavelengths, degrees and errors of the measurements; and what is assumed of them."""
     table, words = star.polarization, []
     x = table["wavelength"].to_value(u.um)
-    degree = table["p"].to_value(u.dimensionless_unscaled)
-    error = table["p_err"].to_value(u.dimensionless_unscaled)
+    degree, error = (table[key].to_value(u.one) for key in ("p", "p_err"))
     stated = np.isfinite(error)
     if not np.all(stated):
         names = ", ".join(dict.fromkeys(map(str, table["reference"][~stated])))
@@ -498,8 +497,7 @@ class StandardStar:
         if self.kind != "unpolarized":
             raise ParameterError(f"{self.name} is {self.kind}; ask for interstellar() instead")
         table = self.polarization
-        degree = table["p"].to_value(u.dimensionless_unscaled)
-        error = table["p_err"].to_value(u.dimensionless_unscaled)
+        degree, error = (table[key].to_value(u.one) for key in ("p", "p_err"))
         stated = np.isfinite(error)
         if np.any(stated):
             table, degree, error = table[stated], degree[stated], error[stated]
@@ -546,14 +544,9 @@ def names(kind=None):
     >>> "HD 293396" in standards.names("unpolarized")
     True
     """
-    check_kind(kind)
-    return [s.name for s in _stars().values() if kind in (None, s.kind)]
-
-
-def check_kind(kind):
-    """Raise if there is no such kind of standard star."""
     if kind is not None:
         check_choice("kind", kind, KINDS, ParameterError)
+    return [s.name for s in _stars().values() if kind in (None, s.kind)]
 
 
 def get(name):

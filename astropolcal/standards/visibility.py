@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import rotation_matrix
 from astropolcal.observations.pointings import offline, pointing
-from astropolcal.standards.priors import StandardStar, check_kind, get, names
+from astropolcal.standards.priors import StandardStar, get, names
 from astropolcal.units import angle_to_rad, iso_date, positive_number
 from astropolcal.words import check_choice, did_you_mean
 
@@ -143,8 +143,7 @@ class TelescopeInformation:
 
     def error(self, name):
         """Return the standard error of a parameter, infinite if the frames do not determine it."""
-        if name not in self.names:
-            raise ParameterError(f"no parameter {name!r}; there are {', '.join(self.names)}")
+        check_choice("parameter", name, self.names, ParameterError)
         place = self.names.index(name)
         return float(np.sqrt(self.covariance[place, place]))
 
@@ -430,7 +429,8 @@ FRAMES = 32
 _REFERENCE_MAGNITUDE = 10
 _RANGES = "altitude_min", "altitude_max", "parallactic_min", "parallactic_max", "hours"
 _FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f") | dict.fromkeys(_RANGES, ".1f")
-_BANDS = ("U", "B", "V", "R", "I", "J", "H", "K")
+# nominal wavelengths of bands, um
+_BANDS = dict(zip("UBVRIJHK", (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
 
 
 def search(
@@ -501,7 +501,6 @@ def search(
      HD 14069    0.191
     HD 293396    0.209
     """
-    check_kind(kind)
     if (site is None) != (night is None):
         raise ParameterError("site and night go together")
     if (center is None) != (radius is None):
@@ -558,9 +557,7 @@ def _degree(star, band):
     if band is not None and band in table["band"]:
         table = table[table["band"] == band]
     elif star.law is not None and (band is not None or not len(table)):
-        place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
-        wavelength = place.get(band, 0.55) * u.um
-        q, stokes_u, covariance = star.stokes(wavelength)
+        q, stokes_u, covariance = star.stokes(_BANDS[band or "V"] * u.um)
         # the error of the degree is that along the direction of polarization in the (q, u) plane
         along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
         # where the angle alone is uncertain rounding may leave less than zero

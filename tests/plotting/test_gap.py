@@ -302,7 +302,7 @@ def test_wavelengths_without_a_size_are_crosses_at_the_foot():
 def test_what_has_no_size_is_refused():
     found = sized({}, [])
     for name, words in (
-        ("other", "is not a cause; these are: beam_gain"),
+        ("other", "cause = .other.; allowed are beam_gain"),
         ("beam_gain", "anything"),
     ):
         with pytest.raises(ParameterError, match=words):

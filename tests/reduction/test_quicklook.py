@@ -70,8 +70,10 @@ def test_quicklook_files(star_run, tmp_path):
     written = save_quicklook(star_run, tmp_path / "look")
     assert [path.name for path in written] == ["apertures.png", "run.png"]
     assert all(path.stat().st_size > 10_000 for path in written)
-    with pytest.raises(ObservationError, match="no folder"):
-        save_quicklook(star_run, tmp_path / "a" / "b")
+    # folders are made as those of other figures are, unless a file is in their way
+    assert save_quicklook(star_run, tmp_path / "a" / "b")[0].parent == tmp_path / "a" / "b"
+    with pytest.raises(ObservationError, match=r"apertures\.png: cannot be made: .*File exists"):
+        save_quicklook(star_run, written[0])
 
 
 def test_indices_are_checked(star_run):

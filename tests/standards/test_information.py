@@ -129,5 +129,5 @@ def test_bad_errors_are_refused():
 def test_offset_needs_the_altitude_and_names_are_checked():
     with pytest.raises(ParameterError, match="altitude of each frame"):
         telescope_information([0, 40] * u.deg, offset=True)
-    with pytest.raises(ParameterError, match="no parameter 'm3'"):
+    with pytest.raises(ParameterError, match="parameter = 'm3'; allowed are"):
         telescope_information([0, 40] * u.deg).error("m3")
