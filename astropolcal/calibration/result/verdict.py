@@ -111,7 +111,8 @@ def verdict(calibration, targets=TARGETS):
         *_mirrors(calibration, known),
         _misfit(calibration),
     ]
-    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), _hanging(free)]
+    unknown = [*_absurd(_without_laws(calibration, free)), _open_words(sky)]
+    unknown += [*_too_far(bright, sky), _hanging(free)]
     held = calibration.settings.get("restarted", {}).get("open")
     unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
     unknown += [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
@@ -276,6 +277,13 @@ def _suspected(calibration):
     if calibration.fit.get("outliers"):
         return "wrong frames?"
     return "why" if calibration.settings.get("observable") == "intensity" else "beams exchanged?"
+
+
+def _without_laws(calibration, free):
+    """Leave out the constants of laws: they are where inputs are zero, far from all frames."""
+    trains = map(leaves, calibration.chains)
+    laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
+    return {name: entry for name, entry in free.items() if name not in laws}
 
 
 def _absurd(free):
