@@ -335,6 +335,31 @@ def test_a_thickness_off_by_little_ends_in_no_other_minimum():
         assert np.sqrt(np.mean(measurement.residuals() ** 2)) < 1e-3, i
 
 
+@pytest.mark.slow
+def test_a_sign_of_one_of_three_wavelengths_that_a_wrong_plate_liked():
+    """The plates of the start have less than half a wave at 2150 nm, the true ones more."""
+    wavelength = [1.25, 1.6, 2.15] * u.um
+    start = instruments.get("charis").chain(wavelength=wavelength)
+    start["hwp"].theta.fixed = start["derotator"].theta.fixed = True
+    truth = start.copy()
+    truth["calibration_polarizer"].theta = 90.3 * u.deg
+    truth["hwp"].w_sio2, truth["hwp"].w_mgf2 = 1.653 * u.mm, 1.291 * u.mm
+    truth["derotator"].horizontal = [-205, -92, -57] * u.deg
+    truth["derotator"].diagonal, truth["derotator"].circular = [-4] * 3 * u.deg, [3] * 3 * u.deg
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100, 120] * u.deg)
+    # the last does not tell which
+    for flux, seed, named in ((1e8, 1, False), (1e7, 0, False), (1e6, 1, True)):
+        data = simulate(truth, wavelength, frames, flux=flux, seed=seed)
+        cal = calibrate(start, data, cross_validate=False)
+        words = "derotator.horizontal at 2150.0 nm: with the other sign"
+        assert any(words in mirror for mirror in cal.identifiability.mirrors) == named, flux
+        known = cal.parameter_values()
+        if not named:
+            off = known["derotator.horizontal"]["value"] - [-205, -92, -57]
+            assert np.abs(off).max() < 0.1, flux
+            assert abs(known["hwp.w_sio2"]["value"] - 1.653) < 3 * known["hwp.w_sio2"]["std"], flux
+
+
 def test_a_wavelength_of_half_a_wave_keeps_the_branch_of_its_neighbours():
     """Where the plate has half a wave a small error of the model outweighs the sign."""
     charis = instruments.get("charis")

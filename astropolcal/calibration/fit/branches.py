@@ -23,6 +23,8 @@ __all__ = []
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4
 CLEARLY_BETTER = 0.99
+# a branch may be so many times worse before all are fitted again, and of a few wavelengths
+FAR_WORSE, _ABSURD = 30.0, 1e3
 # phases of which the sign hangs on the hand of an optic, and those of an elliptical retarder
 _LINEAR, _ELLIPTICAL = "retardance", ("horizontal", "diagonal", "circular")
 # what else has a sign that data may not tell
@@ -47,6 +49,9 @@ _LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
 _WHOLE_TURN = 1.99 * np.pi
 # starts whose sums of squares differ by less are the same
 _APART = 1.001
+# a fit of everything that is not better after so many evaluations, or gains less than a share in a
+# step, is given up
+GLANCE, GAIN = 15, 1e-4
 # so many steps tell which signs may be the best, and of so many more are taken
 _GLIMPSE, _PROMISING = 2, 4
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
@@ -318,8 +323,9 @@ def undecided_signs(measurement, view, stds):
     Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
 
     These are phases, and diattenuations, of which the other sign, all else of the wavelength
-    refitted, is less than three standard deviations worse, or better. Phases that fit exactly as
-    well are a mirror solution anyway; what is zero within three of its ``stds`` has no sign.
+    refitted, and of a few wavelengths everything, is less than three standard deviations worse, or
+    better. Phases that fit exactly as well are a mirror solution anyway; what is zero within three
+    of its ``stds`` has no sign.
     With them the mean squares of the errors of q and u that the other signs would be on sky, times
     their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
     zero where the phases beside tell the sign.
@@ -339,6 +345,7 @@ def undecided_signs(measurement, view, stds):
         if row in phases:
             trial = problem.turned(trial, places, np.zeros(places.shape))
         trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()))
+        others = _refitted(problem, vector, costs, trial, new)
         moved = np.abs(trial[places] - vector[places])
         if row in phases:
             moved = np.abs(np.remainder(moved + np.pi, 2 * np.pi) - np.pi)
@@ -361,11 +368,28 @@ def undecided_signs(measurement, view, stds):
             found.append({"words": words, "sky": None})
         beside = _between(measurement.wavelength, vector[places])
         open_ = close & ~(4 * np.abs(vector[places] - beside) < np.abs(trial[places] - beside))
-        if view is not None and open_.any():
-            other = seen_with(view, measurement.put_back(trial))
-            chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
-            errors = np.maximum(errors, chance * mean_errors(view, other))
+        chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
+        shares = [(chance[i], one) for i, one in others.items()]
+        chance[[*others]] = 0.0
+        for share, there in ((chance, trial), *shares):
+            if view is not None and np.any(share > 0):
+                other = seen_with(view, measurement.put_back(there))
+                errors = np.maximum(errors, share * mean_errors(view, other))
     return found, errors
+
+
+def _refitted(problem, vector, costs, trial, new):
+    """Fit everything from other signs of a few wavelengths; return the vectors by wavelength.
+
+    What ``trial`` and its costs ``new`` have there are those of the fit.
+    """
+    found, total = {}, np.sum(problem.residuals(vector) ** 2)
+    for i, start in _one_by_one(problem, vector, costs, trial, new):
+        found[i] = problem.fit(start, evaluations=GLANCE, gain=GAIN)[0]
+        trial[problem.elements[:, i]] = found[i][problem.elements[:, i]]
+        rise = (np.sum(problem.residuals(found[i]) ** 2) - total) / 2
+        new[i] = max(costs[i] + rise, ROUNDED * costs[i])
+    return found
 
 
 def bent_valleys(measurement, whitened, stds):
@@ -444,6 +468,29 @@ def other_laws(problem, vector, origin):
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def other_signs(problem, vector):
+    """Return starts in which one of a few wavelengths is in another branch."""
+    costs, found = problem.costs(vector), []
+    for branch in problem.branches(vector)[1:] if problem.n_bins <= COARSE else ():
+        found += [
+            start for _, start in _one_by_one(problem, vector, costs, *problem.polish(branch))
+        ]
+    return found
+
+
+def _one_by_one(problem, vector, costs, other, new):
+    """Yield the number of each of a few wavelengths, and vectors that have it as another one has.
+
+    Only where that is not as good and not far worse. Common parameters that are held make the
+    branch dear that they were not fitted to, and so few wavelengths have no neighbours that tell.
+    """
+    few = problem.n_bins <= COARSE
+    for i in np.flatnonzero(few & (_APART * costs < new) & (new < _ABSURD * costs)):
+        start = vector.copy()
+        start[problem.elements[:, i]] = other[problem.elements[:, i]]
+        yield i, start
 
 
 def other_axes(problem, vector, origin):
