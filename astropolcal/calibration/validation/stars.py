@@ -382,13 +382,15 @@ def _add_known(table, q, stokes_u, covariance):
     table["aolp_known"] = np.where(length > 0, polarization_angle(q, stokes_u), np.nan) * u.deg
     along, across = np.full((2, length.size), np.nan)
     if covariance is not None:
-        # of a star without polarization in the direction of q, which is as good as another one
+        # of a star without polarization in the direction of q, which is as good as another one,
+        # and its error of the angle ends in the division by zero below
         pair = np.where(length > 0, [q, stokes_u], [[1.0], [0.0]])
         (qq, qu), (_, uu) = np.broadcast_to(covariance, (length.size, 2, 2)).transpose(1, 2, 0)
         along, across = polarization_errors(*pair, np.sqrt(qq), np.sqrt(uu), qu)
     add_percent(table, dolp_known_err=along)
-    turn = np.where(length > 0, stokes.angle_error(length, across), np.inf)
-    table["aolp_known_err"] = np.where(np.isnan(across), np.nan, turn) * u.deg
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # as the catalogue states it, which made the error across of it in this way
+        table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
 
 def _pull(table, key):
