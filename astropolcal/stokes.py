@@ -54,16 +54,18 @@ def polarization_errors(q, u_, sigma_q, sigma_u, covariance=0.0):
     return along, across
 
 
-def angle_error(dolp, sigma):
+def angle_error(dolp, sigma, is_measured=False):
     r"""
-    Return the rms error of the angle, in degree, of light of a true degree of polarization.
+    Return the rms error of the angle, in degree, of light of a degree of polarization.
 
     For equal and independent errors of q and u, from the angular distribution of Naghizadeh-Khouei
     & Clarke (1993). To first order it is sigma / (2 p); without polarization, where any angle is as
     likely, :math:`90^\circ / \sqrt 3`. With ``sigma`` that across the direction of polarization it
-    is right wherever the errors are small, or equal.
+    is right wherever the errors are small, or equal. The degree is the true one; of one that
+    ``is_measured`` the bias is taken away in the way that leaves the errors nearest to the truth.
     """
     dolp, sigma = np.broadcast_arrays(dolp, sigma)
+    dolp = debias_dolp(dolp, sigma, "wardle-kronberg") if is_measured else dolp
     snr = _signal_to_noise(dolp, sigma)
     first = np.rad2deg(0.5 / np.maximum(snr, _KNOWN[-1])) * np.hypot(1, 1 / np.maximum(snr, 1))
     found = np.where(snr < _KNOWN[-1], np.interp(snr, _KNOWN, _angle_errors()), first)

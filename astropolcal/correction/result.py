@@ -474,13 +474,10 @@ def polarization(q, u, errors):
     for kind, error in errors.items():
         s_p, across = _errors(q, u, dolp, error)
         # what is open stays so
-        degree, s_chi, known = dolp, across.copy(), np.isfinite(across) & np.isfinite(dolp)
-        if kind == "statistical":
+        s_chi, known, is_noise = across.copy(), np.isfinite(across + dolp), kind == "statistical"
+        if is_noise:
             result["dolp_debiased"][known] = debias_dolp(dolp[known], across[known])
-            # of this one the error of the angle is nearest to that of the true degree
-            degree = dolp.copy()
-            degree[known] = debias_dolp(dolp[known], across[known], "wardle-kronberg")
-        s_chi[known] = angle_error(degree[known], across[known])
+        s_chi[known] = angle_error(dolp[known], across[known], is_measured=is_noise)
         result[f"s_p_{kind}"], result[f"s_chi_{kind}"] = s_p, s_chi
     return result
 

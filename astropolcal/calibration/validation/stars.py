@@ -128,7 +128,8 @@ def _table(wavelength, found):
     debiased[known] = stokes.debias_dolp(dolp[known], spread[known])
     add_percent(table, dolp=debiased, dolp_err=spread)
     table["aolp"] = stokes.polarization_angle(*mean) * u.deg
-    table["aolp_err"] = stokes.angle_error(debiased, spread) * u.deg
+    table["aolp_err"] = np.full(dolp.shape, np.nan) * u.deg
+    table["aolp_err"][known] = stokes.angle_error(dolp[known], spread[known], True) * u.deg
     table["n_cycles"] = count
     add_percent(table, q_cycles=found[0], u_cycles=found[1])
     return table
