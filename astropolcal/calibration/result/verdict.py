@@ -132,7 +132,7 @@ def verdict(calibration, targets=TARGETS):
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         if "restarted" in calibration.settings:
-            cautions.append("errors of what is held are not in these")
+            cautions.append("errors of parameters lack those of what is held")
         cautions += _of_one_table(calibration)
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only

@@ -206,6 +206,7 @@ def _of_model(calibration):
     words = "without an error of the model" if len(none) == len(_OF_SOURCES) else words
     # where the data leave two signs of a retardance open
     signs = np.count_nonzero((known or {}).get("sign_relative_percent", ()))
+    words += ", and those of what was held" if "held_absolute_percent" in (known or {}) else ""
     return words + (f", with signs that nothing tells at {signs} wavelengths" if signs else "")
 
 
