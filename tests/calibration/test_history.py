@@ -245,6 +245,7 @@ def test_restart_frees_what_is_named_and_holds_the_rest(years):
     assert new.converged
 
 
+@pytest.mark.slow
 def test_what_is_held_errs_on_sky_as_before(years, tmp_path):
     """The orientation of the lamp's polarizer is nothing to the sky."""
     targets = [(p * u.percent, None) for p in (30, 1, 0.1)]
