@@ -16,6 +16,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.sky import mean_errors, seen_with
 from astropolcal.calibration.noise.weighting import Problem
+from astropolcal.chain import leaves
 from astropolcal.progress import steps
 
 __all__ = []
@@ -438,28 +439,30 @@ def bent_valleys(measurement, whitened, stds):
 
 
 def other_laws(problem, vector, origin):
-    """Return sums of squares and starts with other thicknesses of each optic, best first.
+    """Return sums of squares and starts with other thicknesses or slopes of laws, best first.
 
-    A phase that is a law of a thickness has minima of its own, as one of a bin has. Thicknesses are
-    tried around those of ``origin``, beside the other common parameters of ``vector``, with each
-    bin roughly in its best valley, and in that of the origin.
+    A phase that is a law, of a thickness or with coefficients, has minima of its own, as one of a
+    bin has. Thicknesses are tried around those of ``origin``, beside the other common parameters of
+    ``vector``, with each bin roughly in its best valley, and in that of the origin; so are
+    coefficients, with the constant moved so that the data change least.
     """
-    slots = [
-        slot
-        for slot in problem.measurement.free.slots
-        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m)
-    ]
     slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
     low, high = problem.measurement.free.bounds()
-    base = vector.copy()
-    for slot in slots:
+    base, ways = vector.copy(), {}
+    for slot, constant in _law_slots(problem.measurement):
         base[slot.start] = origin[slot.start]
-    for slot in {slot.name.partition(".")[0]: slot for slot in reversed(slots)}.values():
-        size = np.sqrt(np.mean(slopes[:, slot.start] ** 2))
+        way = np.zeros(vector.size)
+        way[slot.start] = 1.0
+        if constant is not None:
+            base[constant.start] = origin[constant.start]
+            own, of = slopes[:, slot.start], slopes[:, constant.start]
+            way[constant.start] = -(own @ of) / max(of @ of, np.finfo(float).tiny)
+        ways.setdefault(slot.name.partition(".")[0] if constant is None else slot.name, way)
+    for way in ways.values():
+        size = np.sqrt(np.mean((slopes @ way) ** 2))
         for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
-            start = base.copy()
-            start[slot.start] += k * _LAW_STEP / size
-            if low[slot.start] <= start[slot.start] <= high[slot.start]:
+            start = base + k * _LAW_STEP / size * way
+            if np.all((low <= start) & (start <= high)):
                 start[problem.elements] = origin[problem.elements]
                 found.append(problem.polish(start, _ROUGH))
                 for row, *bounds in problem.main_retardances():
@@ -468,6 +471,21 @@ def other_laws(problem, vector, origin):
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def _law_slots(measurement):
+    """Yield thicknesses, and coefficients of laws that are phases with the slots of constants."""
+    by_name = measurement.free.by_name
+    for slot in measurement.free.slots:
+        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m):
+            yield slot, None
+    for leaf in (leaf for chain in measurement.chains for leaf in leaves(chain)):
+        for key, law in leaf._follows.items() if leaf.name else ():
+            constant = by_name.get(f"{leaf.name}.{key}")
+            if constant is None or constant.per_wavelength or key not in (_LINEAR, *_ELLIPTICAL):
+                continue
+            names = (f"{leaf.name}.{name}" for name in law.names(key))
+            yield from ((by_name[name], constant) for name in names if name in by_name)
 
 
 def other_signs(problem, vector):
