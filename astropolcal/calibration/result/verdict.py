@@ -105,12 +105,8 @@ def verdict(calibration, targets=TARGETS):
         if any("[" not in lead for lead in leads) or len(leads) > many
     }
     # what must be wrong with the set-up or its description comes before what is not known
-    wrong = [
-        _nothing(calibration),
-        _angles(calibration, free),
-        *_mirrors(calibration, known),
-        _misfit(calibration),
-    ]
+    wrong = [_nothing(calibration), _angles(calibration, free)]
+    wrong += [*_mirrors(calibration, known), _misfit(calibration)]
     unknown = [*_absurd(_without_laws(calibration, free)), _open_words(sky)]
     unknown += [*_too_far(bright, sky), _hanging(free)]
     held = calibration.settings.get("restarted", {}).get("open")
