@@ -10,6 +10,8 @@ Bad input (a NaN, an intensity that is not positive, a negative error) raises
 `~astropolcal.exceptions.ParameterError`; it never comes back as a number.
 """
 
+from functools import cache
+
 import astropy.units as u
 import numpy as np
 
@@ -34,15 +36,14 @@ def polarization_angle(q, u):
 
 def polarization_errors(q, u_, sigma_q, sigma_u, covariance=0.0):
     r"""
-    Return the errors of degree and angle (degree) of linear polarization, and that across it.
+    Return the errors along and across the direction of linear polarization.
 
     To first order, of numbers whose degree p is above zero. The error along (q, u) is that of the
     degree, :math:`\sigma_p^2 = (q^2 \sigma_q^2 + u^2 \sigma_u^2 + 2 q u\,\sigma_{qu}) / p^2`. That
     across is :math:`b^2 = (u^2 \sigma_q^2 + q^2 \sigma_u^2 - 2 q u\,\sigma_{qu}) / p^2` of
-    Plaszczynski et al. 2014, doi:10.1093/mnras/stu270; over 2 p it is the error of the angle, and
-    it sets the positive bias of the degree. Without covariance the first two are :math:`s_p` and
-    :math:`s_\chi` in Sec. 2.3 of the CHARIS recalibration paper. Good above a signal-to-noise ratio
-    of about three; `aolp_interval` holds below, too.
+    Plaszczynski et al. 2014, doi:10.1093/mnras/stu270; it sets the error of the angle, see
+    `angle_error`, and the positive bias of the degree. Without covariance the first, and the second
+    over 2 p, are :math:`s_p` and :math:`s_\chi` in Sec. 2.3 of the CHARIS recalibration paper.
     """
     # hypot neither overflows nor underflows where the squares would
     dolp = np.hypot(q, u_)
@@ -50,8 +51,44 @@ def polarization_errors(q, u_, sigma_q, sigma_u, covariance=0.0):
     cross = 2 * c * s * covariance
     along = np.sqrt(np.maximum((c * sigma_q) ** 2 + (s * sigma_u) ** 2 + cross, 0))
     across = np.sqrt(np.maximum((s * sigma_q) ** 2 + (c * sigma_u) ** 2 - cross, 0))
-    # the angle is half that of (q, u)
-    return along, np.rad2deg(across / (2 * dolp)), across
+    return along, across
+
+
+def angle_error(dolp, sigma, is_measured=False):
+    r"""
+    Return the rms error of the angle, in degree, of light of a degree of polarization.
+
+    For equal and independent errors of q and u, from the angular distribution of Naghizadeh-Khouei
+    & Clarke (1993). To first order it is sigma / (2 p); without polarization, where any angle is as
+    likely, :math:`90^\circ / \sqrt 3`. With ``sigma`` that across the direction of polarization it
+    is right wherever the errors are small, or equal. The degree is the true one; of one that
+    ``is_measured`` the bias is taken away in the way that leaves the errors nearest to the truth.
+    """
+    dolp, sigma = np.broadcast_arrays(dolp, sigma)
+    dolp = debias_dolp(dolp, sigma, "wardle-kronberg") if is_measured else dolp
+    snr = _signal_to_noise(dolp, sigma)
+    first = np.rad2deg(0.5 / np.maximum(snr, _KNOWN[-1])) * np.hypot(1, 1 / np.maximum(snr, 1))
+    found = np.where(snr < _KNOWN[-1], np.interp(snr, _KNOWN, _angle_errors()), first)
+    return np.where(sigma > 0, found, np.where(sigma == 0, 0.0, np.nan))
+
+
+# signal-to-noise ratios between which the error of the angle is interpolated; above the last, two
+# terms of its series are good to a millionth
+_KNOWN = np.linspace(0.0, 40.0, 4001)
+
+
+@cache
+def _angle_errors():
+    from scipy.special import ndtr
+
+    # of the angle in (q, u) beyond twelve standard deviations is nothing
+    nodes, weights = np.polynomial.legendre.leggauss(100)
+    half = np.minimum(np.pi, 12 / np.maximum(_KNOWN, 1))[:, None] / 2
+    angle, snr = half * (nodes + 1), _KNOWN[:, None]
+    along, across = snr * np.cos(angle), snr * np.sin(angle)
+    density = np.exp(-(snr**2) / 2) / np.pi
+    density = density + np.sqrt(2 / np.pi) * along * np.exp(-(across**2) / 2) * ndtr(along)
+    return np.rad2deg(np.sqrt((density * angle**2 * half) @ weights)) / 2
 
 
 def _signal_to_noise(dolp, sigma):

@@ -11,6 +11,7 @@ from scipy.special import erf
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.stokes import (
+    angle_error,
     aolp_interval,
     debias_dolp,
     polarization_angle,
@@ -20,7 +21,7 @@ from astropolcal.stokes import (
 
 def test_arguments_broadcast():
     q = np.full((3, 1), 0.01)
-    assert np.shape(polarization_errors(q, [0.0, 0.02], 1e-3, 1e-3)) == (3, 3, 2)
+    assert np.shape(polarization_errors(q, [0.0, 0.02], 1e-3, 1e-3)) == (2, 3, 2)
     assert debias_dolp(q, [1e-3, 2e-3]).shape == (3, 2)
     assert aolp_interval(q, [1e-3, 2e-3]).shape == (3, 2)
 
@@ -40,7 +41,8 @@ def test_first_order_errors_against_monte_carlo():
             chi = np.rad2deg(np.arctan2(sample[:, 1], sample[:, 0]) - np.arctan2(u_, q)) / 2
             chi = (chi + 90) % 180 - 90
             arguments = (q, u_, sigma_q, sigma_u, covariance)
-            found = polarization_errors(*arguments)[:2]
+            along, across = polarization_errors(*arguments)
+            found = along, np.rad2deg(across / (2 * np.hypot(q, u_)))
             assert found == pytest.approx((p.std(), chi.std()), rel=rel), angle
 
 
@@ -67,8 +69,9 @@ def test_errors_follow_the_derivatives(q, u_, sigma_q, sigma_u, correlation):
     def angle(a, b):
         return np.rad2deg(np.unwrap([np.arctan2(u_, q), np.arctan2(b, a)])[1] / 2)
 
-    errors = polarization_errors(q, u_, sigma_q, sigma_u, covariance)
-    for function, found in zip((np.hypot, angle), errors, strict=False):
+    along, across = polarization_errors(q, u_, sigma_q, sigma_u, covariance)
+    turn = np.rad2deg(across / (2 * np.hypot(q, u_)))
+    for function, found in ((np.hypot, along), (angle, turn)):
         gradient = slope(function)
         assert found == pytest.approx(np.sqrt(gradient @ matrix @ gradient), rel=1e-3)
 
@@ -79,13 +82,13 @@ def test_the_papers_accuracy_equations():
     q, u_ = abs(p * np.cos(2 * chi)), abs(p * np.sin(2 * chi))
     s_p = np.sqrt((q**2 * s_q**2 + u_**2 * s_u**2) / (q**2 + u_**2))
     s_chi = np.sqrt(q**2 * s_u**2 + u_**2 * s_q**2) / (2 * (q**2 + u_**2))
-    found = polarization_errors(q, u_, s_q, s_u)[:2]
-    assert found == pytest.approx((s_p, np.rad2deg(s_chi)), rel=1e-14)
+    along, across = polarization_errors(q, u_, s_q, s_u)
+    assert (along, across / (2 * p)) == pytest.approx((s_p, s_chi), rel=1e-14)
 
 
 def test_the_two_errors_share_the_variance():
     # along and across are an orthogonal pair, so the trace is kept
-    along, _, across = polarization_errors(0.01, -0.03, 2e-3, 1e-3, 1e-6)
+    along, across = polarization_errors(0.01, -0.03, 2e-3, 1e-3, 1e-6)
     assert along**2 + across**2 == pytest.approx(5e-6, rel=1e-12)
 
 
@@ -132,7 +135,7 @@ def test_debiasing_with_unequal_errors():
     q = rng.normal(truth[0], 1e-3, 200_000)
     u_ = rng.normal(truth[1], 3e-3, 200_000)
     raw = np.hypot(q, u_)
-    estimate = debias_dolp(raw, polarization_errors(q, u_, 1e-3, 3e-3)[2])
+    estimate = debias_dolp(raw, polarization_errors(q, u_, 1e-3, 3e-3)[1])
     assert abs(estimate.mean() - 0.01) < 0.2 * abs(raw.mean() - 0.01)
 
 
@@ -168,6 +171,19 @@ def test_the_interval_holds_its_probability():
             assert held == pytest.approx(probability, abs=1e-9), (snr, probability)
 
 
+def test_the_error_of_an_angle_at_any_signal():
+    """The rms over all angles, at most that of uniform ones."""
+    for snr in (0.0, 0.3, 1.0, 3.333, 12.0, 30.0):
+        edge = min(np.pi / 2, 6 / max(snr, 1e-9))
+        square, _ = quad(lambda x, s=snr: x**2 * angular_density(x, s), 0, edge, epsabs=1e-14)
+        found = angle_error(0.01 * snr, 0.01)
+        assert found == pytest.approx(np.rad2deg(np.sqrt(2 * square)), rel=1e-5), snr
+    for snr in (39.999, 40.001, 1e4):
+        series = np.rad2deg(0.5 / snr) * (1 + 0.5 / snr**2)
+        assert angle_error(snr, 1.0) == pytest.approx(series, rel=1e-5), snr
+    assert angle_error([0.0, 0.1], [0.1, 0.0]) == pytest.approx([90 / np.sqrt(3), 0.0])
+
+
 def test_the_interval_against_monte_carlo():
     rng = np.random.default_rng(11)
     q, u_ = rng.normal(1.3, 1, 100_000), rng.normal(0, 1, 100_000)
@@ -180,7 +196,7 @@ def test_the_interval_at_the_ends():
     assert aolp_interval(0.0, 0.1, 0.5).to_value(u.deg) == pytest.approx(45, rel=1e-12)
     assert aolp_interval(0.1, 0.0).value == 0
     # first order once the ratio is high; 0.6827 is one standard deviation
-    _, first, _ = polarization_errors(0.1, 0.0, 1e-5, 1e-5)
+    first = np.rad2deg(1e-5 / 0.2)
     assert aolp_interval(0.1, 1e-5).to_value(u.deg) / first == pytest.approx(1.0, abs=1e-4)
     with pytest.raises(ParameterError, match="angle"):
         aolp_interval(0.0, 0.0)

@@ -17,8 +17,15 @@ from astropolcal.units import canonical_factor, mjd_of, wavelengths_of
 
 __all__ = []
 
-# columns of I and of Q and U, to which an error of the model is independent or in proportion
-_INTENSITY, _LINEAR = (0,), (1, 2)
+# how q and u err, each in proportion to I, or to q and u; and both with the degree or the angle
+_APART = np.eye(6).reshape(6, 2, 3)[[0, 3]]
+_SHARE = np.eye(6).reshape(6, 2, 3)[[1, 2, 4, 5]]
+_ALONG, _ACROSS = np.array([[0, 1, 0], [0, 0, 1]]), np.array([[0, 0, -1], [0, 1, 0]])
+# by the keys of ``model_error``, percent
+_ERRORS = {"relative_percent": _SHARE, "absolute_percent": _APART}
+_ERRORS |= {f"sign_{key}": patterns for key, patterns in _ERRORS.items()}
+_ERRORS |= {"held_along_percent": [_ALONG], "held_across_percent": [_ACROSS]}
+_ERRORS |= {"held_absolute_percent": _APART}
 
 
 class Rows:
@@ -139,16 +146,14 @@ def model_error(fit, lam, n=3):
     own = np.array(known.get("wavelength_nm", ()), dtype=float) / 1e3
     order = np.argsort(own)
     directions = []
-    both = (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY))
-    for key, columns in (*both, *((f"sign_{key}", columns) for key, columns in both)):
+    for key, patterns in _ERRORS.items():
         if key not in known:
             continue
-        values = np.asarray(known[key], dtype=float)[order] / 100
-        for row in _LINEAR:
-            for column in columns:
-                direction = np.zeros((len(lam), n, n))
-                direction[:, row, column] = np.interp(lam, own[order], values)
-                directions.append(direction)
+        values = np.interp(lam, own[order], np.asarray(known[key], dtype=float)[order] / 100)
+        for pattern in patterns:
+            direction = np.zeros((len(lam), n, n))
+            direction[:, 1:3, :3] = values[:, None, None] * pattern
+            directions.append(direction)
     return np.reshape(directions, (-1, len(lam), n, n))
 
 

@@ -14,7 +14,12 @@ from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.star import measured_star, stated_star, without_star
 from astropolcal.exceptions import AstropolcalWarning, ParameterError
-from astropolcal.stokes import debias_dolp, polarization_angle, polarization_errors
+from astropolcal.stokes import (
+    angle_error,
+    debias_dolp,
+    polarization_angle,
+    polarization_errors,
+)
 from astropolcal.words import check_choice
 
 __all__ = ["Corrected"]
@@ -183,7 +188,7 @@ class Corrected:
         dict of str to `~numpy.ndarray`
             ``dolp``, ``dolp_debiased`` (where statistical errors are known), ``aolp`` in degree
             from north through east, and for each kind of error ``s_p_...`` and ``s_chi_...`` (in
-            degree).
+            degree, at most 52, where any angle is as likely; infinite where it is open).
         """
         kinds = {kind: self.fractional_errors(kind) for kind in _KINDS}
         return polarization(self.q, self.u, kinds)
@@ -467,19 +472,21 @@ def polarization(q, u, errors):
         "aolp": np.where(dolp > 0, polarization_angle(q, u), np.nan),
     }
     for kind, error in errors.items():
-        s_p, s_chi, across = _errors(q, u, dolp, error)
-        result[f"s_p_{kind}"], result[f"s_chi_{kind}"] = s_p, s_chi
-        if kind == "statistical":
-            known = np.isfinite(across) & np.isfinite(dolp)
+        s_p, across = _errors(q, u, dolp, error)
+        # what is open stays so
+        s_chi, known, is_noise = across.copy(), np.isfinite(across + dolp), kind == "statistical"
+        if is_noise:
             result["dolp_debiased"][known] = debias_dolp(dolp[known], across[known])
+        s_chi[known] = angle_error(dolp[known], across[known], is_measured=is_noise)
+        result[f"s_p_{kind}"], result[f"s_chi_{kind}"] = s_p, s_chi
     return result
 
 
 def _errors(q, u, dolp, error):
-    """Return error of the degree, of the angle, and across the direction of polarization."""
+    """Return the errors along and across the direction of polarization."""
     s_q, s_u = error["q"], error["u"]
     is_open = np.isinf(s_q) | np.isinf(s_u)
-    found = np.full((3, *dolp.shape), np.nan)
+    found = np.full((2, *dolp.shape), np.nan)
     found[:, is_open & (dolp > 0)] = np.inf
     good = (dolp > 0) & np.isfinite(s_q) & np.isfinite(s_u)
     if good.any():

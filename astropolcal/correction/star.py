@@ -19,7 +19,7 @@ import numpy as np
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.stokes import polarization_angle
+from astropolcal.stokes import angle_error, polarization_angle
 from astropolcal.units import angle_to_rad, to_unit
 
 __all__ = []
@@ -173,6 +173,9 @@ def star_words(table):
         name: np.hypot(*(np.nan_to_num(middle[f"{name}_{kind}"], posinf=np.inf) for kind in _KINDS))
         for name in ("s_p", "s_chi")
     }
+    if np.isfinite(errors["s_chi"]):
+        # both together tell no less than nothing
+        errors["s_chi"] = min(errors["s_chi"], angle_error(0.0, 1.0))
     # of q and u: angles near 0 and 180 deg are neighbours
     angle = polarization_angle(middle["q"], middle["u"])
     exact = "" if errors["s_p"] or errors["s_chi"] else ", taken as exact"

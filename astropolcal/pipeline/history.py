@@ -19,7 +19,7 @@ magnitude and averaged over, in units of the error of one run (Zellner's g-prior
 """
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,7 +38,8 @@ from astropolcal.calibration.fit.evidence import (
     log_evidence,
 )
 from astropolcal.calibration.identifiability.sky import known_instrument
-from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
+from astropolcal.calibration.validation.targets import keep_sky_accuracy, target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
@@ -641,7 +642,8 @@ def restart(calibration, observations, free, *, chain=None, **options):
     Returns
     -------
     Calibration
-        With the errors of what was refitted; those of what was held are not in it.
+        With the errors of what was refitted as if what was held were exact. In the accuracy on sky
+        are those of both, as errors of degree and angle.
         ``settings["restarted"]`` holds the hash of the old one and what was free.
 
     Raises
@@ -689,7 +691,51 @@ def restart(calibration, observations, free, *, chain=None, **options):
     open_ = [n for n in known if n in table and n not in fitted and "open" in known[n]["status"]]
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     new.settings["restarted"] |= {"open": open_} if open_ else {}
+    if held := _errors_of_held(old, set(known) - fitted):
+        missing = {"missing": ["relative", "absolute"]}
+        new.fit["model_error"] = (new.fit.get("model_error") or missing) | held
+        keep_sky_accuracy(new)
     return new
+
+
+def _errors_of_held(old, held):
+    """Return what the errors of held parameters do on sky, for ``model_error`` of the fit.
+
+    As errors of the degree, across it, and of q and u in proportion to the intensity. What was open
+    then is left out.
+    """
+    chains, whole = [chain.copy() for chain in old.chains], full_covariance(old)
+    for name, parameters in parameter_table(chains).items():
+        for parameter in parameters if name not in held else ():
+            parameter.fixed = True
+    kept = [i for i, name in enumerate(whole.names) if name.partition("[")[0] in held]
+    # one that was restarted has held others
+    before = {k: x for k, x in (old.fit.get("model_error") or {}).items() if k.startswith("held_")}
+    grid = {"wavelength_nm": old.wavelength.to_value(u.nm).tolist()}
+    if not kept:
+        return before and before | grid
+    parts = {key: getattr(whole, key) for key in ("factor", "null")}
+    covariance = Covariance(
+        *([of[i] for i in kept] for of in (whole.names, whole.units)),
+        whole.matrix[np.ix_(kept, kept)],
+        **{key: rows[:, kept] for key, rows in parts.items() if rows is not None},
+    )
+    ties = {name: tie for name, tie in old.ties.items() if tie.source in held}
+    fit = {key: old.fit[key] for key in ("sky_settings",) if key in old.fit}
+    part = replace(old, chains=chains, covariance=covariance, ties=ties, fit=fit)
+    tables = target_accuracies(part, [(1.0, None), (0.0, None)], open_directions="ignore")
+    if not tables:
+        return {}
+    (s_p, turn), (absolute, _) = (
+        (table["s_p"].to_value(u.one), table["s_chi"].to_value(u.rad)) for table in tables
+    )
+    sizes = {"along": s_p**2 - absolute**2, "across": 4 * turn**2 - absolute**2}
+    found = {}
+    for key, square in (sizes | {"absolute": absolute**2}).items():
+        key = f"held_{key}_percent"
+        square = 1e4 * np.nan_to_num(square).clip(0) + np.square(before.get(key, 0.0))
+        found[key] = np.sqrt(square).tolist()
+    return found | grid
 
 
 def _new_chains(old, datasets, instrument, chain):

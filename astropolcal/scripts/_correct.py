@@ -87,8 +87,6 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 """
 # share of the light in the aperture that the edge of the images may have on its area
 _MOST_SKY = 0.01
-# signal to noise of a degree of polarization above which the error of its angle holds
-_CLEAR = 3.0
 # by more standard errors calibrations of the same optics differ
 _MOVED = 5.0
 # degrees by which a derotator may miss the law of what it is said to keep
@@ -467,14 +465,6 @@ def _words(summary, systematic, arguments):
     lines.append(f"  star within {star['radius']:g} pixels, median over the wavelengths:")
     found, accuracy, lost = _polarization(star, is_open)
     lines += found
-    # an error to first order, of an angle that hardly any light has
-    known = star["s_p_statistical"] > 0
-    if 2 * (star["dolp"] < _CLEAR * star["s_p_statistical"])[known].sum() > known.sum():
-        line = (
-            f"the degree is below {_CLEAR:g} statistical errors: the statistical error of the "
-            "angle is then too small"
-        )
-        lines.append(common.wrapped(f"    {line}", indent=6))
     if held := summary.get("held"):
         line = f"  without error, as not free in the calibration: {', '.join(held)}"
         lines.append(common.wrapped(line, indent=4))

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from astropolcal import calibrate, instruments
+from astropolcal.calibration import target_accuracies
 from astropolcal.chain import leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import (
@@ -244,6 +245,26 @@ def test_restart_frees_what_is_named_and_holds_the_rest(years):
     assert new.converged
 
 
+@pytest.mark.slow
+def test_what_is_held_errs_on_sky_as_before(years, tmp_path):
+    """The orientation of the lamp's polarizer is nothing to the sky."""
+    targets = [(p * u.percent, None) for p in (30, 1, 0.1)]
+    # an error of the model is that of the data, which are others
+    fit_of_old = {key: x for key, x in years[0].fit.items() if key != "model_error"}
+    old = target_accuracies(dataclasses.replace(years[0], fit=fit_of_old), targets)
+    new, lamp = years[0], "calibration_polarizer.theta"
+    for seed in (7, 8):
+        new = restart(new, observe(seed, "2026-03-01"), [lamp], cross_validate=False)
+        new.fit["model_error"] |= {"relative_percent": [0.0] * 3, "absolute_percent": [0.0] * 3}
+        for before, after in zip(old, target_accuracies(new, targets), strict=True):
+            for key in ("s_p", "s_chi"):
+                assert np.all(before[key] > 0)
+                np.testing.assert_allclose(after[key], before[key], rtol=0.3)
+            assert "those of what was held" in after.meta["words"]
+    new.write(tmp_path / "new.asdf")
+    assert type(new).read(tmp_path / "new.asdf").fit["model_error"] == new.fit["model_error"]
+
+
 def test_what_was_open_is_not_known_because_it_is_held():
     wavelength = CHARIS.wavelength[::8]
     chain = CHARIS.chain(wavelength=wavelength)
@@ -263,7 +284,7 @@ def test_what_was_open_is_not_known_because_it_is_held():
     for free in ("hwp.theta", "wollaston"):
         found = restart(old, new, [free], cross_validate=False).verdict()
         assert found.usable, free
-        assert found.cautions == ["errors of what is held are not in these"]
+        assert found.cautions == ["errors of parameters lack those of what is held"]
 
 
 def test_change_about_a_restart_is_said_to_be_unsure(years):

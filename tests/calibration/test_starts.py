@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.models import Polynomial1D
 from astropy.table import QTable
 from scipy.optimize import brentq, least_squares
 
@@ -11,7 +12,7 @@ from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration.fit.branches import BinProblem, search_branches
 from astropolcal.calibration.noise.weighting import Weighting
-from astropolcal.chain import insert_optic, join
+from astropolcal.chain import follow, insert_optic, join
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -333,6 +334,57 @@ def test_a_thickness_off_by_little_ends_in_no_other_minimum():
         found = calibrate(chain, table, cross_validate=False)
         measurement = found.live_measurement()
         assert np.sqrt(np.mean(measurement.residuals() ** 2)) < 1e-3, i
+
+
+@pytest.mark.slow
+def test_a_steep_law_of_wavelength_is_found_from_a_flat_start():
+    wavelength, middle = np.linspace(1.2, 2.2, 8) * u.um, 1.7
+    still = (
+        optics.LinearPolarizer(name="polarizer", fixed={"theta": False})
+        | optics.LinearRetarder(retardance=172 * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(
+            retardance=160 * u.deg, mount="derotator", name="derotator", fixed={"retardance": False}
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[45, 60, 90, 120] * u.deg)
+    for slope, bend in ((-73, 0), (99, 0), (76, 0), (-90, 4), (134, -11)):
+        chain = follow(still, "derotator.retardance", Polynomial1D(1 + bool(bend)), "wavelength")
+        truth = chain.copy()
+        # 180 deg in the middle of the band
+        constant = 180 - slope * middle - bend * middle**2
+        truth["derotator"].retardance = constant * u.deg
+        truth["derotator"].retardance_c1 = slope * u.deg / u.um
+        if bend:
+            truth["derotator"].retardance_c2 = bend * u.deg / u.um**2
+        data = simulate(truth, wavelength, frames, flux=1e6, seed=1)
+        cal = calibrate(chain, data, cross_validate=False)
+        assert np.sqrt(np.mean(cal.residuals**2)) < 1.5e-3, (slope, bend)
+
+
+@pytest.mark.slow
+def test_a_sign_of_one_of_three_wavelengths_that_a_wrong_plate_liked():
+    """The plates of the start have less than half a wave at 2150 nm, the true ones more."""
+    wavelength = [1.25, 1.6, 2.15] * u.um
+    start = instruments.get("charis").chain(wavelength=wavelength)
+    start["hwp"].theta.fixed = start["derotator"].theta.fixed = True
+    truth = start.copy()
+    truth["calibration_polarizer"].theta = 90.3 * u.deg
+    truth["hwp"].w_sio2, truth["hwp"].w_mgf2 = 1.653 * u.mm, 1.291 * u.mm
+    truth["derotator"].horizontal = [-205, -92, -57] * u.deg
+    truth["derotator"].diagonal, truth["derotator"].circular = [-4] * 3 * u.deg, [3] * 3 * u.deg
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100, 120] * u.deg)
+    # the last does not tell which
+    for flux, seed, named in ((1e8, 1, False), (1e7, 0, False), (1e6, 1, True)):
+        data = simulate(truth, wavelength, frames, flux=flux, seed=seed)
+        cal = calibrate(start, data, cross_validate=False)
+        words = "derotator.horizontal at 2150.0 nm: with the other sign"
+        assert any(words in mirror for mirror in cal.identifiability.mirrors) == named, flux
+        known = cal.parameter_values()
+        if not named:
+            off = known["derotator.horizontal"]["value"] - [-205, -92, -57]
+            assert np.abs(off).max() < 0.1, flux
+            assert abs(known["hwp.w_sio2"]["value"] - 1.653) < 3 * known["hwp.w_sio2"]["std"], flux
 
 
 def test_a_wavelength_of_half_a_wave_keeps_the_branch_of_its_neighbours():

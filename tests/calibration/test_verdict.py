@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling import models
 from astropy.table import QTable
 from star_data import observe_star, star_chain
 
@@ -17,6 +18,7 @@ from astropolcal import Calibration, Observations, calibrate, instruments, optic
 from astropolcal.calibration.result import verdict as verdicts
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
+from astropolcal.chain import follow
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -260,6 +262,27 @@ def test_errors_that_say_that_nothing_is_known():
         (_entry([1.0, 1.0, 1.0], 100.0, u.deg, **wide), []),
     ):
         assert verdicts._absurd({"a.b": entry}) == words
+
+
+def test_the_constant_of_a_law_far_from_its_frames():
+    """A law is known to 0.01 deg at all wavelengths, and to 30 deg where these are zero."""
+    wavelength = np.linspace(1.2, 2.2, 14) * u.um
+    still = (
+        optics.LinearPolarizer(name="polarizer", fixed={"theta": False})
+        | optics.LinearRetarder(retardance=172 * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(
+            retardance=95 * u.deg, mount="derotator", name="derotator", fixed={"retardance": False}
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    chain = follow(still, "derotator.retardance", models.Polynomial1D(5), "wavelength")
+    truth = chain.copy()
+    truth["derotator"].retardance, truth["derotator"].retardance_c1 = 40 * u.deg, 35 * u.deg / u.um
+    frames = half_wave_plate_cycles(derotator=[40, 70, 100, 130] * u.deg)
+    observations = simulate(truth, wavelength, frames, flux=1e6, seed=1)
+    cal = calibrate(chain, observations, cross_validate=False)
+    assert cal.covariance.std("derotator.retardance") > 10 * u.deg
+    assert cal.verdict().reasons == []
 
 
 def test_orientations_that_hang_on_a_bound():

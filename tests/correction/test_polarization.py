@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.correction.result import fractions, polarization
-from astropolcal.stokes import debias_dolp
+from astropolcal.stokes import angle_error, debias_dolp
 
 STOKES = np.array([1000.0, 30.0, -40.0, 15.0])
 
@@ -102,7 +102,8 @@ def test_errors_along_and_across(angle, s_q, s_u, rho):
     along, across = np.diag(turn @ c @ turn.T)
     assert found["dolp"][0] == pytest.approx(p)
     assert found["s_p_kind"][0] == pytest.approx(np.sqrt(along), rel=1e-6)
-    assert found["s_chi_kind"][0] == pytest.approx(np.rad2deg(np.sqrt(across) / (2 * p)), rel=1e-6)
+    turn = angle_error(p, np.sqrt(across))
+    assert found["s_chi_kind"][0] == pytest.approx(turn, rel=1e-6)
     off = (found["aolp"][0] - angle + 90) % 180 - 90
     assert off == pytest.approx(0, abs=1e-6)
 
@@ -117,6 +118,18 @@ def test_bias_is_removed_by_the_statistical_error_only():
     assert np.all(found["dolp_debiased"] < found["dolp"])
     only = polarization(q, u, {"systematic": kinds["systematic"]})
     assert np.isnan(only["dolp_debiased"]).all()
+
+
+def test_error_of_an_angle_in_noise():
+    """As many angles are within the stated errors as of normal ones, or more."""
+    rng = np.random.default_rng(2)
+    for snr in (1.0, 2.0, 3.0, 6.0):
+        q, u = rng.normal(snr, 1, 20_000), rng.normal(0, 1, 20_000)
+        found = polarization(q, u, {"statistical": errors(*np.ones((2, q.size)), np.zeros(q.size))})
+        off, stated = (found["aolp"] + 90) % 180 - 90, found["s_chi_statistical"]
+        assert 0.67 < np.mean(np.abs(off) < stated) < 0.77, snr
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(np.median(stated), rel=0.07), snr
+        assert stated[found["dolp"] < 1] == pytest.approx(90 / np.sqrt(3)), snr
 
 
 def test_nothing_polarized_has_no_angle():

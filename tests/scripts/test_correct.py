@@ -538,11 +538,6 @@ def test_report_has_units():
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
         assert verdict == (told if is_open else "Usable"), (systematic, words)
         assert lines[-1] == "Written:    o.fits", (systematic, words)
-    # first-order errors of an angle are too small where there is hardly any signal
-    for error, told in ((0.0032, False), (0.0034, True), (np.nan, False)):
-        faint = aperture | {"s_p_statistical": np.array([error])}
-        lines = _correct._words(summary | {"aperture": faint}, None, SimpleNamespace(**outputs))
-        assert ("below 3 statistical errors: the" in " ".join(lines)) == told, error
     # wavelengths at which the aperture has no value are not usable, whatever the frames determine
     summary["wavelength_nm"] = [1200.0, 1600.0]
     for q, told in (

@@ -16,6 +16,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.sky import mean_errors, seen_with
 from astropolcal.calibration.noise.weighting import Problem
+from astropolcal.chain import leaves
 from astropolcal.progress import steps
 
 __all__ = []
@@ -23,6 +24,8 @@ __all__ = []
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4
 CLEARLY_BETTER = 0.99
+# a branch may be so many times worse before all are fitted again, and of a few wavelengths
+FAR_WORSE, _ABSURD = 30.0, 1e3
 # phases of which the sign hangs on the hand of an optic, and those of an elliptical retarder
 _LINEAR, _ELLIPTICAL = "retardance", ("horizontal", "diagonal", "circular")
 # what else has a sign that data may not tell
@@ -47,6 +50,9 @@ _LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
 _WHOLE_TURN = 1.99 * np.pi
 # starts whose sums of squares differ by less are the same
 _APART = 1.001
+# a fit of everything that is not better after so many evaluations, or gains less than a share in a
+# step, is given up
+GLANCE, GAIN = 15, 1e-4
 # so many steps tell which signs may be the best, and of so many more are taken
 _GLIMPSE, _PROMISING = 2, 4
 # a sign is told by the data if chi-square, in units of the residuals, differs by more
@@ -318,8 +324,9 @@ def undecided_signs(measurement, view, stds):
     Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
 
     These are phases, and diattenuations, of which the other sign, all else of the wavelength
-    refitted, is less than three standard deviations worse, or better. Phases that fit exactly as
-    well are a mirror solution anyway; what is zero within three of its ``stds`` has no sign.
+    refitted, and of a few wavelengths everything, is less than three standard deviations worse, or
+    better. Phases that fit exactly as well are a mirror solution anyway; what is zero within three
+    of its ``stds`` has no sign.
     With them the mean squares of the errors of q and u that the other signs would be on sky, times
     their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
     zero where the phases beside tell the sign.
@@ -339,6 +346,7 @@ def undecided_signs(measurement, view, stds):
         if row in phases:
             trial = problem.turned(trial, places, np.zeros(places.shape))
         trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()))
+        others = _refitted(problem, vector, costs, trial, new)
         moved = np.abs(trial[places] - vector[places])
         if row in phases:
             moved = np.abs(np.remainder(moved + np.pi, 2 * np.pi) - np.pi)
@@ -361,11 +369,28 @@ def undecided_signs(measurement, view, stds):
             found.append({"words": words, "sky": None})
         beside = _between(measurement.wavelength, vector[places])
         open_ = close & ~(4 * np.abs(vector[places] - beside) < np.abs(trial[places] - beside))
-        if view is not None and open_.any():
-            other = seen_with(view, measurement.put_back(trial))
-            chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
-            errors = np.maximum(errors, chance * mean_errors(view, other))
+        chance = np.where(open_, 1 / (1 + np.exp(np.where(open_, lost, 0.0) / 2)), 0.0)
+        shares = [(chance[i], one) for i, one in others.items()]
+        chance[[*others]] = 0.0
+        for share, there in ((chance, trial), *shares):
+            if view is not None and np.any(share > 0):
+                other = seen_with(view, measurement.put_back(there))
+                errors = np.maximum(errors, share * mean_errors(view, other))
     return found, errors
+
+
+def _refitted(problem, vector, costs, trial, new):
+    """Fit everything from other signs of a few wavelengths; return the vectors by wavelength.
+
+    What ``trial`` and its costs ``new`` have there are those of the fit.
+    """
+    found, total = {}, np.sum(problem.residuals(vector) ** 2)
+    for i, start in _one_by_one(problem, vector, costs, trial, new):
+        found[i] = problem.fit(start, evaluations=GLANCE, gain=GAIN)[0]
+        trial[problem.elements[:, i]] = found[i][problem.elements[:, i]]
+        rise = (np.sum(problem.residuals(found[i]) ** 2) - total) / 2
+        new[i] = max(costs[i] + rise, ROUNDED * costs[i])
+    return found
 
 
 def bent_valleys(measurement, whitened, stds):
@@ -414,28 +439,30 @@ def bent_valleys(measurement, whitened, stds):
 
 
 def other_laws(problem, vector, origin):
-    """Return sums of squares and starts with other thicknesses of each optic, best first.
+    """Return sums of squares and starts with other thicknesses or slopes of laws, best first.
 
-    A phase that is a law of a thickness has minima of its own, as one of a bin has. Thicknesses are
-    tried around those of ``origin``, beside the other common parameters of ``vector``, with each
-    bin roughly in its best valley, and in that of the origin.
+    A phase that is a law, of a thickness or with coefficients, has minima of its own, as one of a
+    bin has. Thicknesses are tried around those of ``origin``, beside the other common parameters of
+    ``vector``, with each bin roughly in its best valley, and in that of the origin; so are
+    coefficients, with the constant moved so that the data change least.
     """
-    slots = [
-        slot
-        for slot in problem.measurement.free.slots
-        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m)
-    ]
     slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
     low, high = problem.measurement.free.bounds()
-    base = vector.copy()
-    for slot in slots:
+    base, ways = vector.copy(), {}
+    for slot, constant in _law_slots(problem.measurement):
         base[slot.start] = origin[slot.start]
-    for slot in {slot.name.partition(".")[0]: slot for slot in reversed(slots)}.values():
-        size = np.sqrt(np.mean(slopes[:, slot.start] ** 2))
+        way = np.zeros(vector.size)
+        way[slot.start] = 1.0
+        if constant is not None:
+            base[constant.start] = origin[constant.start]
+            own, of = slopes[:, slot.start], slopes[:, constant.start]
+            way[constant.start] = -(own @ of) / max(of @ of, np.finfo(float).tiny)
+        ways.setdefault(slot.name.partition(".")[0] if constant is None else slot.name, way)
+    for way in ways.values():
+        size = np.sqrt(np.mean((slopes @ way) ** 2))
         for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
-            start = base.copy()
-            start[slot.start] += k * _LAW_STEP / size
-            if low[slot.start] <= start[slot.start] <= high[slot.start]:
+            start = base + k * _LAW_STEP / size * way
+            if np.all((low <= start) & (start <= high)):
                 start[problem.elements] = origin[problem.elements]
                 found.append(problem.polish(start, _ROUGH))
                 for row, *bounds in problem.main_retardances():
@@ -444,6 +471,44 @@ def other_laws(problem, vector, origin):
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def _law_slots(measurement):
+    """Yield thicknesses, and coefficients of laws that are phases with the slots of constants."""
+    by_name = measurement.free.by_name
+    for slot in measurement.free.slots:
+        if not slot.per_wavelength and slot.unit is not None and slot.unit.is_equivalent(u.m):
+            yield slot, None
+    for leaf in (leaf for chain in measurement.chains for leaf in leaves(chain)):
+        for key, law in leaf._follows.items() if leaf.name else ():
+            constant = by_name.get(f"{leaf.name}.{key}")
+            if constant is None or constant.per_wavelength or key not in (_LINEAR, *_ELLIPTICAL):
+                continue
+            names = (f"{leaf.name}.{name}" for name in law.names(key))
+            yield from ((by_name[name], constant) for name in names if name in by_name)
+
+
+def other_signs(problem, vector):
+    """Return starts in which one of a few wavelengths is in another branch."""
+    costs, found = problem.costs(vector), []
+    for branch in problem.branches(vector)[1:] if problem.n_bins <= COARSE else ():
+        found += [
+            start for _, start in _one_by_one(problem, vector, costs, *problem.polish(branch))
+        ]
+    return found
+
+
+def _one_by_one(problem, vector, costs, other, new):
+    """Yield the number of each of a few wavelengths, and vectors that have it as another one has.
+
+    Only where that is not as good and not far worse. Common parameters that are held make the
+    branch dear that they were not fitted to, and so few wavelengths have no neighbours that tell.
+    """
+    few = problem.n_bins <= COARSE
+    for i in np.flatnonzero(few & (_APART * costs < new) & (new < _ABSURD * costs)):
+        start = vector.copy()
+        start[problem.elements[:, i]] = other[problem.elements[:, i]]
+        yield i, start
 
 
 def other_axes(problem, vector, origin):

@@ -18,6 +18,9 @@ from astropy.utils.exceptions import AstropyWarning
 from astropolcal.calibration.fit.branches import (
     CLEARLY_BETTER,
     COARSE,
+    FAR_WORSE,
+    GAIN,
+    GLANCE,
     ROUNDED,
     BinProblem,
     best_signs,
@@ -26,6 +29,7 @@ from astropolcal.calibration.fit.branches import (
     mirrored,
     other_axes,
     other_laws,
+    other_signs,
     search_branches,
 )
 from astropolcal.calibration.noise.estimates import (
@@ -50,16 +54,15 @@ from astropolcal.progress import stage
 
 __all__ = []
 
-# a branch may be so many times worse before all are fitted again; equal but for rounding
-_FAR_WORSE, _SAME = 30.0, 1e-9
+# equal but for rounding
+_SAME = 1e-9
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
-# nor is one tried that leaves so many times as much before everything is fitted, or is not better
-# after so many evaluations, or where steps gain less than a share
-_HOPELESS, _GLANCE, _GAIN = 100.0, 15, 1e-4
+# nor is one tried that leaves so many times as much before everything is fitted
+_HOPELESS = 100.0
 # of so many signs not all combinations are tried; sums of squares of the same minimum, and of what
 # may lead to a better one, over that of the best
 _MANY_SIGNS, _SAME_MINIMUM, _MAY_LEAD = 8, 1.001, 2.0
@@ -153,7 +156,7 @@ def outside_bounds(measurement):
 
 
 def joint(measurement, weighting, fitter, search, options=None):
-    """Fit everything, from other axes, too, and where residuals stand out from other laws.
+    """Fit everything; again from other axes, signs and, where residuals stand out, laws.
 
     With ``options`` of the measurement what only stars see is fitted by itself first.
     """
@@ -168,17 +171,28 @@ def joint(measurement, weighting, fitter, search, options=None):
     if stands_out(measurement):
         laws = other_laws(problem, found, origin)[:_STARTS]
         starts += [(start, _BETTER) for told, start in laws if told <= _HOPELESS * least]
+    best = _from_others(measurement, weighting, best, problem, starts, how)
+    best = _behind_mirrors(measurement, best, how)
+    problem = BinProblem(*few_frames(measurement, best[1]))
+    signs = [(start, CLEARLY_BETTER) for start in other_signs(problem, measurement.vector())]
+    return _from_others(measurement, best[1], best, problem, signs, how)
+
+
+def _from_others(measurement, weighting, best, problem, starts, how):
+    """Fit again from starts that lead to less than a share of the sum of squares, one for each."""
+    found = measurement.vector()
+    least = np.sum(problem.residuals(found) ** 2)
     for start, better in starts:
         # most starts lead to the minimum that is known, or crawl towards one that is no better:
         # a few steps of everything tell
-        start = problem.fit(start, evaluations=_GLANCE, gain=_GAIN)[0]
+        start = problem.fit(start, evaluations=GLANCE, gain=GAIN)[0]
         known = problem.costs(found)
         if np.allclose(problem.costs(start), known, rtol=1 - CLEARLY_BETTER, atol=0):
             # of no wavelength it is clearly better or worse: it is the minimum that is known
             continue
-        start, moved = search_branches(problem, start, origin)
+        start, moved = search_branches(problem, start, how[-1])
         if moved.any():
-            start = problem.fit(start, evaluations=_GLANCE, gain=_GAIN)[0]
+            start = problem.fit(start, evaluations=GLANCE, gain=GAIN)[0]
         if np.sum(problem.residuals(start) ** 2) >= better * least:
             continue
         measurement.stand_at(start)
@@ -189,7 +203,7 @@ def joint(measurement, weighting, fitter, search, options=None):
             if not stands_out(measurement):
                 break
     measurement.stand_at(found)
-    return _behind_mirrors(measurement, best, how)
+    return best
 
 
 def _behind_mirrors(measurement, best, how):
@@ -206,7 +220,7 @@ def _behind_mirrors(measurement, best, how):
         # where a fit leads, wavelengths may have other signs again
         for _ in range(2):
             start = best_signs(problem, start, phases)
-            start = problem.fit(start, evaluations=2 * _GLANCE, gain=_GAIN)[0]
+            start = problem.fit(start, evaluations=2 * GLANCE, gain=GAIN)[0]
             left = np.sum(problem.residuals(start) ** 2)
             if not _SAME_MINIMUM < left / least < _MAY_LEAD:
                 break
@@ -304,7 +318,7 @@ def _smoothed(measurement, weighting, fitter, outcome, origin):
     equal = np.abs(ratio - 1) < _SAME
     # beside few wavelengths only what is as good
     good = np.exp(_AS_GOOD / problem._present.sum(axis=1).clip(1))
-    told = ratio < (_FAR_WORSE if problem.n_bins > COARSE else good)
+    told = ratio < (FAR_WORSE if problem.n_bins > COARSE else good)
     for allowed in (told | equal, equal):
         chosen = least_bent(problem, branches, np.where(allowed, ratio, np.inf), origin)
         measurement.stand_at(problem.in_line(np.array(branches)[chosen], origin))

@@ -105,13 +105,10 @@ def verdict(calibration, targets=TARGETS):
         if any("[" not in lead for lead in leads) or len(leads) > many
     }
     # what must be wrong with the set-up or its description comes before what is not known
-    wrong = [
-        _nothing(calibration),
-        _angles(calibration, free),
-        *_mirrors(calibration, known),
-        _misfit(calibration),
-    ]
-    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), _hanging(free)]
+    wrong = [_nothing(calibration), _angles(calibration, free)]
+    wrong += [*_mirrors(calibration, known), _misfit(calibration)]
+    unknown = [*_absurd(_without_laws(calibration, free)), _open_words(sky)]
+    unknown += [*_too_far(bright, sky), _hanging(free)]
     held = calibration.settings.get("restarted", {}).get("open")
     unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
     unknown += [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
@@ -131,7 +128,7 @@ def verdict(calibration, targets=TARGETS):
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         if "restarted" in calibration.settings:
-            cautions.append("errors of what is held are not in these")
+            cautions.append("errors of parameters lack those of what is held")
         cautions += _of_one_table(calibration)
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
@@ -276,6 +273,13 @@ def _suspected(calibration):
     if calibration.fit.get("outliers"):
         return "wrong frames?"
     return "why" if calibration.settings.get("observable") == "intensity" else "beams exchanged?"
+
+
+def _without_laws(calibration, free):
+    """Leave out the constants of laws: they are where inputs are zero, far from all frames."""
+    trains = map(leaves, calibration.chains)
+    laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
+    return {name: entry for name, entry in free.items() if name not in laws}
 
 
 def _absurd(free):

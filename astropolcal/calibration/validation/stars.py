@@ -128,9 +128,8 @@ def _table(wavelength, found):
     debiased[known] = stokes.debias_dolp(dolp[known], spread[known])
     add_percent(table, dolp=debiased, dolp_err=spread)
     table["aolp"] = stokes.polarization_angle(*mean) * u.deg
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
-        table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
+    table["aolp_err"] = np.full(dolp.shape, np.nan) * u.deg
+    table["aolp_err"][known] = stokes.angle_error(dolp[known], spread[known], True) * u.deg
     table["n_cycles"] = count
     add_percent(table, q_cycles=found[0], u_cycles=found[1])
     return table
@@ -388,9 +387,10 @@ def _add_known(table, q, stokes_u, covariance):
         # and its error of the angle ends in the division by zero below
         pair = np.where(length > 0, [q, stokes_u], [[1.0], [0.0]])
         (qq, qu), (_, uu) = np.broadcast_to(covariance, (length.size, 2, 2)).transpose(1, 2, 0)
-        along, _, across = polarization_errors(*pair, np.sqrt(qq), np.sqrt(uu), qu)
+        along, across = polarization_errors(*pair, np.sqrt(qq), np.sqrt(uu), qu)
     add_percent(table, dolp_known_err=along)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # as the catalogue states it, which made the error across of it in this way
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
 

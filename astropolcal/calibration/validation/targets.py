@@ -27,6 +27,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import columns
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
+from astropolcal.stokes import angle_error
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
 
@@ -65,6 +66,10 @@ def _errors_on_sky(calibration, view, targets, ignore):
             lost &= known <= limit
         if not ignore:
             variance[lost | (is_open > limit)] = np.inf
+        # of the angle what is true of a faint target, too; what is open stays so
+        turn = np.split(variance, len(KEYS), axis=-1)[-1]
+        known = np.isfinite(turn) & (dolp > 0)
+        turn[known] = np.deg2rad(angle_error(dolp, 2 * dolp * np.sqrt(turn[known]))) ** 2
         variance[~view.good] = np.nan
         with np.errstate(invalid="ignore", divide="ignore"):
             rms = np.sqrt(np.nansum(variance, axis=1) / np.where(count, count, np.nan))
@@ -144,7 +149,9 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
 
     Notes
     -----
-    It is linear error propagation: above some 30 deg the angle is simply unknown.
+    The errors of *q*, *u* and the degree are to first order. That of the angle is the rms of the
+    angles that errors of *q* and *u* make of the target if they are equal and independent: without
+    polarization, where any angle is as likely, it would be 52 deg.
 
     Examples
     --------
@@ -199,6 +206,7 @@ def _of_model(calibration):
     words = "without an error of the model" if len(none) == len(_OF_SOURCES) else words
     # where the data leave two signs of a retardance open
     signs = np.count_nonzero((known or {}).get("sign_relative_percent", ()))
+    words += ", and those of what was held" if "held_absolute_percent" in (known or {}) else ""
     return words + (f", with signs that nothing tells at {signs} wavelengths" if signs else "")
 
 
