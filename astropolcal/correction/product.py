@@ -83,6 +83,8 @@ def _header(corrected):
     if corrected.star is not None:
         header["STARSUB"] = (corrected.star.meta["star"], "light of the star subtracted")
         header["HISTORY"] = f"polarization of the star, subtracted: {star_words(corrected.star)}"
+    for words in corrected.provenance.get("calibration_faults", []):
+        header["HISTORY"] = f"the calibration is not usable as it is: {_printable(words)}"
     for word in corrected.provenance.get("held", []):
         header["HISTORY"] = f"not free in the calibration, without error: {_printable(word)}"
     for i, words in enumerate(corrected.weak):

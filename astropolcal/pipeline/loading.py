@@ -41,6 +41,7 @@ from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,
     describe,
+    faults_of,
     inner_optics,
     telescope_optics,
     told_beam,
@@ -205,7 +206,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Warns
     -----
     AstropolcalWarning
-        If the calibration is older than ``max_age``.
+        If the calibration is not usable as its verdict says, differs from the one before or after
+        it in the library by more than the errors of both, or is older than ``max_age``.
 
     Examples
     --------
@@ -235,6 +237,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
         library = Library(path)
     wanted = wanted_of(header, instrument, mode=mode, date=date, optics_in=optics_in)
     entry = library.find(**wanted)
+    faults_of(entry.calibration, entry.name)
+    library._warn_of_change(entry)
     stated = {"instrument": instrument, "mode": mode, "date": date}
     stated = {key: value for key, value in stated.items() if value is not None}
     loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)

@@ -427,15 +427,6 @@ def calibrated_instrument(calibration, path, name):
     return instrument
 
 
-def faults_of(calibration, name):
-    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
-    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
-    if faults:
-        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
-    return faults
-
-
 def write_calibration(calibration, arguments, content):
     """Write calibration, figures and what ``content()`` returns as asked for; say so in lines."""
     figures, kept = [], ["Not kept: -o cal.asdf writes the calibration to a file"]

@@ -91,8 +91,6 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 _MOST_SKY = 0.01
 # signal to noise of a degree of polarization above which the error of its angle holds
 _CLEAR = 3.0
-# by more standard errors calibrations of the same optics differ
-_MOVED = 5.0
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
 # options that `correct` calls the same
@@ -162,7 +160,6 @@ def work(arguments):
     files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
-    faults = common.faults_of(calibration, provenance["calibration"])
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
@@ -213,7 +210,7 @@ def work(arguments):
         from astropolcal.plotting.correction import plot_corrected
 
         save(plot_corrected(result), arguments.plot, ObservationError)
-    summary = _summary(result, star, arguments, len(files)) | {"calibration_faults": faults}
+    summary = _summary(result, star, arguments, len(files))
     common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
@@ -309,10 +306,8 @@ def choose_calibration(arguments, files):
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
-        entry, others = _of_library(path, arguments, night, beam, files)
-        path = entry.path
+        path = _of_library(path, arguments, night, beam, files)
         calibration, digest = _read(path)
-        _warn_of_change(calibration, entry.name, others)
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
     moments = [(file, date, mode) for file, date in night.moments.items()]
@@ -343,7 +338,7 @@ def _library(path, changed):
 
 
 def _of_library(path, arguments, night, beam, files):
-    """Return the calibration that holds for the first and the last frame, and those beside it."""
+    """Return the path of the calibration that holds for the first and the last frame."""
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
@@ -362,28 +357,8 @@ def _of_library(path, arguments, night, beam, files):
             f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
             f"{found[0].path} and {found[1].path}: correct them apart"
         )
-    return found[0], library._beside(found[0])
-
-
-def _warn_of_change(calibration, name, others):
-    """Warn where the calibrations before and after it differ by more than the errors of both."""
-    from astropolcal.calibration.result.comparison import moved
-
-    told = []
-    for other in others:
-        optics = {}
-        if np.array_equal(other.calibration.wavelength, calibration.wavelength):
-            optics = moved(calibration, other.calibration)
-        by, most = optics.pop("", 0.0), max(optics, key=optics.get, default=None)
-        if by > _MOVED:
-            told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
-    if told:
-        warnings.warn(
-            f"{name} differs from {' and '.join(told)} standard errors: what changes from one "
-            "calibration to the next is not in the errors (astropolcal health says what changed)",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
+    library._warn_of_change(found[0])
+    return found[0].path
 
 
 # ---- the product ----------------------------------------------------------------------------
@@ -440,6 +415,7 @@ def _summary(result, star, arguments, n_frames):
         "output": str(arguments.output),
         "calibration": result.provenance["calibration"],
         "calibration_hash": result.provenance["calibration_hash"],
+        "calibration_faults": result.provenance["calibration_faults"],
         "mode": result.mode,
         "observable": result.observable,
         "components": result.components,

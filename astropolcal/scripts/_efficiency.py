@@ -87,6 +87,7 @@ def run(arguments):
 def _chains(arguments):
     """Return instrument, chains, that from the sky first, wavelengths and frames."""
     from astropolcal import Calibration
+    from astropolcal.pipeline.headers import faults_of
 
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
@@ -95,7 +96,7 @@ def _chains(arguments):
     calibration = Calibration.read(arguments.file)
     grid = calibration.wavelength
     instrument = common.calibrated_instrument(calibration, arguments.file, arguments.instrument)
-    common.faults_of(calibration, arguments.file)
+    faults_of(calibration, arguments.file)
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
     chains[0] = _on_sky(instrument, chains[0], grid, arguments)
