@@ -318,6 +318,14 @@ def numbers(text, count=None, separator=","):
     return found
 
 
+def _angles(text, count=None):
+    """Return the angles of a text; beyond two turns, which no encoder counts, is a slip."""
+    found = numbers(text, count)
+    if np.abs(found).max() > 720:
+        raise ValueError(f"{text!r} is no angle")
+    return found
+
+
 def text_type(words, read, *arguments):
     """Return the type of an option: what ``read`` makes of a text, which else is not ``words``."""
 
@@ -354,7 +362,10 @@ def number_or(*words, kind=float):
 
 
 _NUMBERS = {float: lambda text: numbers(text, 1)[0], int: partial(plain_number, kind=int)}
-_TYPES = {"angles": text_type("a list of angles in degree", numbers)}
+_TYPES = {
+    "angle": text_type("an angle from -720 to 720 deg", lambda text: _angles(text, 1)[0]),
+    "angles": text_type("a list of angles from -720 to 720 deg", _angles),
+}
 _TYPES["float"] = text_type("a finite number", _NUMBERS[float])
 _TYPES["int"] = text_type("a whole number", _NUMBERS[int])
 _TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Drawing, Folder)}

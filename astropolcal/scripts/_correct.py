@@ -67,7 +67,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --size PIXELS int =51  width of the images of the product (default: 51)
 --rotation {none,fixed,pupil} =none  how the field turned: not known, images stay as they are
     (default); the +y axis at a fixed position angle; at a fixed angle from the zenith
---camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
+--camera-angle DEG angle  position angle of the +y axis, or with --rotation pupil that from the
     zenith (default: 0)
 --mirrored  east is to the right of north
 --subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
