@@ -93,6 +93,8 @@ _MOST_SKY = 0.01
 _CLEAR = 3.0
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
+# pixels by which images may move before their sum is smeared
+_MOST_MOVED = 1.0
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -184,6 +186,8 @@ def work(arguments):
         date=None,
         mode=calibration.validity.mode,
     )
+    if arguments.rotation == "none":
+        _warn_of_turns(table, instrument.sky_law, arguments.size)
     result = correct(
         calibration,
         frames,
@@ -379,21 +383,50 @@ def _position_angles(table, arguments):
 def _warn_of_rotation(table, rotation, law):
     """Warn where the derotator held fixed what --rotation says to have turned."""
     kept = {"fixed": ("field", "pupil"), "pupil": ("pupil", "field")}.get(rotation, ())
-    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
-    if not (kept and known and set(kept) <= set(law.derotator)):
+    turns = [_turns(table, law, what) for what in kept]
+    if not turns or any(each is None for each in turns):
         return
-    off = []
-    for f, g in map(law.derotator_law, kept):
-        # half a turn is none
-        twice = 2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"])
-        turns = np.exp(1j * twice.to_value(u.rad))
-        off.append(np.degrees(np.abs(np.angle(turns / turns.sum())).max()) / 2)
+    off = [np.abs(each).max() / 2 for each in turns]
     if off[0] > _OFF_LAW and off[0] > 3 * off[1]:
         others = {"field": "fixed", "pupil": "pupil"}
         warnings.warn(
             f"--rotation {rotation}: the derotator is up to {off[0]:.1f} deg off the law by which "
             f"it keeps the {kept[0]}, and {off[1]:.1f} deg off that by which it keeps the "
             f"{kept[1]} (--rotation {others[kept[1]]}): images may be turned wrongly",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
+
+
+def _turns(table, law, kept):
+    """Return by how much the derotator turned what it keeps, from the mean; None if not known."""
+    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
+    if not known or kept not in law.derotator:
+        return None
+    f, g = law.derotator_law(kept)
+    # the image turns by twice its angle, so that half a turn is none
+    return _from_mean(2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"]))
+
+
+def _from_mean(angles):
+    turns = np.exp(1j * angles.to_value(u.rad))
+    return np.degrees(np.angle(turns / turns.sum()))
+
+
+def _warn_of_turns(table, law, size):
+    """Warn where the field turned from frame to frame, and images are summed as they are."""
+    turns = _turns(table, law, "field")
+    if turns is None and "parallactic" in table.colnames:
+        # as --rotation pupil has it: nothing else turns the field
+        turns = _from_mean(table["parallactic"])
+    apart = 0.0 if turns is None else np.ptp(turns)
+    # of the pixels at the edge
+    moved = np.radians(apart) * size / 2
+    if moved > _MOST_MOVED:
+        warnings.warn(
+            f"--rotation none: the field turned by up to {apart:.1f} deg between frames, "
+            f"{moved:.2g} pixels at the edge of the images, which are summed as they are: what is "
+            "not round about the star is smeared; --rotation fixed or pupil turn them north up",
             AstropolcalWarning,
             stacklevel=2,
         )
