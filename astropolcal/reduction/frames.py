@@ -34,6 +34,7 @@ from astropolcal.reduction.headers import (
     not_of_instrument,
     observation_time,
     raw_frames,
+    raw_may_tell,
     read_header,
     tracking_error,
 )
@@ -422,23 +423,27 @@ def read_night(files, instrument):
     return Night(moments, dates, next(iter(modes), None), beam)
 
 
-def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
+def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=None):
     """Return angles of all frames, places of the star, exposures, and detectors of both beams.
 
     The places are None where the star is in the middle of each beam.
 
-    ``raw`` is a folder of raw frames, ``centre`` the place of the star where it is known. ``ways``
-    are what a user can do about a file that lacks ``"raw"`` or ``"centre"``, to be said.
+    ``raw`` is a folder of raw frames, ``centre`` the place of the star where it is known,
+    ``exposed`` whether a file without an exposure time is refused. ``ways`` are what a user can do
+    about a file that lacks ``"raw"``, ``"centre"`` or an ``"exposure"``, to be said.
     """
-    ways = {"raw": "", "centre": ""} | (ways or {})
+    ways = {"raw": "", "centre": "", "exposure": ""} | (ways or {})
     known = None if raw is None else raw_frames(raw, layout)
     found = _survey(files, layout, known, centre is None and not layout.centred)
     for file, frame in zip(files, found, strict=True):
         foreign = not_of_instrument(frame.values, layout)
         if foreign:
             raise ObservationError(f"{file}: {foreign}")
+        if exposed and "exposure_time" not in frame.values:
+            word = layout.keywords.get("exposure_time", "exposure_time")
+            raise ObservationError(f"{file}: no keyword {word} in its header{ways['exposure']}")
         if frame.errors:
-            way = ways["raw"] if raw is None and layout.raw_columns else ""
+            way = ways["raw"] if raw is None and raw_may_tell(frame.errors, layout) else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
     _check_one_target(files, found)
     if centre is None and not layout.centred:

@@ -28,7 +28,13 @@ from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
-from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
+from astropolcal.reduction.headers import (
+    check_sequence,
+    configured,
+    raw_frames,
+    raw_may_tell,
+    sort_beams,
+)
 from astropolcal.reduction.tables import photometry_table, reduced_table
 from astropolcal.version import version
 from astropolcal.words import check_choice, counted
@@ -373,10 +379,8 @@ def _nothing(count, task, problems):
     first, *rest = (f"{path}: {'; '.join(why)}" for path, why in problems.items())
     more = f" (and {len(rest)} more)" if rest else ""
     none = "the file cannot be used" if count == 1 else f"none of the {count} files can be used"
-    known = map(task["layout"].keywords.get, task["layout"].raw_columns)
-    lacking = tuple(f"no keyword {keyword} " for keyword in known if keyword)
-    every = (why for reasons in problems.values() for why in reasons)
-    if task["raw"] is None and any(why.startswith(lacking) for why in every):
+    every = [why for reasons in problems.values() for why in reasons]
+    if task["raw"] is None and raw_may_tell(every, task["layout"]):
         more += "; give the folder of the raw frames, which may have them (raw, --raw DIR)"
     return f"{none}: {first}{more}"
 

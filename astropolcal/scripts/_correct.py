@@ -93,8 +93,8 @@ _MOST_SKY = 0.01
 _CLEAR = 3.0
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
-# pixels by which images may move before their sum is smeared
-_MOST_MOVED = 1.0
+# pixels by which images may move: about half the width of a star, which smears little
+_MOST_MOVED = 2.0
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -112,6 +112,7 @@ _WAYS = {
     "mode": "--filter {}",
     "other date": "; --any-date takes it all the same",
     "raw": "; --raw names a folder of raw frames",
+    "exposure": ", which --brightness exposure needs",
     "centre": "; give its place with --centre",
 }
 
@@ -166,7 +167,12 @@ def work(arguments):
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
     table, centres, scale, detectors = survey_frames(
-        files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
+        files,
+        instrument.files,
+        raw=arguments.raw,
+        centre=arguments.centre,
+        exposed=arguments.brightness == "exposure",
+        ways=_WAYS,
     )
     _warn_of_rotation(table, arguments.rotation, instrument.sky_law)
     frames = ScienceFrames.from_files(

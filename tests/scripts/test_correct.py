@@ -358,7 +358,7 @@ CHARIS = instruments.get("charis")
 def told(monkeypatch):
     """Function that returns what is made of headers with these values."""
 
-    def tell(*frames, centre=(70.0, 85.0)):
+    def tell(*frames, centre=(70.0, 85.0), **options):
         files = [f"CRSA{i:08d}_cube.fits" for i in range(len(frames))]
         known = dict(zip(files, frames, strict=True))
         monkeypatch.setattr(
@@ -366,7 +366,7 @@ def told(monkeypatch):
             "_survey",
             lambda *_: [Frame(f, values=dict(known[f]), unit=known[f].get("unit")) for f in files],
         )
-        return survey_frames(files, CHARIS.files, centre=centre)
+        return survey_frames(files, CHARIS.files, centre=centre, **options)
 
     return tell
 
@@ -404,6 +404,9 @@ def test_frames_are_as_bright_as_their_exposures(told):
         frames = [{"hwp": 0.0} | ({} if s is None else {"exposure_time": s}) for s in seconds]
         found = told(*frames)[2]
         assert found is None if scale is None else found.tolist() == scale, (seconds, scale)
+    # where nothing else tells it has to be there
+    with pytest.raises(ObservationError, match=r"01_cube.fits: no keyword EXPTIME in its header"):
+        told({"hwp": 0.0, "exposure_time": 1.0}, {"hwp": 0.0}, {"hwp": 0.0}, exposed=True)
 
 
 def test_rates_are_as_bright_at_all_exposures(told):
@@ -454,6 +457,19 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     centres = survey_frames([files[0], files[2]], CHARIS.files)[1]
     # x and y in the right and in the left beam
     assert [c.tolist() for c in centres] == [[[70.0, 85.0]] * 2] * 2
+
+
+def test_raw_frames_are_advised_where_they_may_help(monkeypatch):
+    for error, advised in (
+        ("no keyword D_IMRANG in its header", True),
+        ("no keyword PARANG in its header, and no right_ascension", False),
+        ("no slice can be used: saturated", False),
+    ):
+        frame = Frame("a.fits", errors=[error])
+        monkeypatch.setattr(frame_files, "_survey", lambda *_, frame=frame: [frame])
+        with pytest.raises(ObservationError, match=error) as refused:
+            survey_frames(["a.fits"], CHARIS.files, ways=_WAYS)
+        assert ("--raw" in str(refused.value)) == advised, error
 
 
 def test_copies_and_other_objects_among_science_frames(monkeypatch):
