@@ -38,10 +38,19 @@ from astropolcal.reduction.headers import (
     read_header,
     tracking_error,
 )
-from astropolcal.reduction.photometry import detector_of, evenly_lit, measure_internal
+from astropolcal.reduction.photometry import (
+    detector_of,
+    evenly_lit,
+    measure_internal,
+    outside_share,
+)
 from astropolcal.reduction.stars import measure_stars
 
 __all__ = []
+
+# share of the light inside the beams of a lamp that is worth a word where it is outside them; from
+# the second on the lamp itself fills the field
+_OUTSIDE = (0.01, 0.5)
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -68,7 +77,9 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
                 frame.values["outliers"] = frame.photometry.outliers
                 frame.doubts.append("single pixels far off their neighbours were left out")
             if source == "internal":
-                frame.values["light"] = "even" if evenly_lit(cube, good, layout) else "uneven"
+                even = evenly_lit(cube, good, layout)
+                frame.values["light"] = "even" if even else "uneven"
+                frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
@@ -78,6 +89,21 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
         most = max(set(result.reasons), key=result.reasons.count)
         frame.errors.append(f"no slice can be used: {most}")
     return frame
+
+
+def _background(cube, good, layout, result):
+    """Say that there is light outside the beams of a lamp, which was not subtracted."""
+    flux = result.flux[:, ~result.failed]
+    if not flux.size or result.background.any():
+        return []
+    share = outside_share(cube, good, layout, flux)
+    if not _OUTSIDE[0] <= share < _OUTSIDE[1]:
+        return []
+    return [
+        f"outside the beams there is {100 * share:.2g} % of the light inside, on the same area; "
+        "where it is under the beams, too, they seem less polarized (background='outside', "
+        "--background outside, subtracts it)"
+    ]
 
 
 def _digest(array):

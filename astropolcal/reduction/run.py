@@ -318,7 +318,9 @@ def reduce_run(
     reduction.frames = frames
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
+    wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
     for frame in frames:
+        frame.doubts += wrong
         frame.doubts += masters.doubts(frame.values, settings)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
@@ -454,10 +456,9 @@ def _meta(frames, instrument, source, given):
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
-    modulated = instrument.files.two_beams and "hwp" in instrument.files.stages
     if source != "internal":
         meta["source"] = source
-    elif "source" not in given and modulated and (seen := _seen_source(frames)):
+    elif "source" not in given and (seen := _seen_source(frames, instrument)):
         meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
@@ -472,8 +473,18 @@ def _optics(values, layout):
     return found
 
 
-def _seen_source(frames):
+def _wrong_source(frames, instrument, told):
+    """Say that the fluxes contradict what is stated of an internal source."""
+    seen, stated = _seen_source(frames, instrument), told["source"]
+    if seen is None or {seen, stated} != {"polarized", "unpolarized"}:
+        return []
+    return [f"source {stated!r} is stated, but the fluxes change with the plate as if {seen}"]
+
+
+def _seen_source(frames, instrument):
     """Return whether an internal source is polarized, as far as its fluxes leave no doubt."""
+    if not (instrument.files.two_beams and "hwp" in instrument.files.stages):
+        return None
     angles = {round(frame.values["hwp"], 1) for frame in frames}
     if len(angles) < 4:
         return None
