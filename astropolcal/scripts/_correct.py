@@ -438,18 +438,20 @@ def _warn_of_turns(table, law, size):
         )
 
 
-# names and keys of degree and angle, their unit, its factor and the form of the number
+# names and keys of what is told of a star, its unit, its factor and the form of the number
 _POLARIZATION = (
-    ("DoLP", "degree", "dolp", "s_p", " %", 100, ".2f"),
-    ("AoLP", "angle", "aolp", "s_chi", " deg", 1, ".1f"),
+    ("DoLP", "degree of linear polarization", "dolp", "s_p", " %", 100, ".2f"),
+    ("AoLP", "angle of linear polarization", "aolp", "s_chi", " deg", 1, ".1f"),
+    ("V/I", "circular polarization V / I", "v", "v", " %", 100, ".2f"),
 )
 
 
 def _summary(result, star, arguments, n_frames):
-    spectrum = {"radius": _radius(arguments), "q": star.q, "u": star.u} | star.polarization()
+    spectrum, names = {"radius": _radius(arguments)}, result.components[1:].lower()
+    spectrum |= {name: getattr(star, name) for name in names} | star.polarization()
     for kind in ("statistical", "systematic"):
         error = star.fractional_errors(kind)
-        spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
+        spectrum |= {f"{name}_{kind}": error[name] for name in names}
     summary = {
         "output": str(arguments.output),
         "calibration": result.provenance["calibration"],
@@ -512,7 +514,8 @@ def _words(summary, systematic, arguments):
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n, poor = len(summary["wavelength_nm"]), summary["poorly_determined"]
-    good = sum(bool(np.isfinite(q)) and str(w) not in poor for w, q in enumerate(star["q"]))
+    known = np.isfinite(star["q"]) & np.isfinite(star["u"])
+    good = int(known.sum())
     verdict, advice = "Usable", common.following("info", arguments.output)
     if not good and len(poor) < n:
         verdict = f"NOT USABLE AS IT IS: no light within {star['radius']:g} pixels of the star"
@@ -527,32 +530,39 @@ def _words(summary, systematic, arguments):
         verdict = f"NOT USABLE AS IT IS: the calibration is not: {faults[0]}"
         advice = common.following("info", summary["calibration"])
     elif good < n:
-        what = "poorly determined" if len(poor) == n - good else "without a value"
+        lacking = all(str(w) in poor for w in np.flatnonzero(~known))
+        what = "poorly determined" if lacking else "without a value"
         verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"
     written = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
-    determined = f"{summary['components']} at {good} of {n} wavelengths"
+    determined = f"IQU at {good} of {n} wavelengths"
+    if "v" in star:
+        determined += f", V at {np.isfinite(star['v']).sum()}"
     accuracy = f"{accuracy} (statistical + systematic)"
     ends = common.ending(verdict, accuracy, determined, advice, common.written_lines(written))
     return common.with_ending(lines, ends, arguments.full)
 
 
 def _polarization(star, is_open):
-    """Return degree and angle of a star in lines, and their errors in one; which is open."""
+    """Return what is told of a star in lines, errors of DoLP and AoLP in one; which is open."""
     lines, accuracy, lost = [], [], []
-    for name, word, key, error, unit, scale, form in _POLARIZATION:
+    for name, words, key, error, unit, scale, form in _POLARIZATION:
+        if key not in star:
+            # V is zero, not found to be
+            continue
         shown = _middle(scale * star[key], form, unit, turns=name == "AoLP")
-        lines.append(f"    {word} of linear polarization: {shown}")
+        lines.append(f"    {words}: {shown}")
         errors = []
         for kind, unknown in (("statistical", False), ("systematic", is_open)):
             values = scale * star[f"{error}_{kind}"]
             none = "infinite" if unknown else "not known"
             lines.append(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
-            if unknown and not np.isfinite(values).any():
+            if unknown and key != "v" and not np.isfinite(values).any():
                 lost.append(name)
             none = "open" if name in lost else "unknown"
             errors.append(_middle(values, ".2g", unit, none=none))
         accuracy.append(f"{name} {' + '.join(errors)}")
-    accuracy = ", ".join(accuracy)
+    # of V there is no room in a line
+    accuracy = ", ".join(accuracy[:2])
     if not lost:
         # the unit once: the line is short
         accuracy = accuracy.replace(" % +", " +").replace(" deg +", " +")

@@ -539,7 +539,7 @@ def test_report_has_units():
         aperture = {"radius": 10.0, "dolp": np.array([0.0099]), "aolp": np.array([30.0])}
         aperture |= {"s_p_statistical": np.array([0.0012]), "s_chi_statistical": np.array([2.0])}
         aperture |= {"s_p_systematic": np.array([np.nan]), "s_chi_systematic": np.array([np.inf])}
-        aperture["q"] = np.array([0.005])
+        aperture["q"] = aperture["u"] = np.array([0.005])
         summary = {
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
@@ -567,13 +567,27 @@ def test_report_has_units():
         faint = aperture | {"s_p_statistical": np.array([error])}
         lines = _correct._words(summary | {"aperture": faint}, None, SimpleNamespace(**outputs))
         assert ("below 3 statistical errors: the" in " ".join(lines)) == told, error
+    # of V where it was solved for
+    assert "V" not in " ".join(lines)
+    full = aperture | {"v": np.array([-0.0042]), "v_statistical": np.array([0.0011])}
+    full |= {"v_systematic": np.array([np.nan])}
+    lines = _correct._words(summary | {"aperture": full}, None, SimpleNamespace(**outputs))
+    place = lines.index("    circular polarization V / I: -0.42 %")
+    assert lines[place + 1] == "      statistical error: 0.11 %"
+    # frames that tell all but V are of use
+    summary["poorly_determined"] = {"0": "0.07 U +1.00 V"}
+    full["v"] = np.array([np.nan])
+    lines = _correct._words(summary | {"aperture": full}, None, SimpleNamespace(**outputs))
+    assert lines[lines.index("") + 1] == "Usable"
+    assert "Determined  IQU at 1 of 1 wavelengths, V at 0" in lines
+    summary["poorly_determined"] = {}
     # wavelengths at which the aperture has no value are not usable, whatever the frames determine
     summary["wavelength_nm"] = [1200.0, 1600.0]
     for q, told in (
         ([0.005, np.nan], "Usable: without a value at 1 wavelength"),
         ([np.nan, np.nan], "NOT USABLE AS IT IS: no light within 10 pixels of the star"),
     ):
-        aperture["q"] = np.array(q)
+        aperture["q"] = aperture["u"] = np.array(q)
         lines = _correct._words(summary, None, SimpleNamespace(**outputs))
         assert lines[lines.index("") + 1] == told
         assert f"IQU at {np.isfinite(q).sum()} of 2 wavelengths" in " ".join(lines)
