@@ -283,7 +283,7 @@ class _WholeCubes:
         return mean, variance
 
     def _fluxes(self, beam, i, wavelengths):
-        """Return the fluxes of a file, NaN where pixels are saturated: that is no measurement."""
+        """Return the fluxes of a file, NaN where pixels are saturated: they measure nothing."""
         flux = self._section(beam, i, wavelengths, 0)
         if self._detectors is not None:
             flux[flux >= getattr(self._detectors[i][beam], "saturation", np.inf)] = np.nan

@@ -322,7 +322,7 @@ def _angles(text, count=None):
     """Return the angles of a text; beyond two turns, which no encoder counts, is a slip."""
     found = numbers(text, count)
     if np.abs(found).max() > 720:
-        raise ValueError(f"{text!r} is no angle")
+        raise ValueError(f"{text!r} is not an angle")
     return found
 
 

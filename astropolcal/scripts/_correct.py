@@ -210,6 +210,13 @@ def work(arguments):
     _warn_of_sky(result["I"], star["I"], _radius(arguments))
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
+    _write(result, star, arguments)
+    summary = _summary(result, star, arguments, len(files))
+    common.give(arguments, _words(summary, result.systematic, arguments), summary)
+
+
+def _write(result, star, arguments):
+    """Write the product, the spectrum of the star and the figure."""
     result.write(arguments.output, overwrite=True)
     if arguments.spectrum:
         from astropolcal.observations.reading import write_table
@@ -220,8 +227,6 @@ def work(arguments):
         from astropolcal.plotting.correction import plot_corrected
 
         save(plot_corrected(result), arguments.plot, ObservationError)
-    summary = _summary(result, star, arguments, len(files))
-    common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
 def _sorted(files, instrument):
@@ -438,7 +443,7 @@ def _warn_of_turns(table, law, size):
         )
 
 
-# names and keys of what is told of a star, its unit, its factor and the form of the number
+# names and keys of the polarization of a star, its unit, its factor and the form of the number
 _POLARIZATION = (
     ("DoLP", "degree of linear polarization", "dolp", "s_p", " %", 100, ".2f"),
     ("AoLP", "angle of linear polarization", "aolp", "s_chi", " deg", 1, ".1f"),
@@ -543,7 +548,7 @@ def _words(summary, systematic, arguments):
 
 
 def _polarization(star, is_open):
-    """Return what is told of a star in lines, errors of DoLP and AoLP in one; which is open."""
+    """Return degree and angle of a star in lines, and their errors in one; which is open."""
     lines, accuracy, lost = [], [], []
     for name, words, key, error, unit, scale, form in _POLARIZATION:
         if key not in star:
