@@ -536,6 +536,13 @@ def test_stokes_cubes_that_cannot_be_corrected(loaded):
             loaded.correct(stokes, headers, **options)
     with pytest.raises(ParameterError, match="either header or positions"):
         loaded.correct(cube)
+    # true angles of the plate are not those by which a pipeline takes differences
+    sky = {"parallactic": [-30, -30] * u.deg, "altitude": [55, 55] * u.deg}
+    positions = {"hwp": [40, 62.5] * u.deg, "derotator": [60, 60] * u.deg} | sky
+    with pytest.raises(ParameterError, match=r"hwp = None: .* the commanded angles are needed"):
+        loaded.correct(cube, positions=positions)
+    loaded.correct(cube, positions=positions, hwp=[0, 22.5] * u.deg)
+    loaded.correct(cube, positions=positions, light="internal")
 
 
 def test_masked_pixels_of_a_cube_and_positions_of_other_frames_give_no_numbers(loaded):
