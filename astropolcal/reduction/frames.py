@@ -45,9 +45,11 @@ from astropolcal.reduction.photometry import (
     outside_share,
 )
 from astropolcal.reduction.stars import measure_stars
+from astropolcal.words import counted
 
 __all__ = []
 
+_SINGLE = "single pixels far off their neighbours were left out"
 # share of the light inside the beams of a lamp that is worth a word where it is outside them; from
 # the second on the lamp itself fills the field
 _OUTSIDE = (0.01, 0.5)
@@ -75,7 +77,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             frame.photometry = measure(cube, good, detector, layout, **(options or {}))
             if frame.photometry.outliers:
                 frame.values["outliers"] = frame.photometry.outliers
-                frame.doubts.append("single pixels far off their neighbours were left out")
+                frame.doubts.append(_SINGLE)
             if source == "internal":
                 even = evenly_lit(cube, good, layout)
                 frame.values["light"] = "even" if even else "uneven"
@@ -472,6 +474,7 @@ def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=N
             way = ways["raw"] if raw is None and raw_may_tell(frame.errors, layout) else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
     _check_one_target(files, found)
+    _warn_of_doubts(files, found)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
         centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
@@ -502,6 +505,23 @@ def _brightness(files, frames, detectors):
     number = np.array([frame.values.get("exposures", 1.0) for frame in frames])
     scale = exposure * number / [right.gain for right, _ in detectors]
     return scale / np.median(scale) if np.ptp(scale) > 1e-6 * scale.max() else None
+
+
+def _warn_of_doubts(files, frames):
+    """Warn of what is odd about frames whose images are used as they are."""
+    odd = {}
+    for file, frame in zip(files, frames, strict=True):
+        for words in frame.doubts:
+            odd.setdefault(words, []).append(file)
+    for words, of in odd.items():
+        # only the photometry of the star leaves them out
+        used = "single pixels far off their neighbours, as a cosmic ray makes them, change q and u"
+        words = f"{used}; mask them (NaN)" if words == _SINGLE else words
+        warnings.warn(
+            f"{counted(len(of), 'file')}: {words}; the first is {of[0]}",
+            AstropolcalWarning,
+            stacklevel=4,
+        )
 
 
 def _check_one_target(files, frames):

@@ -472,6 +472,24 @@ def test_raw_frames_are_advised_where_they_may_help(monkeypatch):
         assert ("--raw" in str(refused.value)) == advised, error
 
 
+def test_what_is_odd_about_science_frames_is_told(monkeypatch, tmp_path):
+    """A pixel that the photometry of the star leaves out is in the images that are corrected."""
+    frames = half_wave_plate_cycles([0, 22.5] * u.deg, [60] * u.deg)
+    frames["parallactic"], frames["altitude"] = [20, 20] * u.deg, [70, 70] * u.deg
+    simulate_cubes(
+        tmp_path, CHARIS.on_sky(CHARIS.published()), CHARIS, frames, source="star",
+        stokes=(1, 0, 0, 0), flux=1e6, detector=DetectorModel(noise=False),
+        files=CubeFiles(raw=False),
+    )  # fmt: skip
+    paths = sorted(tmp_path.glob("*.fits"))
+    survey_frames(paths, CHARIS.files)
+    with fits.open(paths[1], mode="update") as hdus:
+        hdus[1].data[3, 124, 133] += 2e4
+    with pytest.warns(AstropolcalWarning, match="1 file: single pixels .* change q and u") as told:
+        survey_frames(paths, CHARIS.files)
+    assert paths[1].name in str(told[0].message)
+
+
 def test_copies_and_other_objects_among_science_frames(monkeypatch):
     def told(*frames):
         found = [Frame(f"{i}.fits", unit="adu", **one) for i, one in enumerate(frames)]
