@@ -575,6 +575,8 @@ def best_modulation(chain, wavelength, frames, free, *, components="IQUV", seed=
     """
     from scipy.optimize import minimize
 
+    # refuses what is no table
+    beams_of_frames(chain, frames, None)
     chain, frames, rng = chain.copy(), frames.copy(), np.random.default_rng(check_seed(seed))
     settings = [_setting(chain, frames, name) for name in free]
     sizes = np.cumsum([value.size for value, *_ in settings])[:-1]

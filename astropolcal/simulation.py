@@ -138,10 +138,6 @@ def simulate(
         raise ParameterError(
             f"wavelength = {wavelength}: values per wavelength are those of ascending wavelengths"
         )
-    wanted = "a table is needed, such as half_wave_plate_cycles() gives"
-    check_type("frames", frames, Table, wanted, ParameterError)
-    if not len(frames):
-        raise ParameterError("frames is a table without rows; at least one frame is needed")
     # for unit source, (n_wavelengths, n_frames)
     names, frames, lamp = beams_of_frames(chain, frames, lamp)
     fluxes = expected_fluxes(chain, wavelength, frames, source)[: len(names)]
@@ -164,6 +160,10 @@ def simulate(
 
 def beams_of_frames(chain, frames, lamp):
     """Return the columns of the fluxes, and the frames and their lamp, one for each beam."""
+    wanted = "a table is needed, such as half_wave_plate_cycles() gives"
+    check_type("frames", frames, Table, wanted, ParameterError)
+    if not len(frames):
+        raise ParameterError("frames is a table without rows; at least one frame is needed")
     if splits(leaves(chain)):
         return ("flux_right", "flux_left"), frames, lamp
     beams = states_of(chain).get("beam")

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Modulation matrices, optimal demodulation and efficiencies of sequences of frames."""
 
+from functools import partial
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -71,6 +73,10 @@ def test_what_is_not_modulated_is_named():
         demodulation(plate(180), LAM, four[::2], components="IQU")
     with pytest.raises(ChainError, match="stage 'plate'"):
         demodulation(plate(180), LAM, QTable({"polarizer": [0, 45] * u.deg}))
+    for frames in ({"plate": [0, 45] * u.deg}, [0, 45], None):
+        for call in (demodulation, partial(best_modulation, free=["plate"])):
+            with pytest.raises(ParameterError, match=r"frames is of type .*; a table is needed"):
+                call(plate(180), LAM, frames)
     with pytest.raises(ParameterError, match="components = 'IV'; allowed are IQU, IQUV"):
         demodulation(plate(100), LAM, four, components="IV")
     with pytest.raises(ParameterError, match=r"variance of shape \(3,\); 4 numbers above zero"):

@@ -378,6 +378,7 @@ def test_commands_from_simulation_to_a_corrected_star(tmp_path, capsys):
     values = ["--fix", "star.q=0.03", "--fix", "star.u=-0.02", "--derotator", "60"]
     main([*simulate, "--calibration", str(cal), *pointing, *seen, *values])
     ways = ["--any-date", "--open-directions", "ignore", "--size", "31", "-q"]
+    ways += ["--rotation", "pupil"]
     main(["correct", str(star), "--calibration", str(cal), *ways, "-o", str(tmp_path / "s.fits"),
           "--json", str(summary)])  # fmt: skip
     content = json.loads(summary.read_text())

@@ -23,7 +23,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import provenance
 from astropolcal.observations import OBSERVABLES
-from astropolcal.pipeline.headers import check_frames
+from astropolcal.pipeline.headers import check_frames, faults_of
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import counting, shown
 from astropolcal.words import check_choice, check_type
@@ -163,10 +163,11 @@ def correct(
     Warns
     -----
     AstropolcalWarning
-        If the frames have no pairs, or some have none, where pairs are to be fitted; their
-        brightness cannot be measured, or differs at one wavelength from others; variances as
-        weights follow the measured fluxes; combinations of Stokes parameters are poorly determined
-        at some wavelengths; the calibration does not determine how they change; or it is old.
+        If the calibration is not usable, as its verdict says; the frames have no pairs, or some
+        have none, where pairs are to be fitted; their brightness cannot be measured, or differs at
+        one wavelength from others; variances as weights follow the measured fluxes; combinations
+        of Stokes parameters are poorly determined at some wavelengths; the calibration does not
+        determine how they change; or it is old.
 
     Examples
     --------
@@ -186,7 +187,10 @@ def correct(
     """
     by_variance = isinstance(weights, str)
     _check(frames, mode, weights, open_directions, n_samples, seed)
+    provenance = dict(provenance or {})
     if hasattr(calibration, "datasets"):
+        name = provenance.get("calibration", "the calibration")
+        provenance["calibration_faults"] = faults_of(calibration, name)
         chain = _chain_at(calibration, frames, chain, max_age=max_age, dates=not any_date)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
@@ -381,7 +385,7 @@ def _provenance(calibration, frames, systematic, given):
         "held": [] if systematic is None else list(systematic.held),
         "frames": [str(name) for name in frames.names],
     }
-    return provenance() | known | dict(frames.meta) | dict(given or {})
+    return provenance() | known | dict(frames.meta) | given
 
 
 # ---- the sum over frames, in bounded memory ------------------------------------------------------

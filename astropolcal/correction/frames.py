@@ -343,7 +343,8 @@ class ScienceFrames:
             By what the left beam is multiplied, one number or one per frame.
         detectors : sequence of (object, object), optional
             Of the right and left beam in each frame, whose ``variance(pixels)`` gives the variances
-            where the files hold no errors.
+            where the files hold no errors; pixels from ``saturation`` on, if they have one, count
+            as without a value.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 
@@ -460,6 +461,15 @@ def _centres(centres, layout):
             f"centres = {centres.tolist()}: the right beam comes first, about (x, y) = "
             f"{layout.star_offset} from the left one; of 2 frames give both beams"
         )
+    if far:
+        left, right = (np.asarray(xy) - centres[..., 1, :] for xy in layout.internal_apertures[:2])
+        # beyond the image it is refused as such
+        inside = (centres[..., 1, :] < layout.shape[:0:-1]).all(axis=-1)
+        if (inside & (np.hypot(*right.T) < np.hypot(*left.T))).any():
+            raise ParameterError(
+                f"centres = {centres[..., 1, :].tolist()} of the left beam are in the right one; "
+                f"the middle of the left one is at {layout.internal_apertures[0]}"
+            )
     if layout.beam_files:
         # their files are apart; side by side the left image comes first
         centres[..., 0, 0] -= layout.file_shape[2]

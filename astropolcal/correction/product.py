@@ -83,6 +83,8 @@ def _header(corrected):
     if corrected.star is not None:
         header["STARSUB"] = (corrected.star.meta["star"], "light of the star subtracted")
         header["HISTORY"] = f"polarization of the star, subtracted: {star_words(corrected.star)}"
+    if faults := corrected.provenance.get("calibration_faults"):
+        header["CALFAULT"] = _printable("; ".join(faults))
     for word in corrected.provenance.get("held", []):
         header["HISTORY"] = f"not free in the calibration, without error: {_printable(word)}"
     for i, words in enumerate(corrected.weak):
@@ -207,6 +209,8 @@ def _read(hdus):
     provenance = {
         key: header[keyword] for key, (keyword, _) in _KEYWORDS.items() if keyword in header
     }
+    if "CALFAULT" in header:
+        provenance["calibration_faults"] = [_stated(header, "CALFAULT", str)]
     provenance["frames"] = [str(name) for name in _table(hdus["FRAMES"])["frame"]]
     _check(hdus, stokes, codes, table)
     unit = u.Unit(header["BUNIT"])

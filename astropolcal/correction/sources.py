@@ -191,8 +191,9 @@ class _WholeCubes:
     """Cubes of both beams in FITS files, which are opened when they are needed.
 
     Inverse variances or errors (``weights``) may follow the cube's ``extension``, else those of
-    the ``detectors`` count; ``left_scale`` multiplies the left beam. Of ``stacked`` files the
-    first axis are exposures, of which the mean is taken.
+    the ``detectors`` count. Pixels that these call saturated have no value. ``left_scale``
+    multiplies the left beam. Of ``stacked`` files the first axis are exposures, of which the mean
+    is taken.
     """
 
     def __init__(
@@ -263,12 +264,12 @@ class _WholeCubes:
             return self._mean(beam, i)[power - 1]
         if self._has_errors and power == 2:
             return self._squared(self._section(beam, i, wavelengths, 1))
-        flux = self._section(beam, i, wavelengths, 0)
+        flux = self._fluxes(beam, i, wavelengths)
         return flux if power == 1 else self._detectors[i][beam].variance(flux)
 
     def _mean(self, beam, i):
         """Return the mean of the exposures that have a value and an error, and its variance."""
-        flux, variance = self._section(beam, i, slice(None), 0), None
+        flux, variance = self._fluxes(beam, i, slice(None)), None
         good = np.isfinite(flux)
         if self._has_errors:
             variance = self._squared(self._section(beam, i, slice(None), 1))
@@ -280,6 +281,13 @@ class _WholeCubes:
             # the detector is that of a mean of all exposures
             variance = self._detectors[i][beam].variance(mean) * len(flux) / number
         return mean, variance
+
+    def _fluxes(self, beam, i, wavelengths):
+        """Return the fluxes of a file, NaN where pixels are saturated: they measure nothing."""
+        flux = self._section(beam, i, wavelengths, 0)
+        if self._detectors is not None:
+            flux[flux >= getattr(self._detectors[i][beam], "saturation", np.inf)] = np.nan
+        return flux
 
     def _squared(self, known):
         """Return variances of errors or weights: error^2 = 1 / inverse variance."""

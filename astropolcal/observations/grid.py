@@ -331,7 +331,8 @@ def _measured(table, label, beams):
             raise ObservationError(f"{label}: missing column {other}; it has {there[0]}")
         errors += tuple(there)
     # the right beam sets the unit; the left one and the errors are converted
-    values = {name: numeric_column(table, name, label, flux_unit) for name in (*beams, *errors)}
+    how = {"unit": flux_unit, "like": beams[0]}
+    values = {name: numeric_column(table, name, label, **how) for name in (*beams, *errors)}
     for name in errors:
         first_bad_row(values[name] < 0, name, values[name], label, "errors above zero")
     if len(errors) > 2:

@@ -197,8 +197,12 @@ def complete_table(table, label):
     return completed
 
 
-def numeric_column(table, name, label, unit=None):
-    """Return a column of a checked table as floats in ``unit`` (a copy), NaN where it is masked."""
+def numeric_column(table, name, label, unit=None, like=None):
+    """
+    Return a column of a checked table as floats in ``unit`` (a copy), NaN where it is masked.
+
+    ``like`` is the column whose unit that is, if it is that of another one.
+    """
     column = table[name]
     dtype = getattr(column, "dtype", None)
     if dtype is None or dtype.kind not in "iuf":
@@ -211,23 +215,26 @@ def numeric_column(table, name, label, unit=None):
     # a copy, which the caller may change
     values = np.array(data, dtype=float)
     if unit is not None:
-        values = _convert(values, getattr(plain, "unit", None), unit, name, label)
+        values = _convert(values, getattr(plain, "unit", None), unit, name, label, like)
     values[np.broadcast_to(mask, values.shape)] = np.nan
     return values
 
 
-def _convert(values, own, unit, name, label):
+def _convert(values, own, unit, name, label, like):
     example = f"such as {unit}" if unit.to_string() else "that is dimensionless"
+    why = "" if like in (None, name) else f", as {like} has it"
     if own is None:
         if unit == u.dimensionless_unscaled:
             return values
-        raise ObservationError(f"{label}: column {name} has no unit, a unit {example} is needed")
+        raise ObservationError(
+            f"{label}: column {name} has no unit, a unit {example} is needed{why}"
+        )
     try:
         # a factor keeps the numbers untouched where the units agree
         factor = u.Unit(own).to(unit)
     except (u.UnitsError, TypeError, ValueError, AttributeError):
         raise ObservationError(
-            f"{label}: column {name} has unit {one_line(own, 60)}, a unit {example} is needed"
+            f"{label}: column {name} has unit {one_line(own, 60)}, a unit {example} is needed{why}"
         ) from None
     with np.errstate(over="ignore", under="ignore"):
         return values if factor == 1.0 else values * factor

@@ -308,6 +308,15 @@ def date_of(calibration):
     return next((_moment(day, "date") for day in days_of(calibration)), None)
 
 
+def faults_of(calibration, name):
+    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
+    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
+    if faults:
+        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
+        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+    return faults
+
+
 def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", dates=True):
     """Refuse frames for which a calibration does not hold, and warn if it is old for some.
 

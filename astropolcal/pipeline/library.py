@@ -58,6 +58,8 @@ _MOST_BYTES = 16_384
 _SETTLED = 2_000_000_000
 _LONGEST_NAME, _LONGEST_SLUG, _MOST_SHOWN = 255, 60, 4
 _CHOSEN = "chosen: the newest that holds"
+# by more standard errors calibrations of the same optics differ
+_MOVED = 5.0
 # what the index keeps of how good a calibration is
 _QUALITY = {"datasets": str, "s_res": float | None, "s_cv": float | None, "converged": bool}
 
@@ -322,6 +324,28 @@ class Library:
             if _meet(other, newest):
                 raise CalibrationFileError(_overlap(other, newest))
         return newest
+
+    def _warn_of_change(self, chosen):
+        """Warn where the calibrations before and after one differ by more than the errors."""
+        # what compares is not needed to choose
+        from astropolcal.calibration.result.comparison import moved
+
+        calibration, told = chosen.calibration, []
+        for other in self._beside(chosen):
+            optics = {}
+            if np.array_equal(other.calibration.wavelength, calibration.wavelength):
+                optics = moved(calibration, other.calibration)
+            by, most = optics.pop("", 0.0), max(optics, key=optics.get, default=None)
+            if by > _MOVED:
+                told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
+        if told:
+            warnings.warn(
+                f"{chosen.name} differs from {' and '.join(told)} standard errors: what changes "
+                "from one calibration to the next is not in the errors (astropolcal health says "
+                "what changed)",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
 
     def _beside(self, chosen):
         """Return the entries before and after one, of the same instrument, mode and optics."""

@@ -41,6 +41,7 @@ from astropolcal.pipeline.headers import (
     FrameAngles,
     check_frames,
     describe,
+    faults_of,
     inner_optics,
     telescope_optics,
     told_beam,
@@ -205,7 +206,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Warns
     -----
     AstropolcalWarning
-        If the calibration is older than ``max_age``.
+        If the calibration is not usable as its verdict says, differs from the one before or after
+        it in the library by more than the errors of both, or is older than ``max_age``.
 
     Examples
     --------
@@ -235,6 +237,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
         library = Library(path)
     wanted = wanted_of(header, instrument, mode=mode, date=date, optics_in=optics_in)
     entry = library.find(**wanted)
+    faults_of(entry.calibration, entry.name)
+    library._warn_of_change(entry)
     stated = {"instrument": instrument, "mode": mode, "date": date}
     stated = {key: value for key, value in stated.items() if value is not None}
     loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)
@@ -451,7 +455,8 @@ class LoadedCalibration:
         positions : dict of str to `~astropy.units.Quantity`
             In their place the positions of all stages in each frame, as for `system_mueller`.
         hwp : `~astropy.units.Quantity`, optional
-            Commanded angles of the half-wave plate; by default those of the headers or positions.
+            Commanded angles of the half-wave plate; by default those of the headers, or the
+            positions where the plate does not follow the sky.
         difference : {"right-left", "left-right"}
             Of the beams.
         **options
@@ -467,7 +472,8 @@ class LoadedCalibration:
         Raises
         ------
         ParameterError
-            If the cube has another shape, or the angles of the plate do not tell Q and U apart.
+            If the cube has another shape, the angles of the plate do not tell Q and U apart, or
+            the commanded ones are not known.
         """
         # a copy, NaN where it is masked
         given = np.array(to_unit(stokes, getattr(stokes, "unit", None), "stokes"))
@@ -476,6 +482,11 @@ class LoadedCalibration:
         beams = [self.system_mueller(beam=b, **options) for b in ("right", "left")]
         if hwp is None and headers:
             hwp = FrameAngles(headers, self.instrument).position("hwp") * u.rad
+        if hwp is None and options.get("light", "sky") == "sky" and self._plate_follows():
+            raise ParameterError(
+                "hwp = None: the position of the half-wave plate is its true angle, which follows "
+                "the sky; the commanded angles are needed, by which the cube was made"
+            )
         hwp = beams[0].positions["hwp"] if hwp is None else hwp
         size = len(beams[0].wavelength)
         if given.ndim < 2 or given.shape[0] not in (3, 4) or given.shape[1] != size:
@@ -508,6 +519,11 @@ class LoadedCalibration:
         systematic = np.zeros_like(flat)
         systematic[:3] = np.where(is_open, np.inf, spread)
         return flat.reshape(given.shape), systematic.reshape(given.shape)
+
+    def _plate_follows(self):
+        """Return whether the half-wave plate follows the sky, as far as is known."""
+        instrument = self.instrument
+        return instrument is None or any(any(law) for law in instrument.sky_law.plate.values())
 
     def _check(self, frames, light):
         """Refuse frames for which the calibration does not hold."""

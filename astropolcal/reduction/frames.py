@@ -34,13 +34,25 @@ from astropolcal.reduction.headers import (
     not_of_instrument,
     observation_time,
     raw_frames,
+    raw_may_tell,
     read_header,
     tracking_error,
 )
-from astropolcal.reduction.photometry import detector_of, evenly_lit, measure_internal
+from astropolcal.reduction.photometry import (
+    detector_of,
+    evenly_lit,
+    measure_internal,
+    outside_share,
+)
 from astropolcal.reduction.stars import measure_stars
+from astropolcal.words import counted
 
 __all__ = []
+
+_SINGLE = "single pixels far off their neighbours were left out"
+# share of the light inside the beams of a lamp that is worth a word where it is outside them; from
+# the second on the lamp itself fills the field
+_OUTSIDE = (0.01, 0.5)
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -65,9 +77,11 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             frame.photometry = measure(cube, good, detector, layout, **(options or {}))
             if frame.photometry.outliers:
                 frame.values["outliers"] = frame.photometry.outliers
-                frame.doubts.append("single pixels far off their neighbours were left out")
+                frame.doubts.append(_SINGLE)
             if source == "internal":
-                frame.values["light"] = "even" if evenly_lit(cube, good, layout) else "uneven"
+                even = evenly_lit(cube, good, layout)
+                frame.values["light"] = "even" if even else "uneven"
+                frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
@@ -77,6 +91,21 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
         most = max(set(result.reasons), key=result.reasons.count)
         frame.errors.append(f"no slice can be used: {most}")
     return frame
+
+
+def _background(cube, good, layout, result):
+    """Say that there is light outside the beams of a lamp, which was not subtracted."""
+    flux = result.flux[:, ~result.failed]
+    if not flux.size or result.background.any():
+        return []
+    share = outside_share(cube, good, layout, flux)
+    if not _OUTSIDE[0] <= share < _OUTSIDE[1]:
+        return []
+    return [
+        f"outside the beams there is {100 * share:.2g} % of the light inside, on the same area; "
+        "where it is under the beams, too, they seem less polarized (background='outside', "
+        "--background outside, subtracts it)"
+    ]
 
 
 def _digest(array):
@@ -422,25 +451,30 @@ def read_night(files, instrument):
     return Night(moments, dates, next(iter(modes), None), beam)
 
 
-def survey_frames(files, layout, *, raw=None, centre=None, ways=None):
+def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=None):
     """Return angles of all frames, places of the star, exposures, and detectors of both beams.
 
     The places are None where the star is in the middle of each beam.
 
-    ``raw`` is a folder of raw frames, ``centre`` the place of the star where it is known. ``ways``
-    are what a user can do about a file that lacks ``"raw"`` or ``"centre"``, to be said.
+    ``raw`` is a folder of raw frames, ``centre`` the place of the star where it is known,
+    ``exposed`` whether a file without an exposure time is refused. ``ways`` are what a user can do
+    about a file that lacks ``"raw"``, ``"centre"`` or an ``"exposure"``, to be said.
     """
-    ways = {"raw": "", "centre": ""} | (ways or {})
+    ways = {"raw": "", "centre": "", "exposure": ""} | (ways or {})
     known = None if raw is None else raw_frames(raw, layout)
     found = _survey(files, layout, known, centre is None and not layout.centred)
     for file, frame in zip(files, found, strict=True):
         foreign = not_of_instrument(frame.values, layout)
         if foreign:
             raise ObservationError(f"{file}: {foreign}")
+        if exposed and "exposure_time" not in frame.values:
+            word = layout.keywords.get("exposure_time", "exposure_time")
+            raise ObservationError(f"{file}: no keyword {word} in its header{ways['exposure']}")
         if frame.errors:
-            way = ways["raw"] if raw is None and layout.raw_columns else ""
+            way = ways["raw"] if raw is None and raw_may_tell(frame.errors, layout) else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
     _check_one_target(files, found)
+    _warn_of_doubts(files, found)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
         centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
@@ -471,6 +505,23 @@ def _brightness(files, frames, detectors):
     number = np.array([frame.values.get("exposures", 1.0) for frame in frames])
     scale = exposure * number / [right.gain for right, _ in detectors]
     return scale / np.median(scale) if np.ptp(scale) > 1e-6 * scale.max() else None
+
+
+def _warn_of_doubts(files, frames):
+    """Warn of what is odd about frames whose images are used as they are."""
+    odd = {}
+    for file, frame in zip(files, frames, strict=True):
+        for words in frame.doubts:
+            odd.setdefault(words, []).append(file)
+    for words, of in odd.items():
+        # only the photometry of the star leaves them out
+        used = "single pixels far off their neighbours, as a cosmic ray makes them, change q and u"
+        words = f"{used}; mask them (NaN)" if words == _SINGLE else words
+        warnings.warn(
+            f"{counted(len(of), 'file')}: {words}; the first is {of[0]}",
+            AstropolcalWarning,
+            stacklevel=4,
+        )
 
 
 def _check_one_target(files, frames):

@@ -226,6 +226,12 @@ def _compare(frame, column, found, layout):
                 frame.doubts.append(f"{first} and {keyword} differ by more than {most:g} deg")
 
 
+def raw_may_tell(errors, layout):
+    """Return whether a keyword is missing that raw frames may have."""
+    known = map(layout.keywords.get, layout.raw_columns)
+    return any(why.startswith(f"no keyword {word} ") for word in known if word for why in errors)
+
+
 def _half_turn(angle):
     return (angle + 90.0) % 180.0 - 90.0
 

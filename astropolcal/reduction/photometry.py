@@ -346,6 +346,16 @@ def _outside(apertures, shape):
     return clear
 
 
+def outside_share(cube, good, layout, flux):
+    """Return the light outside the beams, on their area, over their mean ``flux``."""
+    clear = _outside(layout.internal_apertures, cube.shape[1:]) & good.all(axis=0)
+    # all slices together; exact zeros are no lenslets
+    image = np.sum(cube, axis=0, dtype=float)[clear] / len(cube)
+    image = image[image != 0.0]
+    *_, width, height, _ = layout.internal_apertures
+    return float(np.median(image) * width * height / np.mean(flux)) if image.size else 0.0
+
+
 def _level(cube, good, detector, layout):
     """Return the median outside the beams, the variance of a pixel, and their number."""
     clear = _outside(layout.internal_apertures, cube.shape[1:])

@@ -28,7 +28,13 @@ from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
 from astropolcal.reduction.frames import Frame, Masters, check_stars, reduce_frame
-from astropolcal.reduction.headers import check_sequence, configured, raw_frames, sort_beams
+from astropolcal.reduction.headers import (
+    check_sequence,
+    configured,
+    raw_frames,
+    raw_may_tell,
+    sort_beams,
+)
 from astropolcal.reduction.tables import photometry_table, reduced_table
 from astropolcal.version import version
 from astropolcal.words import check_choice, counted
@@ -312,7 +318,9 @@ def reduce_run(
     reduction.frames = frames
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
+    wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
     for frame in frames:
+        frame.doubts += wrong
         frame.doubts += masters.doubts(frame.values, settings)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
@@ -373,10 +381,8 @@ def _nothing(count, task, problems):
     first, *rest = (f"{path}: {'; '.join(why)}" for path, why in problems.items())
     more = f" (and {len(rest)} more)" if rest else ""
     none = "the file cannot be used" if count == 1 else f"none of the {count} files can be used"
-    known = map(task["layout"].keywords.get, task["layout"].raw_columns)
-    lacking = tuple(f"no keyword {keyword} " for keyword in known if keyword)
-    every = (why for reasons in problems.values() for why in reasons)
-    if task["raw"] is None and any(why.startswith(lacking) for why in every):
+    every = [why for reasons in problems.values() for why in reasons]
+    if task["raw"] is None and raw_may_tell(every, task["layout"]):
         more += "; give the folder of the raw frames, which may have them (raw, --raw DIR)"
     return f"{none}: {first}{more}"
 
@@ -450,10 +456,9 @@ def _meta(frames, instrument, source, given):
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
-    modulated = instrument.files.two_beams and "hwp" in instrument.files.stages
     if source != "internal":
         meta["source"] = source
-    elif "source" not in given and modulated and (seen := _seen_source(frames)):
+    elif "source" not in given and (seen := _seen_source(frames, instrument)):
         meta |= {"source": seen, "source_from": "the modulation of the fluxes"}
     return meta | dict(given)
 
@@ -468,8 +473,18 @@ def _optics(values, layout):
     return found
 
 
-def _seen_source(frames):
+def _wrong_source(frames, instrument, told):
+    """Say that the fluxes contradict what is stated of an internal source."""
+    seen, stated = _seen_source(frames, instrument), told["source"]
+    if seen is None or {seen, stated} != {"polarized", "unpolarized"}:
+        return []
+    return [f"source {stated!r} is stated, but the fluxes change with the plate as if {seen}"]
+
+
+def _seen_source(frames, instrument):
     """Return whether an internal source is polarized, as far as its fluxes leave no doubt."""
+    if not (instrument.files.two_beams and "hwp" in instrument.files.stages):
+        return None
     angles = {round(frame.values["hwp"], 1) for frame in frames}
     if len(angles) < 4:
         return None

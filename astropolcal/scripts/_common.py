@@ -313,6 +313,14 @@ def numbers(text, count=None, separator=","):
     return found
 
 
+def _angles(text, count=None):
+    """Return the angles of a text; beyond two turns, which no encoder counts, is a slip."""
+    found = numbers(text, count)
+    if np.abs(found).max() > 720:
+        raise ValueError(f"{text!r} is not an angle")
+    return found
+
+
 def text_type(words, read, *arguments):
     """Return the type of an option: what ``read`` makes of a text, which else is not ``words``."""
 
@@ -349,7 +357,10 @@ def number_or(*words, kind=float):
 
 
 _NUMBERS = {float: lambda text: numbers(text, 1)[0], int: partial(plain_number, kind=int)}
-_TYPES = {"angles": text_type("a list of angles in degree", numbers)}
+_TYPES = {
+    "angle": text_type("an angle from -720 to 720 deg", lambda text: _angles(text, 1)[0]),
+    "angles": text_type("a list of angles from -720 to 720 deg", _angles),
+}
 _TYPES["float"] = text_type("a finite number", _NUMBERS[float])
 _TYPES["int"] = text_type("a whole number", _NUMBERS[int])
 _TYPES |= {kind.__name__: kind for kind in (Input, Frames, Output, Continued, Drawing, Folder)}
@@ -415,15 +426,6 @@ def calibrated_instrument(calibration, path, name):
         words = f"the calibration is of instrument {own!r}, not {instrument.name!r}"
         raise InstrumentError(f"{path}: {words}")
     return instrument
-
-
-def faults_of(calibration, name):
-    """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
-    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
-    if faults:
-        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
-        warn(words, stacklevel=3)
-    return faults
 
 
 def write_calibration(calibration, arguments, content):

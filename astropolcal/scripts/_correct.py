@@ -65,7 +65,7 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --size PIXELS int =51  width of the images of the product (default: 51)
 --rotation {none,fixed,pupil} =none  how the field turned: not known, images stay as they are
     (default); the +y axis at a fixed position angle; at a fixed angle from the zenith
---camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
+--camera-angle DEG angle  position angle of the +y axis, or with --rotation pupil that from the
     zenith (default: 0)
 --mirrored  east is to the right of north
 --subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
@@ -87,10 +87,10 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 """
 # share of the light in the aperture that the edge of the images may have on its area
 _MOST_SKY = 0.01
-# by more standard errors calibrations of the same optics differ
-_MOVED = 5.0
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
+# pixels by which images may move: about half the width of a star, which smears little
+_MOST_MOVED = 2.0
 # options that `correct` calls the same
 _PASSED_ON = (
     *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
@@ -108,6 +108,7 @@ _WAYS = {
     "mode": "--filter {}",
     "other date": "; --any-date takes it all the same",
     "raw": "; --raw names a folder of raw frames",
+    "exposure": ", which --brightness exposure needs",
     "centre": "; give its place with --centre",
 }
 
@@ -158,12 +159,16 @@ def work(arguments):
     files = common.cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
-    faults = common.faults_of(calibration, provenance["calibration"])
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
     files, instrument = _sorted(files, instrument)
     table, centres, scale, detectors = survey_frames(
-        files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
+        files,
+        instrument.files,
+        raw=arguments.raw,
+        centre=arguments.centre,
+        exposed=arguments.brightness == "exposure",
+        ways=_WAYS,
     )
     _warn_of_rotation(table, arguments.rotation, instrument.sky_law)
     frames = ScienceFrames.from_files(
@@ -183,6 +188,8 @@ def work(arguments):
         date=None,
         mode=calibration.validity.mode,
     )
+    if arguments.rotation == "none":
+        _warn_of_turns(table, instrument.sky_law, arguments.size)
     result = correct(
         calibration,
         frames,
@@ -199,6 +206,13 @@ def work(arguments):
     _warn_of_sky(result["I"], star["I"], _radius(arguments))
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
+    _write(result, star, arguments)
+    summary = _summary(result, star, arguments, len(files))
+    common.give(arguments, _words(summary, result.systematic, arguments), summary)
+
+
+def _write(result, star, arguments):
+    """Write the product, the spectrum of the star and the figure."""
     result.write(arguments.output, overwrite=True)
     if arguments.spectrum:
         from astropolcal.observations.reading import write_table
@@ -209,8 +223,6 @@ def work(arguments):
         from astropolcal.plotting.correction import plot_corrected
 
         save(plot_corrected(result), arguments.plot, ObservationError)
-    summary = _summary(result, star, arguments, len(files)) | {"calibration_faults": faults}
-    common.give(arguments, _words(summary, result.systematic, arguments), summary)
 
 
 def _sorted(files, instrument):
@@ -303,10 +315,8 @@ def choose_calibration(arguments, files):
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
-        entry, others = _of_library(path, arguments, night, beam, files)
-        path = entry.path
+        path = _of_library(path, arguments, night, beam, files)
         calibration, digest = _read(path)
-        _warn_of_change(calibration, entry.name, others)
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
     moments = [(file, date, mode) for file, date in night.moments.items()]
@@ -337,7 +347,7 @@ def _library(path, changed):
 
 
 def _of_library(path, arguments, night, beam, files):
-    """Return the calibration that holds for the first and the last frame, and those beside it."""
+    """Return the path of the calibration that holds for the first and the last frame."""
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
@@ -356,27 +366,8 @@ def _of_library(path, arguments, night, beam, files):
             f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
             f"{found[0].path} and {found[1].path}: correct them apart"
         )
-    return found[0], library._beside(found[0])
-
-
-def _warn_of_change(calibration, name, others):
-    """Warn where the calibrations before and after it differ by more than the errors of both."""
-    from astropolcal.calibration.result.comparison import moved
-
-    told = []
-    for other in others:
-        optics = {}
-        if np.array_equal(other.calibration.wavelength, calibration.wavelength):
-            optics = moved(calibration, other.calibration)
-        by, most = optics.pop("", 0.0), max(optics, key=optics.get, default=None)
-        if by > _MOVED:
-            told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
-    if told:
-        warn(
-            f"{name} differs from {' and '.join(told)} standard errors: what changes from one "
-            "calibration to the next is not in the errors (astropolcal health says what changed)",
-            stacklevel=3,
-        )
+    library._warn_of_change(found[0])
+    return found[0].path
 
 
 # ---- the product ----------------------------------------------------------------------------
@@ -397,15 +388,10 @@ def _position_angles(table, arguments):
 def _warn_of_rotation(table, rotation, law):
     """Warn where the derotator held fixed what --rotation says to have turned."""
     kept = {"fixed": ("field", "pupil"), "pupil": ("pupil", "field")}.get(rotation, ())
-    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
-    if not (kept and known and set(kept) <= set(law.derotator)):
+    turns = [_turns(table, law, what) for what in kept]
+    if not turns or any(each is None for each in turns):
         return
-    off = []
-    for f, g in map(law.derotator_law, kept):
-        # half a turn is none
-        twice = 2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"])
-        turns = np.exp(1j * twice.to_value(u.rad))
-        off.append(np.degrees(np.abs(np.angle(turns / turns.sum())).max()) / 2)
+    off = [np.abs(each).max() / 2 for each in turns]
     if off[0] > _OFF_LAW and off[0] > 3 * off[1]:
         others = {"field": "fixed", "pupil": "pupil"}
         warn(
@@ -415,21 +401,58 @@ def _warn_of_rotation(table, rotation, law):
         )
 
 
-# names and keys of degree and angle, their unit, its factor and the form of the number
+def _turns(table, law, kept):
+    """Return by how much the derotator turned what it keeps, from the mean; None if not known."""
+    known = {"derotator", "parallactic", "altitude"} <= set(table.colnames)
+    if not known or kept not in law.derotator:
+        return None
+    f, g = law.derotator_law(kept)
+    # the image turns by twice its angle, so that half a turn is none
+    return _from_mean(2 * (table["derotator"] - f * table["parallactic"] - g * table["altitude"]))
+
+
+def _from_mean(angles):
+    turns = np.exp(1j * angles.to_value(u.rad))
+    return np.degrees(np.angle(turns / turns.sum()))
+
+
+def _warn_of_turns(table, law, size):
+    """Warn where the field turned from frame to frame, and images are summed as they are."""
+    turns = _turns(table, law, "field")
+    if turns is None and "parallactic" in table.colnames:
+        # as --rotation pupil has it: nothing else turns the field
+        turns = _from_mean(table["parallactic"])
+    apart = 0.0 if turns is None else np.ptp(turns)
+    # of the pixels at the edge
+    moved = np.radians(apart) * size / 2
+    if moved > _MOST_MOVED:
+        warnings.warn(
+            f"--rotation none: the field turned by up to {apart:.1f} deg between frames, "
+            f"{moved:.2g} pixels at the edge of the images, which are summed as they are: what is "
+            "not round about the star is smeared; --rotation fixed or pupil turn them north up",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
+
+
+# names and keys of the polarization of a star, its unit, its factor and the form of the number
 _POLARIZATION = (
-    ("DoLP", "degree", "dolp", "s_p", " %", 100, ".2f"),
-    ("AoLP", "angle", "aolp", "s_chi", " deg", 1, ".1f"),
+    ("DoLP", "degree of linear polarization", "dolp", "s_p", " %", 100, ".2f"),
+    ("AoLP", "angle of linear polarization", "aolp", "s_chi", " deg", 1, ".1f"),
+    ("V/I", "circular polarization V / I", "v", "v", " %", 100, ".2f"),
 )
 
 
 def _summary(result, star, arguments, n_frames):
-    spectrum = {"radius": _radius(arguments), "q": star.q, "u": star.u} | star.polarization()
+    spectrum, names = {"radius": _radius(arguments)}, result.components[1:].lower()
+    spectrum |= {name: getattr(star, name) for name in names} | star.polarization()
     for kind in ("statistical", "systematic"):
         error = star.fractional_errors(kind)
-        spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
+        spectrum |= {f"{name}_{kind}": error[name] for name in names}
     same = ("mode", "observable", "components", "north_up", "condition")
+    kept = ("calibration", "calibration_hash", "calibration_faults")
     summary = {"output": str(arguments.output), "n_frames": n_frames}
-    summary |= {key: result.provenance[key] for key in ("calibration", "calibration_hash")}
+    summary |= {key: result.provenance[key] for key in kept}
     summary |= {key: getattr(result, key) for key in same} | {
         "wavelength_nm": result.wavelength.to_value(u.nm),
         "poorly_determined": {str(i): words for i, words in enumerate(result.weak) if words},
@@ -474,7 +497,8 @@ def _words(summary, systematic, arguments):
     if subtracted := summary.get("subtracted_star"):
         lines.append(f"  subtracted from all light: {subtracted['words']} ({subtracted['from']})")
     n, poor = len(summary["wavelength_nm"]), summary["poorly_determined"]
-    good = sum(bool(np.isfinite(q)) and str(w) not in poor for w, q in enumerate(star["q"]))
+    known = np.isfinite(star["q"]) & np.isfinite(star["u"])
+    good = int(known.sum())
     verdict, advice = "Usable", common.following("info", arguments.output)
     if not good and len(poor) < n:
         verdict = f"NOT USABLE AS IT IS: no light within {star['radius']:g} pixels of the star"
@@ -489,10 +513,13 @@ def _words(summary, systematic, arguments):
         verdict = f"NOT USABLE AS IT IS: the calibration is not: {faults[0]}"
         advice = common.following("info", summary["calibration"])
     elif good < n:
-        what = "poorly determined" if len(poor) == n - good else "without a value"
+        lacking = all(str(w) in poor for w in np.flatnonzero(~known))
+        what = "poorly determined" if lacking else "without a value"
         verdict = f"Usable: {what} at {counted(n - good, 'wavelength')}"
     written = [getattr(arguments, name) for name in ("output", "spectrum", "plot", "json")]
-    determined = f"{summary['components']} at {good} of {n} wavelengths"
+    determined = f"IQU at {good} of {n} wavelengths"
+    if "v" in star:
+        determined += f", V at {np.isfinite(star['v']).sum()}"
     accuracy = f"{accuracy} (statistical + systematic)"
     ends = common.ending(verdict, accuracy, determined, advice, common.written_lines(written))
     return common.with_ending(lines, ends, arguments.full)
@@ -501,20 +528,24 @@ def _words(summary, systematic, arguments):
 def _polarization(star, is_open):
     """Return degree and angle of a star in lines, and their errors in one; which is open."""
     lines, accuracy, lost = [], [], []
-    for name, word, key, error, unit, scale, form in _POLARIZATION:
+    for name, words, key, error, unit, scale, form in _POLARIZATION:
+        if key not in star:
+            # V is zero, not found to be
+            continue
         shown = _middle(scale * star[key], form, unit, turns=name == "AoLP")
-        lines.append(f"    {word} of linear polarization: {shown}")
+        lines.append(f"    {words}: {shown}")
         errors = []
         for kind, unknown in (("statistical", False), ("systematic", is_open)):
             values = scale * star[f"{error}_{kind}"]
             none = "infinite" if unknown else "not known"
             lines.append(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
-            if unknown and not np.isfinite(values).any():
+            if unknown and key != "v" and not np.isfinite(values).any():
                 lost.append(name)
             none = "open" if name in lost else "unknown"
             errors.append(_middle(values, ".2g", unit, none=none))
         accuracy.append(f"{name} {' + '.join(errors)}")
-    accuracy = ", ".join(accuracy)
+    # of V there is no room in a line
+    accuracy = ", ".join(accuracy[:2])
     if not lost:
         # the unit once: the line is short
         accuracy = accuracy.replace(" % +", " +").replace(" deg +", " +")

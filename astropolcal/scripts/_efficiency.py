@@ -38,13 +38,14 @@ EXAMPLES = """\
 OPTIONS = """
 file CAL.asdf ? Input  calibration
 --instrument NAME  default: that of the file, or charis
---altitude DEG float  default: 60
---parallactic DEG float  default: 0
---derotator DEG + float  angles of the table (default: 0 to 90 in steps of 15)
+--altitude DEG angle  default: 60
+--parallactic DEG angle  default: 0
+--derotator DEG + angle  angles of the table (default: 0 to 90 in steps of 15)
 --wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
 --target RA,DEC  for the best derotator offset: degrees, or 05:26:06,+16:42:00
 --night START/END  times in UTC, with --target
---law MODE  what the derotator stabilizes, such as field (default: pupil)
+--law MODE  what the derotator stabilizes, such as field (default: pupil); with --target, or where
+    the law of the half-wave plate depends on it
 --date DATE  of the telescope's mirrors, where that matters
 -o --output FILE Drawing  save the figure (PNG, PDF, SVG); with --target that of the derotator
     offsets
@@ -78,6 +79,7 @@ def run(arguments):
 def _chains(arguments):
     """Return instrument, chains, that from the sky first, wavelengths and frames."""
     from astropolcal import Calibration
+    from astropolcal.pipeline.headers import faults_of
 
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
@@ -86,7 +88,7 @@ def _chains(arguments):
     calibration = Calibration.read(arguments.file)
     grid = calibration.wavelength
     instrument = common.calibrated_instrument(calibration, arguments.file, arguments.instrument)
-    common.faults_of(calibration, arguments.file)
+    faults_of(calibration, arguments.file)
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
     chains[0] = _on_sky(instrument, chains[0], grid, arguments)
@@ -192,6 +194,11 @@ def _mode(arguments, instrument):
     if arguments.law is not None and modes and arguments.law not in modes:
         raise ParameterError(
             f"--law {arguments.law}: allowed of {instrument.name} are {', '.join(modes)}"
+        )
+    if arguments.law and not (arguments.target or instrument.sky_law.plate_depends_on_mode):
+        raise ParameterError(
+            f"--law {arguments.law}: of {instrument.name} it only tells the best offset of the "
+            "derotator, which needs --target and --night"
         )
     # high-contrast imaging keeps the pupil still
     usual = "pupil" if "pupil" in modes else next(iter(modes), None)

@@ -277,6 +277,7 @@ def _describe_product(path, product):
         f"{content['systematic']}",
         f"  calibration: {made.get('calibration', 'not known')}, sha256 "
         f"{str(made.get('calibration_hash', 'not known'))[:12]}",
+        *(f"  NOT USABLE AS IT IS: {words}" for words in made.get("calibration_faults", [])),
         f"  from {counted(len(frames), 'frame')}" + (f": {' to '.join(ends)}" if frames else ""),
     ]
     return lines, content

@@ -28,7 +28,7 @@ name NAME ?  a star, such as 'HD 293396'
 --radius DEG float  goes with --near (default: 15)
 --site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
 --night YYYY-MM-DD  date of the evening at the site
---min-altitude DEG float =30  goes with --night: lowest altitude (default: 30)
+--min-altitude DEG float  goes with --night: lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
 --plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
@@ -46,6 +46,8 @@ EXAMPLES = """\
 def run(arguments):
     """Print the stars."""
     _check(arguments)
+    if arguments.min_altitude is None:
+        arguments.min_altitude = 30.0
     # text for people, content for machines, nights for the figure
     lines, content, seen, total = (_one if arguments.name else _many)(arguments)
     if arguments.plot:
@@ -62,8 +64,7 @@ def _check(arguments):
         raise ParameterError("--site and --night go together")
     if arguments.plot and arguments.night is None:
         raise ParameterError("--plot needs --site and --night")
-    # the default, even if it is stated, does no harm
-    if arguments.min_altitude != 30 and arguments.night is None:
+    if arguments.min_altitude is not None and arguments.night is None:
         raise ParameterError("--min-altitude needs --site and --night")
     if arguments.radius is not None and arguments.near is None:
         raise ParameterError("--radius goes with --near RA,DEC")

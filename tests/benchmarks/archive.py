@@ -66,12 +66,13 @@ def write_sequences(folder, calibration, numbers):
         angles |= {"parallactic": parallactic, "altitude": altitude}
         positions = {name: angle * u.deg for name, angle in angles.items()}
         rows = measurement_rows(chain, positions, CHARIS.wavelength)
-        flux = rows @ [1e6, *(1e6 * rng.uniform(-0.03, 0.03, 2)), 0]
+        # below the saturation of a pixel
+        flux = rows @ [5e4, *(5e4 * rng.uniform(-0.03, 0.03, 2)), 0]
         inside = Path(folder) / f"{number:05d}"
         inside.mkdir(parents=True, exist_ok=True)
         for i in range(N_FRAMES):
             cube = sum(flux[b, :, i, None, None] * images[b] for b in (0, 1))
-            cube = cube + rng.normal(0, 10, cube.shape)
+            cube = cube + rng.normal(0, 0.5, cube.shape)
             header = fits.Header(
                 {"INSTRUME": "CHARIS", "OBJECT": f"HD {number}", "FILTNAME": "Broadband",
                  "RET-ANG1": hwp[i], "D_IMRANG": 60.0, "PARANG": parallactic[i],

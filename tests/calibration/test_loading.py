@@ -1,9 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What a pipeline loads: system Mueller matrices from headers, with their errors."""
 
+import copy
 import dataclasses
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import astropy.units as u
@@ -22,6 +24,7 @@ from astropolcal.chain import (
     system_mueller_derivatives,
     with_beam,
 )
+from astropolcal.correction import ScienceFrames, correct
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -286,6 +289,31 @@ def test_calibration_in_memory(calibration, loaded):
 
 
 @pytest.mark.slow
+def test_what_is_wrong_with_a_calibration_is_told_as_by_correct(calibration, tmp_path):
+    """A fit that did not converge, and neighbours in the library that differ."""
+    bad = copy.deepcopy(calibration)
+    bad.fit["converged"] = False
+    words = "NOT USABLE AS IT IS: the fit did not converge"
+    with pytest.warns(AstropolcalWarning, match=f"calibration in memory: {words}"):
+        load(bad)
+    fluxes = np.ones((1, len(WAVELENGTH)))
+    frames = ScienceFrames.from_arrays(fluxes, fluxes, WAVELENGTH, {}, date="2025-10-05")
+    with (
+        pytest.warns(AstropolcalWarning, match=f"the calibration: {words}"),
+        # they have no mode
+        suppress(CalibrationFileError),
+    ):
+        correct(bad, frames)
+    library = Library(tmp_path)
+    library.add(calibration, name="a.asdf", valid_until="2025-12-01")
+    for chain in bad.chains:
+        chain["hwp"].w_sio2.value *= 1.01
+    library.add(bad, name="b.asdf", valid_from="2025-12-01")
+    with pytest.warns(AstropolcalWarning, match=r"a.asdf differs from b.asdf by \d+ \(hwp by"):
+        assert load(library, HEADER).path.name == "a.asdf"
+
+
+@pytest.mark.slow
 def test_library_is_looked_up_by_the_header(calibration, tmp_path):
     library = Library(tmp_path)
     early = library.add(calibration, valid_from="2025-01-01", valid_until="2025-10-05")
@@ -508,6 +536,13 @@ def test_stokes_cubes_that_cannot_be_corrected(loaded):
             loaded.correct(stokes, headers, **options)
     with pytest.raises(ParameterError, match="either header or positions"):
         loaded.correct(cube)
+    # true angles of the plate are not those by which a pipeline takes differences
+    sky = {"parallactic": [-30, -30] * u.deg, "altitude": [55, 55] * u.deg}
+    positions = {"hwp": [40, 62.5] * u.deg, "derotator": [60, 60] * u.deg} | sky
+    with pytest.raises(ParameterError, match=r"hwp = None: .* the commanded angles are needed"):
+        loaded.correct(cube, positions=positions)
+    loaded.correct(cube, positions=positions, hwp=[0, 22.5] * u.deg)
+    loaded.correct(cube, positions=positions, light="internal")
 
 
 def test_masked_pixels_of_a_cube_and_positions_of_other_frames_give_no_numbers(loaded):

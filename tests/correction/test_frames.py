@@ -257,6 +257,10 @@ def test_centres_that_are_none(cubes):
     for centres in [[(10, 8), (27, 11)], [(10, 8), (9, 7)], np.zeros((4, 2, 2))]:
         with pytest.raises(ParameterError, match=r"the right beam comes first, about \(x, y\) = "):
             from_files(cubes[1], centres=centres)
+    # the star in the right beam, given as that in the left one
+    for centres in [(27, 11), [(44, 14), (27, 11)]]:
+        with pytest.raises(ParameterError, match="of the left beam are in the right one"):
+            from_files(cubes[1], centres=centres)
 
 
 def test_files_of_two_cameras(tmp_path):

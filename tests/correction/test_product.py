@@ -295,6 +295,15 @@ def test_long_names_without_error_come_back(corrected, tmp_path):
     assert Corrected.read(tmp_path / "out.fits").systematic.held == names
 
 
+def test_what_is_wrong_with_the_calibration_comes_back(corrected, tmp_path):
+    given = corrected.provenance | {"calibration_faults": ["a" * 90, "the fit did not converge"]}
+    dataclasses.replace(corrected, provenance=given).write(tmp_path / "a.fits")
+    # also of a product that was read
+    Corrected.read(tmp_path / "a.fits").write(tmp_path / "b.fits")
+    told = Corrected.read(tmp_path / "b.fits").provenance["calibration_faults"]
+    assert "; ".join(told) == "; ".join(given["calibration_faults"])
+
+
 def test_how_much_resampling_took_comes_back(corrected, path, tmp_path):
     dataclasses.replace(corrected, resampling=0.6).write(tmp_path / "turned.fits")
     again = Corrected.read(tmp_path / "turned.fits")

@@ -10,6 +10,7 @@ from astropy.utils.masked import Masked
 from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.reduction.photometry import Detector
 
 ALL = slice(None)
 
@@ -348,3 +349,19 @@ def test_exposures_that_are_no_measurement_take_no_part_in_their_mean(tmp_path):
         assert (flux[0, 0], variance[0, 0]) == (100.0, one / 4)
         if weights:
             assert (flux[1, 1], variance[1, 1]) == (100.0, one / 3)
+
+
+def test_saturated_pixels_are_no_measurement(tmp_path):
+    detector = Detector(u.adu, gain=2.0, read_noise=3.0, saturation=100.0)
+    for stacked, shape in ((False, (1, 6, 12)), (True, (4, 6, 12))):
+        cube = np.full(shape, 50.0)
+        cube[0, 3, 3] = 100.0
+        for n_hdus in (1, 2):
+            hdus = [fits.PrimaryHDU(cube), fits.ImageHDU(np.ones(shape))][:n_hdus]
+            fits.HDUList(hdus).writeto(tmp_path / "a.fits", overwrite=True)
+            options = {"extension": 0, "stacked": stacked, "detectors": [(detector, detector)]}
+            source = CubeFiles([tmp_path / "a.fits"], [(3, 3), (9, 3)], 3, **options)
+            flux = source.fluxes(0, ALL, ALL)[0, 0]
+            # of several exposures the others are left
+            assert np.isnan(flux[1, 1]) if not stacked else flux[1, 1] == 50.0
+            assert np.isfinite(flux).sum() == 8 + stacked

@@ -229,7 +229,7 @@ def test_columns_with_a_wrong_unit():
         ("wavelength", u.Hz, "column wavelength has unit Hz"),
         ("hwp", u.um, "column hwp has unit um, a unit such as deg is needed"),
         ("derotator", u.s, "column derotator has unit s"),
-        ("flux_left", u.Jy, "column flux_left has unit Jy, a unit such as adu is needed"),
+        ("flux_left", u.Jy, "left has unit Jy, a unit such as adu is needed, as flux_right has it"),
         ("flux_left_err", u.deg, "column flux_left_err has unit deg"),
         ("flux_right", u.mag, "column flux_(right|left)"),
     ]:

@@ -119,7 +119,9 @@ def test_unpolarized_source_is_recognized_and_a_statement_wins(tmp_path, small):
     paths = flat_frames(tmp_path, CYCLE)
     assert reduce_cubes(paths, small).source == "unpolarized"
     assert reduce_cubes(paths, small, meta={"source": "lamp"}).source == "lamp"
-    assert reduce_cubes(paths, small, source="polarized").source == "polarized"
+    words = "source 'polarized' is stated, but the fluxes change with the plate as if unpolarized"
+    with pytest.warns(AstropolcalWarning, match=words):
+        assert reduce_cubes(paths, small, source="polarized").source == "polarized"
     # too few angles to tell
     assert reduce_cubes(paths[:2], small).source is None
 
@@ -287,6 +289,24 @@ def test_a_star_is_no_internal_source(tmp_path, small):
     tracked, light = alone.doubts[str(star)]
     assert tracked.startswith("RET-POS1 and RET-ANG1 differ by more than 1 deg")
     assert "as that of a star" in light
+
+
+def test_light_outside_the_beams_of_a_lamp_is_told(tmp_path, small):
+    """Subtracted it is told no more; where there is as much as inside the lamp fills the field."""
+    image = np.zeros((201, 201))
+    for rows, columns, weights in rectangles(LAYOUT.internal_apertures, (201, 201)):
+        image[rows, columns] += 400.0 * weights
+    for level, background, told in (
+        (0.0, "none", None),
+        (2.0, "none", None),
+        (20.0, "none", r"there is 4\.\d % of the light inside"),
+        (20.0, "outside", None),
+        (300.0, "none", "there is 4[0-9] %"),
+        (1e4, "none", None),
+    ):
+        path = write_cube(tmp_path / "CRSA00000001_cube.fits", expose(image + level, LAYOUT))
+        doubts = str(reduce_run([path], small, background=background).doubts)
+        assert bool(re.search(told or "outside the beams", doubts)) == bool(told), (level, doubts)
 
 
 def test_lamp_is_no_star_and_says_so_without_warnings(tmp_path, small):

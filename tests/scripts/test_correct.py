@@ -111,7 +111,7 @@ def test_a_product_is_not_usable_where_its_calibration_is_not(night, tmp_path, c
     calibration = Calibration.read(night / "charis.asdf")
     calibration.fit["converged"] = False
     calibration.write(tmp_path / "bad.asdf")
-    words = [night / "cubes", "-o", tmp_path / "out.fits", "--size", 31]
+    words = [night / "cubes", "-o", tmp_path / "out.fits", "--size", 31, "--rotation", "pupil"]
     words += ["--json", tmp_path / "s.json", "--calibration"]
     told = "the fit did not converge"
     with pytest.warns(AstropolcalWarning, match=f"bad.asdf: NOT USABLE AS IT IS: {told}"):
@@ -295,12 +295,20 @@ def test_a_derotator_that_kept_something_else_than_stated(night, tmp_path):
         ((95, 101), "fixed", "fixed", None),
         # neither law holds
         ((95, 98), "fixed", "fixed", None),
+        # images of different orientation are summed
+        (
+            (95, 95),
+            "none",
+            None,
+            r"turned by up to 12.0 deg between frames, 5.3 pixels at",
+        ),
+        ((95, 281), "none", None, None),
     ]:
         hwp = [h + plate[0] * p + plate[1] * 70 for h, p in ((0, 20), (45, 32))]
         keywords = [("PARANG", 20, 32), ("ALTITUDE", 70), ("D_IMRANG", *derotator)]
         paths = changed(night, tmp_path, *keywords, ("RET-POS1", *hwp))
         words_of = [*paths, "--calibration", night / "charis.asdf", "-o", tmp_path / "o.fits"]
-        words_of += ["--centre", "69.9,84.7", "--size", "5", "-q", "--rotation", stated]
+        words_of += ["--centre", "69.9,84.7", "--size", "51", "-q", "--rotation", stated]
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             # two frames may be too few for a product
@@ -310,7 +318,7 @@ def test_a_derotator_that_kept_something_else_than_stated(night, tmp_path):
         assert len(told) == (words is not None), (derotator, stated, told)
         if words:
             assert re.search(words, told[0])
-            assert f"(--rotation {others})" in told[0]
+            assert others is None or f"(--rotation {others})" in told[0]
 
 
 @pytest.mark.slow
@@ -350,7 +358,7 @@ CHARIS = instruments.get("charis")
 def told(monkeypatch):
     """Function that returns what is made of headers with these values."""
 
-    def tell(*frames, centre=(70.0, 85.0)):
+    def tell(*frames, centre=(70.0, 85.0), **options):
         files = [f"CRSA{i:08d}_cube.fits" for i in range(len(frames))]
         known = dict(zip(files, frames, strict=True))
         monkeypatch.setattr(
@@ -358,7 +366,7 @@ def told(monkeypatch):
             "_survey",
             lambda *_: [Frame(f, values=dict(known[f]), unit=known[f].get("unit")) for f in files],
         )
-        return survey_frames(files, CHARIS.files, centre=centre)
+        return survey_frames(files, CHARIS.files, centre=centre, **options)
 
     return tell
 
@@ -396,6 +404,9 @@ def test_frames_are_as_bright_as_their_exposures(told):
         frames = [{"hwp": 0.0} | ({} if s is None else {"exposure_time": s}) for s in seconds]
         found = told(*frames)[2]
         assert found is None if scale is None else found.tolist() == scale, (seconds, scale)
+    # where nothing else tells it has to be there
+    with pytest.raises(ObservationError, match=r"01_cube.fits: no keyword EXPTIME in its header"):
+        told({"hwp": 0.0, "exposure_time": 1.0}, {"hwp": 0.0}, {"hwp": 0.0}, exposed=True)
 
 
 def test_rates_are_as_bright_at_all_exposures(told):
@@ -446,6 +457,37 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     centres = survey_frames([files[0], files[2]], CHARIS.files)[1]
     # x and y in the right and in the left beam
     assert [c.tolist() for c in centres] == [[[70.0, 85.0]] * 2] * 2
+
+
+def test_raw_frames_are_advised_where_they_may_help(monkeypatch):
+    for error, advised in (
+        ("no keyword D_IMRANG in its header", True),
+        ("no keyword PARANG in its header, and no right_ascension", False),
+        ("no slice can be used: saturated", False),
+    ):
+        frame = Frame("a.fits", errors=[error])
+        monkeypatch.setattr(frame_files, "_survey", lambda *_, frame=frame: [frame])
+        with pytest.raises(ObservationError, match=error) as refused:
+            survey_frames(["a.fits"], CHARIS.files, ways=_WAYS)
+        assert ("--raw" in str(refused.value)) == advised, error
+
+
+def test_what_is_odd_about_science_frames_is_told(monkeypatch, tmp_path):
+    """A pixel that the photometry of the star leaves out is in the images that are corrected."""
+    frames = half_wave_plate_cycles([0, 22.5] * u.deg, [60] * u.deg)
+    frames["parallactic"], frames["altitude"] = [20, 20] * u.deg, [70, 70] * u.deg
+    simulate_cubes(
+        tmp_path, CHARIS.on_sky(CHARIS.published()), CHARIS, frames, source="star",
+        stokes=(1, 0, 0, 0), flux=1e6, detector=DetectorModel(noise=False),
+        files=CubeFiles(raw=False),
+    )  # fmt: skip
+    paths = sorted(tmp_path.glob("*.fits"))
+    survey_frames(paths, CHARIS.files)
+    with fits.open(paths[1], mode="update") as hdus:
+        hdus[1].data[3, 124, 133] += 2e4
+    with pytest.warns(AstropolcalWarning, match="1 file: single pixels .* change q and u") as told:
+        survey_frames(paths, CHARIS.files)
+    assert paths[1].name in str(told[0].message)
 
 
 def test_copies_and_other_objects_among_science_frames(monkeypatch):
@@ -515,7 +557,7 @@ def test_report_has_units():
         aperture = {"radius": 10.0, "dolp": np.array([0.0099]), "aolp": np.array([30.0])}
         aperture |= {"s_p_statistical": np.array([0.0012]), "s_chi_statistical": np.array([2.0])}
         aperture |= {"s_p_systematic": np.array([np.nan]), "s_chi_systematic": np.array([np.inf])}
-        aperture["q"] = np.array([0.005])
+        aperture["q"] = aperture["u"] = np.array([0.005])
         summary = {
             "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
             "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
@@ -538,13 +580,27 @@ def test_report_has_units():
         told = "NOT USABLE AS IT IS: the calibration does not determine DoLP and AoLP"
         assert verdict == (told if is_open else "Usable"), (systematic, words)
         assert lines[-1] == "Written:    o.fits", (systematic, words)
+    # of V where it was solved for
+    assert "V" not in " ".join(lines)
+    full = aperture | {"v": np.array([-0.0042]), "v_statistical": np.array([0.0011])}
+    full |= {"v_systematic": np.array([np.nan])}
+    lines = _correct._words(summary | {"aperture": full}, None, SimpleNamespace(**outputs))
+    place = lines.index("    circular polarization V / I: -0.42 %")
+    assert lines[place + 1] == "      statistical error: 0.11 %"
+    # frames that tell all but V are of use
+    summary["poorly_determined"] = {"0": "0.07 U +1.00 V"}
+    full["v"] = np.array([np.nan])
+    lines = _correct._words(summary | {"aperture": full}, None, SimpleNamespace(**outputs))
+    assert lines[lines.index("") + 1] == "Usable"
+    assert "Determined  IQU at 1 of 1 wavelengths, V at 0" in lines
+    summary["poorly_determined"] = {}
     # wavelengths at which the aperture has no value are not usable, whatever the frames determine
     summary["wavelength_nm"] = [1200.0, 1600.0]
     for q, told in (
         ([0.005, np.nan], "Usable: without a value at 1 wavelength"),
         ([np.nan, np.nan], "NOT USABLE AS IT IS: no light within 10 pixels of the star"),
     ):
-        aperture["q"] = np.array(q)
+        aperture["q"] = aperture["u"] = np.array(q)
         lines = _correct._words(summary, None, SimpleNamespace(**outputs))
         assert lines[lines.index("") + 1] == told
         assert f"IQU at {np.isfinite(q).sum()} of 2 wavelengths" in " ".join(lines)

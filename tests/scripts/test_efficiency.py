@@ -167,6 +167,7 @@ def test_bad_input_is_one_error():
         (["--wavelength", "5"], ParameterError, r"--wavelength 5: allowed are 1.160 to 2.369 um"),
         (["--altitude", "95"], AstropolcalError, "altitude = 95 deg"),
         (["--law", "sky"], ParameterError, "--law sky: allowed of charis are pupil, field"),
+        (["--law", "field"], ParameterError, "--law field: of charis it only tells the best off"),
         (["--date", "2020-01-01"], ParameterError, "--date: the telescope of charis"),
         (["--instrument", "irdis", "--date", "spring"], InstrumentError, "is not a date"),
         (["--instrument", "nothing"], InstrumentError, "unknown instrument 'nothing'"),

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import astropy.units as u
@@ -182,6 +183,11 @@ def test_product_tells_what_it_holds(product, tmp_path, capsys):
     assert content["n_determined"] == 2
     assert content["provenance"]["calibration"] == "cal.asdf"
     assert len(content["frames"]) == 4
+    assert "NOT USABLE" not in text
+    made = product.provenance | {"calibration_faults": ["the fit did not converge"]}
+    replace(product, provenance=made).write(tmp_path / "faulty.fits")
+    text, _ = told(tmp_path / "faulty.fits", capsys)
+    assert "NOT USABLE AS IT IS: the fit did not converge" in text
 
 
 # ---- cubes and other FITS files ----------------------------------------------------------

@@ -173,6 +173,9 @@ def test_options_that_cannot_be_understood(capsys):
         (["sample", "c", "t", "--burn", "x"], "argument --burn: 'x' is not auto or a number"),
         (["reduce", "c", "-o", "x", "--meta", "=in"], "argument --meta: '=in' is not KEY=VALUE"),
         (["simulate", "--source", "sun"], "argument --source: invalid choice: 'sun'"),
+        (["correct", "--camera-angle", "1e9"], "'1e9' is not an angle from -720 to 720 deg"),
+        (["efficiency", "--derotator", "45", "1e9"], "'1e9' is not an angle from -720"),
+        (["simulate", "--hwp", "0,900"], "'0,900' is not a list of angles from -720 to 720 deg"),
     ]:
         with pytest.raises(SystemExit) as caught:
             main(argv)

@@ -60,7 +60,7 @@ def test_stated_defaults_are_those_of_the_parser(sections):
         ("simulate", "--seed", "(20251005)"),
         ("simulate", "--fwhm", "(5)"),
         ("sample", "--steps", "by default 5000"),
-        ("standards", "--min-altitude", "by default 30"),
+        ("reduce", "--gap", "by default 30"),
         ("correct", "--size", "by default 51"),
         ("correct", "--max-condition", "by default 30"),
         ("challenge", "-n", "by default 20"),

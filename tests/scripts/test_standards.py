@@ -111,7 +111,7 @@ def test_bad_input_is_refused_with_what_is_allowed(tmp_path, monkeypatch):
         (["--magnitude", "30,31"], "no standard star fits"),
         (["--near=0,-80", *NIGHT], "no standard star above 30 deg"),
         (["--radius", "5"], "--radius goes with --near"),
-        (["--min-altitude", "40"], "--min-altitude needs --site and --night"),
+        (["--min-altitude", "30"], "--min-altitude needs --site and --night"),
         (["HD 30675", "--band", "H"], "--band selects among stars"),
         (["--near", "north"], "--near north"),
         (["--near", "400,0"], "--near 400,0: .* a right ascension from -360 to 360 deg"),
