@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """From science frames to corrected Stokes parameters."""
 
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from numbers import Integral
@@ -15,12 +14,7 @@ from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
 from astropolcal.correction.systematic import check_choices, linear_systematic, sampled_systematic
-from astropolcal.exceptions import (
-    AstropolcalError,
-    AstropolcalWarning,
-    ObservationError,
-    ParameterError,
-)
+from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError, warn
 from astropolcal.files import provenance
 from astropolcal.observations import OBSERVABLES
 from astropolcal.pipeline.headers import check_frames, faults_of
@@ -210,7 +204,7 @@ def correct(
         unmeasured.append(_OPEN)
     unmeasured += _weighted(by_variance, frames.source)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
-        warnings.warn(words, AstropolcalWarning, stacklevel=2)
+        warn(words)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
     found = corrected_planes(frames.source, solution, by_variance, **division)
     n = len(components)

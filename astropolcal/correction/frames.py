@@ -11,7 +11,7 @@ from astropy.table import QTable
 from astropolcal.chain import check_states, leaves, stages
 from astropolcal.correction.solve import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
-from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError, ParameterError, warn
 from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations
 from astropolcal.observations.observables import pair_frames
@@ -491,10 +491,9 @@ def frame_positions(instrument, table, chain, names=None):
                 "which images do not have; correct both for it, and calibrate without it"
             )
         if leaf.stage in ("sequence", "frame"):
-            warnings.warn(
+            warn(
                 f"{leaf.name} of the calibrated chain changes in the course of the calibrated run; "
                 "the frames are taken to change so too, in their order",
-                AstropolcalWarning,
                 stacklevel=3,
             )
     modulated = "flc_state" in stages(chain)

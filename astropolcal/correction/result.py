@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Corrected Stokes parameters with what is known of their errors."""
 
-import warnings
 from dataclasses import dataclass, field, replace
 
 import astropy.units as u
@@ -13,7 +12,7 @@ from astropolcal.correction.geometry import azimuthal, azimuthal_variances
 from astropolcal.correction.product import read_product, write_product
 from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.star import measured_star, stated_star, without_star
-from astropolcal.exceptions import AstropolcalWarning, ParameterError
+from astropolcal.exceptions import ParameterError, warn
 from astropolcal.stokes import (
     angle_error,
     debias_dolp,
@@ -249,12 +248,10 @@ class Corrected:
         known = np.isfinite(pixels)
         known = (known | ~known.any(axis=-1, keepdims=True)).all(axis=0)
         if lost := (~known).sum(axis=1).max():
-            warnings.warn(
+            warn(
                 f"up to {lost} of {inside.sum()} pixels of the aperture have no value, at "
                 f"{(~known).any(axis=1).sum()} of {len(known)} wavelengths; they are left out of "
-                "all Stokes parameters, and I lacks their light",
-                AstropolcalWarning,
-                stacklevel=2,
+                "all Stokes parameters, and I lacks their light"
             )
         stokes = np.where(known, pixels, 0.0).sum(axis=-1)
         if covariance is not None:

@@ -6,7 +6,6 @@ The flux of a beam is :math:`d = \mathbf a \cdot \mathbf S`, where :math:`\mathb
 first row of the system Mueller matrix of that beam, frame and wavelength.
 """
 
-import warnings
 from functools import partial
 
 import astropy.units as u
@@ -16,7 +15,7 @@ from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows, free_of, match_wavelengths
 from astropolcal.chain import check_states, join, leaves, stages, warn_beyond
-from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
+from astropolcal.exceptions import ChainError, ParameterError, warn
 from astropolcal.observations.pointings import in_state
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import finite_position
@@ -71,10 +70,9 @@ class RowModel(Rows):
             grid = calibration.wavelength
             _, mix = match_wavelengths(grid, chain, self.wavelength, interpolate)
             if names and not np.isin(mix, (0.0, 1.0)).all():
-                warnings.warn(
+                warn(
                     f"interpolated linearly between the {grid.size} calibrated wavelengths: "
                     f"{', '.join(names)}",
-                    AstropolcalWarning,
                     stacklevel=3,
                 )
         check_states(chain, positions, "positions")

@@ -8,7 +8,6 @@ of all pixels and wavelengths, and their correlations, are a few small matrices.
 of the instrument lacks (``model_error`` in the ``fit`` of a calibration) is a few more of them.
 """
 
-import warnings
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 
@@ -19,7 +18,7 @@ from astropolcal.calibration.identifiability.linearized import led
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.correction.solve import estimator
-from astropolcal.exceptions import AstropolcalWarning, ParameterError
+from astropolcal.exceptions import ParameterError, warn
 from astropolcal.units import check_seed
 
 __all__ = ["Systematic"]
@@ -167,7 +166,7 @@ def sampled_systematic(
         along, is_open = along[:0], np.zeros_like(is_open)
         if narrow := model.calibration.posterior.scatter:
             words = f"systematic errors are too small: {narrow}"
-            warnings.warn(words, AstropolcalWarning, stacklevel=4)
+            warn(words, stacklevel=4)
     return _with_model_error(factor, along, is_open, "sampled", model, light)
 
 

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What headers tell of frames, and whether a calibration and which of its chains hold for them."""
 
-import warnings
 from contextlib import suppress
 
 import astropy.units as u
@@ -22,12 +21,12 @@ from astropolcal.calibration.system import split_chain
 from astropolcal.chain import leaves
 from astropolcal.exceptions import (
     AstropolcalError,
-    AstropolcalWarning,
     CalibrationFileError,
     ChainError,
     InstrumentError,
     ObservationError,
     ParameterError,
+    warn,
 )
 from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
@@ -313,7 +312,7 @@ def faults_of(calibration, name):
     faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
     if faults:
         words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+        warn(words, stacklevel=3)
     return faults
 
 
@@ -362,11 +361,10 @@ def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", 
     worst = apart.argmax()
     if apart[worst] > limit:
         moment = list(moments)[worst]
-        warnings.warn(
+        warn(
             f"{moments[moment]} was taken {moment}, {apart[worst] / 365.25:.1f} yr from the data "
             f"of {name} ({' to '.join(dict.fromkeys((days[0], days[-1])))}); a calibration counts "
             f"as old after {limit:g} d (max_age), and what has changed since is not in its errors",
-            AstropolcalWarning,
             stacklevel=3,
         )
 

@@ -18,7 +18,6 @@ of one, or three numbers per parameter, or is free. Its size is unknown within t
 magnitude and averaged over, in units of the error of one run (Zellner's g-prior).
 """
 
-import warnings
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -42,7 +41,7 @@ from astropolcal.calibration.uncertainty.covariance import Covariance, full_cova
 from astropolcal.calibration.validation.targets import keep_sky_accuracy, target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
-from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement import parameter_table
 from astropolcal.measurement.parameters import ties_among
 from astropolcal.observations import Observations
@@ -286,7 +285,7 @@ def compared(named, parameters=None):
     if held := [name for name, one in named if one.settings.get("restarted")]:
         words = f"{listed(held)}: holds what another calibration found, whose errors are not in its"
         words += " own; how sure a change from or to it is, is not known"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+        warn(words, stacklevel=3)
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]

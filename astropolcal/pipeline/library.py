@@ -17,7 +17,6 @@ import os
 import re
 import stat
 import time
-import warnings
 from collections.abc import Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -43,7 +42,7 @@ from astropolcal.calibration.result.calibration import (
 )
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
-from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, InstrumentError
+from astropolcal.exceptions import CalibrationFileError, InstrumentError, warn
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
@@ -339,11 +338,10 @@ class Library:
             if by > _MOVED:
                 told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
         if told:
-            warnings.warn(
+            warn(
                 f"{chosen.name} differs from {' and '.join(told)} standard errors: what changes "
                 "from one calibration to the next is not in the errors (astropolcal health says "
                 "what changed)",
-                AstropolcalWarning,
                 stacklevel=3,
             )
 
@@ -511,11 +509,9 @@ class Library:
             )
             if same is not None:
                 if name not in (None, same.name):
-                    warnings.warn(
+                    warn(
                         f"name = {name!r}: the calibration is there already, as {same.name}; "
-                        "nothing is written",
-                        AstropolcalWarning,
-                        stacklevel=2,
+                        "nothing is written"
                     )
                 return self.source / same.name
             others = [entry for entry in self._in_force() if entry.content_hash not in gone]

@@ -4,7 +4,6 @@
 Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
 """
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -27,11 +26,11 @@ from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join, leaves, with_beam
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import (
-    AstropolcalWarning,
     CalibrationFileError,
     ChainError,
     InstrumentError,
     ParameterError,
+    warn,
 )
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
@@ -582,10 +581,9 @@ class LoadedCalibration:
         # axes of the telescope are optics, too, but there is nothing to calibrate in them
         assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)
         if assumed:
-            warnings.warn(
+            warn(
                 f"{self.path.name}: {', '.join(assumed)} not calibrated, published values are "
                 "taken without errors",
-                AstropolcalWarning,
                 stacklevel=4,
             )
         return chain, assumed

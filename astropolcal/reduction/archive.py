@@ -24,9 +24,9 @@ from pathlib import Path
 from astropolcal import instruments
 from astropolcal.exceptions import (
     AstropolcalError,
-    AstropolcalWarning,
     InstrumentError,
     ObservationError,
+    warn,
 )
 from astropolcal.files import append_line, one_line, understood
 from astropolcal.fitscheck import primary_header
@@ -67,11 +67,7 @@ class Index:
             words = "another run works on this archive" if "locked" in str(problem) else problem
             raise AstropolcalError(f"{path}: {words}") from None
         except sqlite3.DatabaseError as problem:
-            warnings.warn(
-                f"{path}: not a readable index ({problem}); it is made again",
-                AstropolcalWarning,
-                stacklevel=2,
-            )
+            warn(f"{path}: not a readable index ({problem}); it is made again")
             self._base.close()
             self.path.unlink()
             self._connect()
@@ -325,9 +321,8 @@ class Manifest:
             raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
         # the last one may have been cut off
         if n_bad > (not line.endswith("\n")):
-            warnings.warn(
+            warn(
                 f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
-                AstropolcalWarning,
                 stacklevel=3,
             )
 

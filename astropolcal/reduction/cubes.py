@@ -10,7 +10,6 @@ two images.
 
 import os
 import re
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,10 +22,10 @@ from scipy import ndimage
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import (
-    AstropolcalWarning,
     InstrumentError,
     ObservationError,
     ParameterError,
+    warn,
 )
 from astropolcal.files import atomic_path, check_new, understood
 from astropolcal.instruments.layout import TEXTS, unit_of
@@ -333,11 +332,9 @@ def simulate_cubes(
             header = layout.to_header(header_of(frames[i], layout) | more)
             write_cube(*names[i], cube, weight, header, layout)
     if fullest[0] > 1 and not detector.saturate:
-        warnings.warn(
+        warn(
             f"the brightest pixel has {fullest[1]:.3g} adu, above the saturation of "
-            f"{fullest[2]:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
-            AstropolcalWarning,
-            stacklevel=2,
+            f"{fullest[2]:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)"
         )
     return [cube for cube, _ in names]
 

@@ -18,9 +18,9 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import (
     AstropolcalError,
-    AstropolcalWarning,
     ObservationError,
     ParameterError,
+    warn,
 )
 from astropolcal.fitscheck import open_fits, primary_header, readable_fits
 from astropolcal.instruments.layout import ANGLES, card_value
@@ -517,11 +517,7 @@ def _warn_of_doubts(files, frames):
         # only the photometry of the star leaves them out
         used = "single pixels far off their neighbours, as a cosmic ray makes them, change q and u"
         words = f"{used}; mask them (NaN)" if words == _SINGLE else words
-        warnings.warn(
-            f"{counted(len(of), 'file')}: {words}; the first is {of[0]}",
-            AstropolcalWarning,
-            stacklevel=4,
-        )
+        warn(f"{counted(len(of), 'file')}: {words}; the first is {of[0]}", stacklevel=4)
 
 
 def _check_one_target(files, frames):
@@ -537,11 +533,7 @@ def _check_one_target(files, frames):
             objects.setdefault(re.sub(r"[^\w+-]|_", "", name).casefold(), (name, file))
     if len(objects) > 1:
         (one, first), (other, second) = list(objects.values())[:2]
-        warnings.warn(
-            f"{first} is of object {one!r}, {second} of {other!r}: corrected as one",
-            AstropolcalWarning,
-            stacklevel=4,
-        )
+        warn(f"{first} is of object {one!r}, {second} of {other!r}: corrected as one", stacklevel=4)
 
 
 def _survey(files, layout, raw, find):

@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import re
-import warnings
 from collections import Counter
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
@@ -16,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import (
-    AstropolcalWarning,
     InstrumentError,
     ObservationError,
     ParameterError,
+    warn,
 )
 from astropolcal.files import append_line, understood
 from astropolcal.observations import Observations
@@ -181,11 +180,9 @@ def reduce_cubes(files, instrument, **options):
     reduction = reduce_run(files, instrument, **options)
     for words, told in (("left out", reduction.problems), ("doubtful", reduction.doubts)):
         for path, why in list(told.items())[:1]:
-            warnings.warn(
+            warn(
                 f"{counted(len(told), 'file')} {words} (reduce_run lists all); the first is "
-                f"{path}: {'; '.join(why)}",
-                AstropolcalWarning,
-                stacklevel=2,
+                f"{path}: {'; '.join(why)}"
             )
     return reduction.observations
 

@@ -426,12 +426,10 @@ def _warn_of_turns(table, law, size):
     # of the pixels at the edge
     moved = np.radians(apart) * size / 2
     if moved > _MOST_MOVED:
-        warnings.warn(
+        warn(
             f"--rotation none: the field turned by up to {apart:.1f} deg between frames, "
             f"{moved:.2g} pixels at the edge of the images, which are summed as they are: what is "
-            "not round about the star is smeared; --rotation fixed or pupil turn them north up",
-            AstropolcalWarning,
-            stacklevel=2,
+            "not round about the star is smeared; --rotation fixed or pupil turn them north up"
         )
 
 
