@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from astropolcal import instruments
-from astropolcal.chain import join, leaves
+from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap import diagnose
 from astropolcal.gap.cells import Cell, Probes, dependences
@@ -87,6 +87,20 @@ def test_a_stage_with_another_zero_is_one_change():
     (change,) = to_dict(found)["changes"]
     assert "the zero of the angle of the half-wave plate changed by 0.4" in change["words"]
     assert change["cell"]["place"] == "in:hwp"
+
+
+@pytest.mark.slow
+def test_an_optic_of_any_axis_that_one_run_has_is_one_change():
+    film = LinearRetarder(retardance=1.6 * u.deg, theta=100 * u.deg, name="film")
+    second = insert_optic(data.chain(), film, after="hwp")
+    runs = [data.observed(data.chain(), seed=3, name=JULY), data.observed(second, name=OCTOBER)]
+    found = diagnose(data.chain(), runs, changes=True)
+    assert [cause.name for cause in found.causes] == [f"static_retarder:hwp/dataset:{OCTOBER}"]
+    (change,) = to_dict(found)["changes"]
+    assert change["words"].startswith(
+        f'In "{OCTOBER}" only there is a retarder that is static downstream of the half-wave plate'
+    )
+    assert change["cell"]["place"] == "after:hwp"
 
 
 @pytest.mark.slow

@@ -453,7 +453,11 @@ class Effect:
         return [self, *(self.at(name) for name in names if name not in first)]
 
     def per_run(self, runs):
-        """Return itself, or once for each run in which it may differ: of two only the second."""
+        """Return itself, or once for each run in which it may differ.
+
+        An orientation, which the model has for all runs, differs in the second of two as it does
+        in the first.
+        """
         if self.dependence != OWN_RUN:
             return [self]
         return [
@@ -462,7 +466,7 @@ class Effect:
                 title=f'{self.title} in "{run}"',
                 dependence=f"dataset:{run}",
             )
-            for run in (runs[1:] if len(runs) == 2 else runs)
+            for run in (runs[1:] if self.around and len(runs) == 2 else runs)
         ]
 
     def applies(self, chains):
