@@ -188,6 +188,13 @@ class Scan:
         """Return the candidate of a cell with a law of some degree, None where it does nothing."""
         return next(iter(_of_cell(self.probes, cell, degree, self.temper)), None)
 
+    def constant(self, candidate):
+        """Return a name with the same sizes at all wavelengths, None where that is no other law."""
+        if not candidate.is_named:
+            return None
+        found = _named(self.probes, [candidate.named], self.temper, _DEGREES[0])
+        return next((one for one in found if one.rank < candidate.rank), None)
+
     def by_run(self, candidate):
         """Return the evidence for a cause in each of several runs alone."""
         probes = self.probes

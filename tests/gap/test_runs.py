@@ -91,16 +91,20 @@ def test_a_stage_with_another_zero_is_one_change():
 
 @pytest.mark.slow
 def test_an_optic_of_any_axis_that_one_run_has_is_one_change():
-    film = LinearRetarder(retardance=1.6 * u.deg, theta=100 * u.deg, name="film")
-    second = insert_optic(data.chain(), film, after="hwp")
-    runs = [data.observed(data.chain(), seed=3, name=JULY), data.observed(second, name=OCTOBER)]
-    found = diagnose(data.chain(), runs, changes=True)
-    assert [cause.name for cause in found.causes] == [f"static_retarder:hwp/dataset:{OCTOBER}"]
-    (change,) = to_dict(found)["changes"]
-    assert change["words"].startswith(
-        f'In "{OCTOBER}" only there is a retarder that is static downstream of the half-wave plate'
-    )
-    assert change["cell"]["place"] == "after:hwp"
+    # of the second one the derivatives alone say that it depends on the wavelength
+    for run, size, theta in ((OCTOBER, 1.6, 100), (JULY, 2.2, 92)):
+        film = LinearRetarder(retardance=size * u.deg, theta=theta * u.deg, name="film")
+        chains = {name: data.chain() for name in (JULY, OCTOBER)}
+        chains[run] = insert_optic(chains[run], film, after="hwp")
+        runs = [data.observed(chains[JULY], seed=3, name=JULY)]
+        runs.append(data.observed(chains[OCTOBER], name=OCTOBER))
+        found = diagnose(data.chain(), runs, changes=True, cross_validate=False)
+        assert [cause.name for cause in found.causes] == [f"static_retarder:hwp/dataset:{run}"]
+        (change,) = to_dict(found)["changes"]
+        assert change["words"].startswith(
+            f'In "{run}" only there is a retarder that is static downstream of the half-wave plate'
+        )
+        assert change["cell"]["place"] == "after:hwp"
 
 
 @pytest.mark.slow
