@@ -46,11 +46,11 @@ _DEPENDENCE = {
     "direction": -1.5,
     "move": -1.5,
     "time2": -1.0,
-    "dataset": -2.0,
+    "dataset": 0.0,
 }
 _OTHER = -0.5
-# and what changes in one of several runs only needs another
-_ALONE = -1.0
+# and what is in one of several runs only needs another, be it constant there or not
+_ALONE = -2.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
 #: Evidence that is the same to so many decimals is of causes that do the same.
@@ -172,7 +172,10 @@ class Scan:
             for one in steps:
                 if one.evidence > best.evidence - ALIKE:
                     probes.waves.setdefault(one.cell.dependence, probes.waves_of(one.cell))
-        for degree in _FREER if probes is not None else ():
+        # an optic that one run has was asked for with its usual law only, of several components
+        has_one_law = candidate.is_named and split_run(candidate.named.dependence)[1] is not None
+        degrees = (_DEGREES[0], *_FREER) if has_one_law else _FREER
+        for degree in degrees if probes is not None else ():
             if candidate.is_named:
                 names = [one.named for one in among if one.is_named]
                 found = _named(probes, [candidate.named], self.temper, degree, names)
@@ -184,6 +187,13 @@ class Scan:
     def of_cell(self, cell, degree):
         """Return the candidate of a cell with a law of some degree, None where it does nothing."""
         return next(iter(_of_cell(self.probes, cell, degree, self.temper)), None)
+
+    def constant(self, candidate):
+        """Return a name with the same sizes at all wavelengths, None where that is no other law."""
+        if not candidate.is_named:
+            return None
+        found = _named(self.probes, [candidate.named], self.temper, _DEGREES[0])
+        return next((one for one in found if one.rank < candidate.rank), None)
 
     def by_run(self, candidate):
         """Return the evidence for a cause in each of several runs alone."""
@@ -341,7 +351,7 @@ def _candidates(place, kind, names, by_law, temper):
 @cache
 def _prior(dependence):
     text, run = split_run(dependence)
-    alone = _ALONE if run is not None and text != "dataset" else 0.0
+    alone = _ALONE if run is not None else 0.0
     return _DEPENDENCE.get(text.partition(":")[0], _OTHER) + alone
 
 
@@ -481,7 +491,10 @@ def _bent_name(probes, effect, context):
 
 
 def _with_name(effect, model, values, share, temper, context=None):
-    prior, spectrum, statistic = float(np.log(NAMED)), (values, share, 1.0), float(share.sum())
+    is_any = split_run(effect.dependence)[1] is not None and not effect.around
+    # no name makes a new optic more probable than the same without one; zeros of stages do move
+    prior = _prior(effect.dependence) if is_any else float(np.log(NAMED))
+    spectrum, statistic = (values, share, 1.0), float(share.sum())
     cell, rank = effect.cell(model.trains), int(_rank(values, 1.0))
     one = Candidate(effect, cell, statistic, rank, 0.0, prior, spectrum, context=context)
     return one.tempered(temper)

@@ -174,6 +174,10 @@ def _sentence(cell, entry, names, wavelength, of, named):
     size = _size(entry["size"], wavelength, 2.0 if cell.kind == "gain" else 1.0)
     chance = _chance(entry, of)
     run = entry["dataset"]
+    if named and len(entry["size"]) > 1:
+        # an optic of any axis: none of its components is the change
+        told = f"clearest component {_number(*size[:2])} {size[2]}, " if size else ""
+        return f'In "{run}" only there is a {named} ({told}{chance}).'
     if constant and len(names) == 2 and size:
         # of the second against the first, whichever of the two has it
         sign = 1 if run == names[1] else -1

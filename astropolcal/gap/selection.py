@@ -556,7 +556,13 @@ def _simple(state, found, fitted, instead):
     named = [one for one in few if one.is_named and one.evidence > _FAR_PROMISE * best]
     few = [one for one in few if one.evidence > _HALF * best]
     few = _distinct(few, _FITTED[1]) + _distinct(named, _FITTED[1])
-    return _new(state, {one.name: one for one in few}.values(), fitted, instead)
+    new = _new(state, {one.name: one for one in few}.values(), fitted, instead)
+    # what derivatives ask a law for may be in the second order
+    constant = found.constant(fitted[0].chosen[0])
+    constant = constant and _extended(state, (constant,), instead)
+    if constant and constant.evidence(found.temper) > fitted[0].evidence(found.temper):
+        fitted[0] = constant
+    return new
 
 
 def _new(state, added, fitted, instead):

@@ -19,6 +19,7 @@ from astropolcal.gap.effects import (
     get_effect,
 )
 from astropolcal.gap.effects.effect import tracking_laws
+from astropolcal.measurement.parameters import with_own
 from astropolcal.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -104,6 +105,25 @@ def test_an_optic_is_the_same_in_all_datasets_whatever_is_upstream_of_it():
         assert upstream == [f"gap_{name}".replace(":", "_")] * there
         assert "half-wave" not in found[name].title
     assert found["static_diattenuator"].title.endswith("modulator")
+
+
+def test_plates_with_values_of_their_own_share_no_effect_with_one_in_front_of_them():
+    free = {"fixed": {"theta": False}}
+    modulator, unit = (
+        optics.LinearRetarder(retardance=90 * u.deg, mount=name, name=name, **free)
+        for name in ("modulator", "unit")
+    )
+    alone, both = (
+        [*front, optics.WollastonPrism(name="prism")] for front in ([modulator], [unit, modulator])
+    )
+    for runs, expected in [
+        ((alone, alone), [""]),
+        ((both, both), ["", ":modulator", ":modulator_b"]),
+        ((alone, both), [":modulator", ":unit", ":modulator_b"]),
+    ]:
+        chains = with_own([join(run) for run in runs], "ab", ["modulator.theta"])[0]
+        found = adapted([get_effect("hwp_diattenuation")], chains)
+        assert [one.name for one in found] == [f"hwp_diattenuation{end}" for end in expected]
 
 
 def test_law_of_the_plate_is_that_of_each_datasets_instrument():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from astropolcal import instruments
-from astropolcal.chain import join, leaves
+from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap import diagnose
 from astropolcal.gap.cells import Cell, Probes, dependences
@@ -87,6 +87,24 @@ def test_a_stage_with_another_zero_is_one_change():
     (change,) = to_dict(found)["changes"]
     assert "the zero of the angle of the half-wave plate changed by 0.4" in change["words"]
     assert change["cell"]["place"] == "in:hwp"
+
+
+@pytest.mark.slow
+def test_an_optic_of_any_axis_that_one_run_has_is_one_change():
+    # of the second one the derivatives alone say that it depends on the wavelength
+    for run, size, theta in ((OCTOBER, 1.6, 100), (JULY, 2.2, 92)):
+        film = LinearRetarder(retardance=size * u.deg, theta=theta * u.deg, name="film")
+        chains = {name: data.chain() for name in (JULY, OCTOBER)}
+        chains[run] = insert_optic(chains[run], film, after="hwp")
+        runs = [data.observed(chains[JULY], seed=3, name=JULY)]
+        runs.append(data.observed(chains[OCTOBER], name=OCTOBER))
+        found = diagnose(data.chain(), runs, changes=True, cross_validate=False)
+        assert [cause.name for cause in found.causes] == [f"static_retarder:hwp/dataset:{run}"]
+        (change,) = to_dict(found)["changes"]
+        assert change["words"].startswith(
+            f'In "{run}" only there is a retarder that is static downstream of the half-wave plate'
+        )
+        assert change["cell"]["place"] == "after:hwp"
 
 
 @pytest.mark.slow

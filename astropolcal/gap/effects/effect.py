@@ -443,17 +443,23 @@ class Effect:
         """Return the effect once for each optic of its kind, itself for the first."""
         if self.acts_on is None or self.optic is not None:
             return [self]
-        every = [[o.name for o in Roles(chain).all(self.acts_on)] for chain in chains]
-        names = dict.fromkeys(name for found in every for name in found)
-        first = {found[0] for found in every if found}
-        if any(name in first for found in every for name in found[1:]):
+        every = [found for chain in chains if (found := Roles(chain).all(self.acts_on))]
+        names = dict.fromkeys(o.name for found in every for o in found)
+        first = {found[0].name for found in every}
+        # one with values of its own in a dataset has another name there, on the same stage
+        unlike = len({found[0].stage for found in every}) > 1
+        if unlike or any(o.name in first for found in every for o in found[1:]):
             # which one is first depends on the dataset: none has the plain name
             return [self.at(name) for name in names]
         # the first of a kind keeps the plain name, in whichever dataset it is
         return [self, *(self.at(name) for name in names if name not in first)]
 
     def per_run(self, runs):
-        """Return itself, or once for each run in which it may differ: of two only the second."""
+        """Return itself, or once for each run in which it may differ.
+
+        An orientation, which the model has for all runs, differs in the second of two as it does
+        in the first.
+        """
         if self.dependence != OWN_RUN:
             return [self]
         return [
@@ -462,7 +468,7 @@ class Effect:
                 title=f'{self.title} in "{run}"',
                 dependence=f"dataset:{run}",
             )
-            for run in (runs[1:] if len(runs) == 2 else runs)
+            for run in (runs[1:] if self.around and len(runs) == 2 else runs)
         ]
 
     def applies(self, chains):

@@ -582,3 +582,9 @@ OF_RUNS = [
         ("hwp", "half-wave plate", _PLATE), ("derotator", "derotator", _DEROTATOR),
     )
 ]  # fmt: skip
+# of any axis, which is one optic and two or three cells
+OF_RUNS += [
+    effect.changed(dependence=OWN_RUN)
+    for effect in _RELAY_EFFECTS
+    if effect.name in ("static_retarder", "static_diattenuator")
+]

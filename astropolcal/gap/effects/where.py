@@ -262,8 +262,8 @@ def adapted(effects, chains, runs=()):
     ['m3_diattenuation', 'm3_diattenuation:m4']
     """
     chains = list(chains)
-    found = [own for effect in effects for own in effect.per_run(runs)]
-    found = [one for effect in found for one in effect.per_optic(chains)]
+    found = [own for effect in effects for own in effect.per_optic(chains)]
+    found = [one for effect in found for one in effect.per_run(runs)]
     found = [one for one in found if one.applies(chains)]
     every = [Roles(chain) for chain in chains]
     plates = [o for roles in every for o in roles.all("plate")]
