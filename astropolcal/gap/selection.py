@@ -335,10 +335,7 @@ def _checked(task, best):
 def _worse(best, steps, history, groups):
     """Return the numbers of causes that are impossible or contradicted by left-out frames."""
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
-    if not impossible and steps[0].model.p_value > _NOISE:
-        # the residuals are no larger than noise: a pattern in them may be that of the noise itself
-        enough = ENOUGH * best.model.alike
-        impossible = [i for i, o in enumerate(best.chosen) if o.evidence < enough > ENOUGH]
+    impossible = impossible or _of_noise(best, steps[0].model)
     if impossible or groups is None:
         return impossible[-1:]
     pairs = zip(pairwise(history), steps[1:], strict=True)
@@ -354,6 +351,23 @@ def _worse(best, steps, history, groups):
         or _worsens(whole, foreseen(best.model.without([best.chosen[i].name]), groups), scatter)
     ]
     return found[-1:] if few else found
+
+
+def _of_noise(best, base):
+    """Return the numbers of causes whose pattern may be that of the noise itself.
+
+    That may be where the residuals without any cause are no larger than noise, and where they are
+    all that tells it: then noise may as well be larger in these few frames, unless it is beyond
+    doubt that there is a cause.
+    """
+    stated, few = all(channel.stated for channel in base.problem.channels), []
+    for i, one in enumerate(best.chosen if base.p_value > _NOISE or not stated else ()):
+        scatter, error = best.model.unsteadiness(one.name)
+        surely = scatter * (scatter > 1 + 2 * error)
+        more = surely if stated else max(scatter, 1.0) * (1 + 2 * error)
+        if one.evidence < ENOUGH * max(more, best.model.alike) > ENOUGH:
+            few.append(i)
+    return few if stated or len(few) == len(best.chosen) else []
 
 
 def _worsens(after, before, scatter):
