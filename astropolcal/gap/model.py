@@ -70,6 +70,8 @@ _FEW = 3
 _SEARCHES, _STEPS = 2, 15
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
+# a retardance as near to half a wave as this (radian) is at it
+_HALF_WAVE = 1e-3
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -251,6 +253,21 @@ class Model:
             start = min(others, key=lambda q: np.sum(self.problem.residual(q) ** 2))
         moved = start is not self.fit.coefficients
         return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
+
+    def off_half_waves(self):
+        """Return the model with retardances moved that its fit left at half a wave, None of none.
+
+        Where the data ask for more than half a wave can do, something is missing that no derivative
+        shows there: another retarder does nothing to first order.
+        """
+        vector = self.problem.vector(self.fit.coefficients).copy()
+        before = vector.copy()
+        for slot in self.problem.free.slots:
+            pressed = np.abs(np.sin(vector[slot.slice])) < _HALF_WAVE
+            if slot.name.endswith(".retardance") and pressed.mean() > _SHOWS:
+                vector[slot.slice] += pressed * FINITE
+        start = Fit(self.problem.coefficients(vector), np.inf, False)
+        return Model(self.problem, start, self.added) if np.any(vector != before) else None
 
     def without(self, names):
         """Return the model without some of its effects, to first order."""

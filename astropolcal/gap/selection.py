@@ -20,7 +20,7 @@ from scipy.special import expit
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
-from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, preference, scan
+from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
 from astropolcal.gap.cells import Cell, alike, count_runs
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -520,7 +520,7 @@ def _extensions(task, states, known, most):
     instead = partial(_in_place, replace(task, library=names))
     temper = min(known[state.outline].temper for state in states)
     fitted = _ranked(_fitted(_grown(states, known, temper, most)[:most], temper, instead))
-    for more in (_far, _simple) if not k else ():
+    for more in (_far, _simple, _at_half_a_wave) if not k else ():
         new = more(states[0], known[states[0].outline], fitted, instead)
         fitted = _ranked(fitted + new)
     return fitted
@@ -571,6 +571,24 @@ def _simple(state, found, fitted, instead):
     few = [one for one in few if one.evidence > _HALF * best]
     few = _distinct(few, _FITTED[1]) + _distinct(named, _FITTED[1])
     return _new(state, {one.name: one for one in few}.values(), fitted, instead)
+
+
+def _at_half_a_wave(state, found, fitted, instead):
+    """Return the set of a retarder beside an optic that the nominal fit left at half a wave."""
+    moved = state.model.off_half_waves() if state.model.p_value < REMAINDER else None
+    if moved is None or all(one.is_named for one in found.candidates):
+        return []
+    cells = [Cell(*k, "constant") for k in found.probes.slopes if k[1] in _OF_OPTIC[:2]]
+    added = [Candidate(None, cell, 0.0, 1, 0.0, degree=0) for cell in cells]
+    tried = [(state.model.with_effects([o.recipe], like=moved, **_QUICK), o.name) for o in added]
+    model, name = min(tried, key=lambda one: one[0].fit.chi2)
+    # what it does is known where it is
+    beside = scan(model, without=name, temper=max(1.0, model.mean_square)).candidates
+    one = next((one for one in beside if one.name == name), None)
+    if one is None or name in {o.name for grown in fitted for o in grown.chosen}:
+        return []
+    grown = _State(state.model.with_effects([one.recipe], like=model, **_QUICK), [one])
+    return [grown] if grown.model.is_physical(name) else []
 
 
 def _new(state, added, fitted, instead):
@@ -651,7 +669,9 @@ def _exchanged(task, best, first):
     task.say("each cause beside all the others")
     for one in progress.steps(best.chosen[::-1], "causes"):
         others = [other for other in best.chosen if other is not one]
-        found, is_near = _beside(task, best, one, like) if others else (first, False)
+        hidden = all(other.name != one.name for other in first.candidates)
+        beside = others or hidden
+        found, is_near = _beside(task, best, one, like) if beside else (first, False)
         like = like or (found.probes if is_near else None)
         scans[one.name] = found
         if len(best.chosen) > _MOST:
