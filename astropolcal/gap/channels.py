@@ -277,19 +277,20 @@ def _left_over(columns, values):
 
 
 def _best_degree(sequence, values, seen, beside):
-    """Return the degree of the drift, beside other columns (F, k), by an information criterion.
+    """Return the degree of the drift, with other columns (F, k), by an information criterion.
 
-    That of Schwarz (1978), corrected for few data (McQuarrie 1999): in a dozen frames a curve that
-    bends more leaves no flicker, whatever the lamp does.
+    That of Schwarz (1978), corrected for the few data that the columns leave (McQuarrie 1999): in a
+    dozen frames a curve that bends more leaves no flicker, whatever the lamp does.
     """
     scores, n = [], int(seen.sum())
     for degree in range(_LARGEST_DEGREE + 1):
         curve = np.polynomial.legendre.legvander(sequence, degree)
-        square, rank = _left_over(np.concatenate([curve, beside], axis=1)[seen], values[seen])
+        square, rank = _left_over(curve[seen], values[seen])
+        left = n - rank - beside.shape[1]
         # a curve through all frames would leave no flicker to be seen
-        if n - rank < 3:
+        if left < 3:
             break
-        scores.append(n * np.log(max(square / n, 1e-24)) + rank * np.log(n) * n / (n - rank - 2))
+        scores.append(n * np.log(max(square / n, 1e-24)) + rank * np.log(n) * n / (left - 2))
     return int(np.argmin(scores)) if scores else 0
 
 

@@ -576,9 +576,9 @@ def _simple(state, found, fitted, instead):
 def _at_half_a_wave(state, found, fitted, instead):
     """Return the set of a retarder beside an optic that the nominal fit left at half a wave."""
     moved = state.model.off_half_waves() if state.model.p_value < REMAINDER else None
-    if moved is None or all(one.is_named for one in found.candidates):
-        return []
     cells = [Cell(*k, "constant") for k in found.probes.slopes if k[1] in _OF_OPTIC[:2]]
+    if moved is None or not cells or all(one.is_named for one in found.candidates):
+        return []
     added = [Candidate(None, cell, 0.0, 1, 0.0, degree=0) for cell in cells]
     tried = [(state.model.with_effects([o.recipe], like=moved, **_QUICK), o.name) for o in added]
     model, name = min(tried, key=lambda one: one[0].fit.chi2)
