@@ -262,7 +262,9 @@ def test_pulls_are_one(kind):
 def test_a_planted_fault_is_found_and_none_without_one(kind):
     assert diagnose(kind.chain(), observed(kind, seed=3), cross_validate=False).verdict == "none"
     chain, name = truth_with_fault(kind)
-    found = diagnose(kind.chain(), observed(kind, chain, seed=3, flux=1e6))
+    # four beams share the light: with less of it the noise alone is half of what a tilt does
+    flux = 1e7 if kind.name == "fourbeams" else 1e6
+    found = diagnose(kind.chain(), observed(kind, chain, seed=3, flux=flux))
     words = summary(found)
     assert "double diff" not in words.replace("in double diff.", "")
     assert "half-wave" not in words or kind.name == "fourbeams"

@@ -70,6 +70,8 @@ _FEW = 3
 _SEARCHES, _STEPS = 2, 15
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
+# a retardance as near to half a wave as this (radian) is at it
+_HALF_WAVE = 1e-3
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -158,6 +160,26 @@ class Model:
         same = float(both / max(each, 1e-300))
         return (1 + same) / (1 - same) if same > _CORRELATED / np.sqrt(count) else 1.0
 
+    def unsteadiness(self, name):
+        """
+        Return how much larger the variance of an effect's size is than noise says, and its error.
+
+        As the frames tell, by how much each of them pulls at the size (White 1980,
+        doi:10.2307/1912934), in units of the mean square of the residuals. It is more than 1 of
+        noise that is alike at several wavelengths, has heavy tails, or is larger in the frames or
+        at the wavelengths that show the effect.
+        """
+        seen, pulls = self.without([name]).residual - self.linear.residual, []
+        for channel, rows in zip(self.problem.channels, self.problem.segments, strict=True):
+            shown, left = (part[rows].reshape(channel.shape) for part in (seen, self.residual))
+            pulls.append([np.sum(shown * part, axis=(0, 1)) for part in (shown, left)])
+        own, pull = np.concatenate(pulls, axis=1)
+        # so many frames of equal weight would tell as much
+        count = max(own.sum() ** 2 / max(np.sum(own**2), 1e-300), 1.5)
+        found = np.sum(pull**2) / max(own.sum(), 1e-300) * count / (count - 1)
+        found *= self.problem.n_data / max(self.linear.freedom, 1) / max(self.mean_square, 1.0)
+        return float(found), float(np.sqrt(2 / count))
+
     def could_hide(self):
         """Return the excess of chi-square that the residuals do not exclude (95 %)."""
         freedom, spread = self.linear.freedom, 2 * self.alike * _ONE_SIDED**2
@@ -231,6 +253,21 @@ class Model:
             start = min(others, key=lambda q: np.sum(self.problem.residual(q) ** 2))
         moved = start is not self.fit.coefficients
         return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
+
+    def off_half_waves(self):
+        """Return the model with retardances moved that its fit left at half a wave, None of none.
+
+        Where the data ask for more than half a wave can do, something is missing that no derivative
+        shows there: another retarder does nothing to first order.
+        """
+        vector = self.problem.vector(self.fit.coefficients).copy()
+        before = vector.copy()
+        for slot in self.problem.free.slots:
+            pressed = np.abs(np.sin(vector[slot.slice])) < _HALF_WAVE
+            if slot.name.endswith(".retardance") and pressed.mean() > _SHOWS:
+                vector[slot.slice] += pressed * FINITE
+        start = Fit(self.problem.coefficients(vector), np.inf, False)
+        return Model(self.problem, start, self.added) if np.any(vector != before) else None
 
     def without(self, names):
         """Return the model without some of its effects, to first order."""

@@ -20,7 +20,7 @@ from scipy.special import expit
 from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
-from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, preference, scan
+from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
 from astropolcal.gap.cells import Cell, alike, count_runs
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
@@ -335,10 +335,7 @@ def _checked(task, best):
 def _worse(best, steps, history, groups):
     """Return the numbers of causes that are impossible or contradicted by left-out frames."""
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
-    if not impossible and steps[0].model.p_value > _NOISE:
-        # the residuals are no larger than noise: a pattern in them may be that of the noise itself
-        enough = ENOUGH * best.model.alike
-        impossible = [i for i, o in enumerate(best.chosen) if o.evidence < enough > ENOUGH]
+    impossible = impossible or _of_noise(best, steps[0].model)
     if impossible or groups is None:
         return impossible[-1:]
     pairs = zip(pairwise(history), steps[1:], strict=True)
@@ -354,6 +351,23 @@ def _worse(best, steps, history, groups):
         or _worsens(whole, foreseen(best.model.without([best.chosen[i].name]), groups), scatter)
     ]
     return found[-1:] if few else found
+
+
+def _of_noise(best, base):
+    """Return the numbers of causes whose pattern may be that of the noise itself.
+
+    That may be where the residuals without any cause are no larger than noise, and where they are
+    all that tells it: then noise may as well be larger in these few frames, unless it is beyond
+    doubt that there is a cause.
+    """
+    stated, few = all(channel.stated for channel in base.problem.channels), []
+    for i, one in enumerate(best.chosen if base.p_value > _NOISE or not stated else ()):
+        scatter, error = best.model.unsteadiness(one.name)
+        surely = scatter * (scatter > 1 + 2 * error)
+        more = surely if stated else max(scatter, 1.0) * (1 + 2 * error)
+        if one.evidence < ENOUGH * max(more, best.model.alike) > ENOUGH:
+            few.append(i)
+    return few if stated or len(few) == len(best.chosen) else []
 
 
 def _worsens(after, before, scatter):
@@ -506,7 +520,7 @@ def _extensions(task, states, known, most):
     instead = partial(_in_place, replace(task, library=names))
     temper = min(known[state.outline].temper for state in states)
     fitted = _ranked(_fitted(_grown(states, known, temper, most)[:most], temper, instead))
-    for more in (_far, _simple) if not k else ():
+    for more in (_far, _simple, _at_half_a_wave) if not k else ():
         new = more(states[0], known[states[0].outline], fitted, instead)
         fitted = _ranked(fitted + new)
     return fitted
@@ -563,6 +577,24 @@ def _simple(state, found, fitted, instead):
     if constant and constant.evidence(found.temper) > fitted[0].evidence(found.temper):
         fitted[0] = constant
     return new
+
+
+def _at_half_a_wave(state, found, fitted, instead):
+    """Return the set of a retarder beside an optic that the nominal fit left at half a wave."""
+    moved = state.model.off_half_waves() if state.model.p_value < REMAINDER else None
+    cells = [Cell(*k, "constant") for k in found.probes.slopes if k[1] in _OF_OPTIC[:2]]
+    if moved is None or not cells or all(one.is_named for one in found.candidates):
+        return []
+    added = [Candidate(None, cell, 0.0, 1, 0.0, degree=0) for cell in cells]
+    tried = [(state.model.with_effects([o.recipe], like=moved, **_QUICK), o.name) for o in added]
+    model, name = min(tried, key=lambda one: one[0].fit.chi2)
+    # what it does is known where it is
+    beside = scan(model, without=name, temper=max(1.0, model.mean_square)).candidates
+    one = next((one for one in beside if one.name == name), None)
+    if one is None or name in {o.name for grown in fitted for o in grown.chosen}:
+        return []
+    grown = _State(state.model.with_effects([one.recipe], like=model, **_QUICK), [one])
+    return [grown] if grown.model.is_physical(name) else []
 
 
 def _new(state, added, fitted, instead):
@@ -643,7 +675,9 @@ def _exchanged(task, best, first):
     task.say("each cause beside all the others")
     for one in progress.steps(best.chosen[::-1], "causes"):
         others = [other for other in best.chosen if other is not one]
-        found, is_near = _beside(task, best, one, like) if others else (first, False)
+        hidden = all(other.name != one.name for other in first.candidates)
+        beside = others or hidden
+        found, is_near = _beside(task, best, one, like) if beside else (first, False)
         like = like or (found.probes if is_near else None)
         scans[one.name] = found
         if len(best.chosen) > _MOST:

@@ -168,10 +168,22 @@ def test_the_drift_has_the_degree_that_it_has():
 
 
 def test_a_drift_never_takes_all_frames():
-    x = np.linspace(0, 1, 5)
+    x = np.linspace(-1, 1, 5)
     values = np.random.default_rng(1).normal(size=5)
     # four columns would leave one frame: at least three are kept
-    assert _best_degree(2 * x - 1, values, np.ones(5, dtype=bool)) <= 1
+    assert _best_degree(x, values, np.ones(5, dtype=bool), np.zeros((5, 0))) <= 1
+    # nor nearly all of a dozen beside what the plate does: the flicker is left
+    x, plate = np.linspace(-1, 1, 12), np.tile(np.deg2rad([0, 22.5, 45, 67.5]), 3)
+    columns = np.stack([part(k * plate) for k in (2, 4) for part in (np.cos, np.sin)], axis=1)
+    weight, found = np.full((W, 12), 1e4), []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        flicker = 0.005 * rng.normal(size=12) + 1e-4 * rng.normal(size=(W, 12))
+        found.append(_Lamp(flicker, weight, x / 2 + 0.5, columns).flicker)
+    assert min(found) > 0.001
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.005, rel=0.2)
+    drift = 0.1 * x + 0.05 * x**2
+    assert _best_degree(x, drift + flicker.mean(axis=0), np.ones(12, dtype=bool), columns) == 2
 
 
 def test_flicker_is_that_of_the_lamp():

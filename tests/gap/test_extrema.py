@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from gap_data import WAVELENGTH as DATA_WAVELENGTH
 from gap_data import chain, clean_model, observed
 from gap_setups import cassegrain
@@ -135,3 +136,27 @@ def test_a_held_source_is_looked_at_like_all_others():
         source = {"standard_polarization", "source/diattenuation_d/constant"}
         assert source & {one.name for one in group}
         assert found.remainder_p_value > 1e-3
+
+
+@pytest.mark.slow
+def test_a_retarder_beside_a_plate_that_is_pressed_to_half_a_wave():
+    """No derivative shows it there; what a derivative shows instead was given 99 %."""
+    wavelength = np.linspace(0.5, 0.9, 6) * u.um
+    law = (176 + 3 * np.linspace(-1, 1, 6) ** 2) * u.deg
+    table = QTable({"calibrator": np.repeat(np.arange(6) * 30.0, 8) * u.deg})
+    table["hwp"] = np.tile(np.arange(8) * 11.25, 6) * u.deg
+    lamp = optics.LinearPolarizer(mount="calibrator", name="calibrator")
+    prism = optics.WollastonPrism(efficiency=np.full(6, 0.98), name="wollaston")
+    plate, known = (
+        optics.LinearRetarder(retardance=one, mount="hwp", name="hwp")
+        for one in (law, np.full(6, 178) * u.deg)
+    )
+    some = optics.LinearRetarder(retardance=3 * u.deg, theta=45 * u.deg, name="window")
+    truth = join([lamp, plate, some, prism])
+    for seed in (0, 2):
+        run = simulate(truth, wavelength, table, flux=1e6, seed=seed, name="lamp")
+        found = diagnose(join([lamp, known, prism]), run, cross_validate=False)
+        (cause,) = found.causes
+        assert cause.name == "after:hwp/retardance_d/constant", (seed, found)
+        assert cause.probability > 0.9
+        assert found.remainder_p_value > 0.01

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise import estimates
 from astropolcal.exceptions import FitError
-from astropolcal.gap import channels
+from astropolcal.gap import channels, diagnose
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.report import Fitted
 from astropolcal.observations import Observations
+from astropolcal.optics import BeamGain
 
 W, F = 11, 60
 ANGLES = {
@@ -258,3 +259,25 @@ def test_expected_fluxes_are_there_for_masked_data_too():
     problem.settle_noise()
     (found,) = problem.fluxes
     assert found[0, 2, 4] == pytest.approx(observations.flux_right[4, 2], rel=0.02)
+
+
+@pytest.mark.slow
+def test_noise_that_no_table_states_is_no_cause():
+    """Alike at neighbouring wavelengths, or larger at some; a gain beside it is one."""
+    true, n = data.chain(), len(data.WAVELENGTH)
+    gain = true | BeamGain(imbalance=0.005, name="flat")
+    uneven = np.where(np.arange(n) % 3 == 1, 3.0, 1.0)
+    cases = [(true, 0, 0.7, 1.0), (true, 12, 0.0, uneven), (gain, 12, 0.0, 1.0)]
+    for chain, seed, alike, size in cases:
+        table = data.observed(chain, noise=False).to_table()
+        table.remove_columns([name for name in table.colnames if name.endswith("_err")])
+        rng = np.random.default_rng(seed)
+        for beam in ("flux_right", "flux_left"):
+            noise = rng.normal(size=(len(table) // n, n))
+            for k in range(1, n):
+                noise[:, k] = alike * noise[:, k - 1] + np.sqrt(1 - alike**2) * noise[:, k]
+            table[beam] = table[beam] * (1 + 2e-3 * (size * noise).ravel())
+        run = Observations.from_table(table, name="lamp")
+        found = diagnose(data.chain(), run, cross_validate=False)
+        assert (found.verdict == "none") == (chain is true), (seed, found)
+        assert bool(found.causes) == (chain is gain)
