@@ -151,6 +151,7 @@ def test_a_polarized_standard_is_that_of_the_catalogue_with_its_errors():
     np.testing.assert_allclose(np.rad2deg(np.angle(mean)) / 2, 59, atol=3)
 
 
+@pytest.mark.slow
 def test_the_angle_of_a_polarized_standard_is_no_better_known_than_in_the_catalogue():
     """Far from the wavelengths at which it was measured, too, and whatever law it follows there."""
     for target in ("HD 30675", "HD 147084", "SLS 3386"):

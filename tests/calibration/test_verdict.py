@@ -287,7 +287,7 @@ def test_the_constant_of_a_law_far_from_its_frames():
 
 def test_orientations_that_hang_on_a_bound():
     entry = {"unit": u.deg, "bounds": (-5, 5), "std_released": np.array(2.4)}
-    for by, words in (("hwp.theta", "orientations depend on the bound of derotator.theta"), ("a.q", "")):
+    for by, words in (("hwp.theta", "orientations depend on the bound of hwp.theta"), ("a.q", "")):
         free = {
             "hwp.theta": _entry(5.0, unit=u.deg, at_bound=np.array(True)),
             "polarizer.theta": _entry(1.0, 0.2, conditional_on=np.array(f"b.q, {by}"), **entry),
