@@ -280,7 +280,7 @@ def _best_degree(sequence, values, seen, beside):
     """Return the degree of the drift, with other columns (F, k), by an information criterion.
 
     That of Schwarz (1978), corrected for the few data that the columns leave (McQuarrie 1999): in a
-    dozen frames a curve that bends more leaves no flicker, whatever the lamp does.
+    dozen frames a curve that bends more leaves no flicker of any lamp.
     """
     scores, n = [], int(seen.sum())
     for degree in range(_LARGEST_DEGREE + 1):
