@@ -189,7 +189,7 @@ class Scan:
         return next(iter(_of_cell(self.probes, cell, degree, self.temper)), None)
 
     def constant(self, candidate):
-        """Return a name with the same sizes at all wavelengths, None where that is the law it has."""
+        """Return a name with the same sizes at all wavelengths, None where its law is that."""
         if not candidate.is_named:
             return None
         found = _named(self.probes, [candidate.named], self.temper, _DEGREES[0])
