@@ -42,18 +42,17 @@ _MOST_STEPS = 16
 _SAME = 1e-9
 # size (radian) of a retardance that is tried where its derivative vanishes
 FINITE = 0.1
-#: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
-SIZES = {
-    "retardance": 0.1,
-    "rotation": 0.02,
-    "diattenuation": 0.02,
-    "depolarization": 0.05,
+# usual size of a perturbation by kind, the scale of its prior, and the most that it may be (radian,
+# or a share): beyond it is no perturbation
+_SIZES = {
+    "retardance": (0.1, np.pi),
+    "rotation": (0.02, np.pi / 4),
+    "diattenuation": (0.02, 3.0),
+    "depolarization": (0.05, 3.0),
     # what follows the flux would follow the flicker of the lamp as well if it could be large
-    "background": 0.003,
-    "nonlinearity": 0.003,
-    "persistence": 0.003,
+    **dict.fromkeys(("background", "nonlinearity", "persistence"), (0.003, 0.5)),
 }
-_USUAL = 0.02
+_USUAL = 0.02, 0.5
 
 
 @dataclass(frozen=True, order=True)
@@ -102,7 +101,12 @@ class Cell:
     @property
     def scale(self):
         """Usual size, in radian or as a share."""
-        return SIZES.get(self.kind.partition("_")[0], _USUAL)
+        return _SIZES.get(self.kind.partition("_")[0], _USUAL)[0]
+
+    @property
+    def limit(self):
+        """The most that it may be, in radian or as a share."""
+        return _SIZES.get(self.kind.partition("_")[0], _USUAL)[1]
 
     @property
     def title(self):
