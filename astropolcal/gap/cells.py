@@ -24,14 +24,16 @@ from astropolcal.optics.positions import COORDINATES
 
 __all__ = []
 
-#: Kinds that only a detector may have, and the dependence of each.
-DETECTED = {
-    "background": "flux",
-    "background_of_one_beam": "flux",
-    "nonlinearity": "flux",
-    "persistence": "previous",
-    "crosstalk": "constant",
+# kinds that only a detector may have: dependence and words of each
+_DETECTED = {
+    "background": ("flux", "background in both beams"),
+    "background_of_one_beam": ("flux", "background in one beam"),
+    "nonlinearity": ("flux", "answer that is not linear"),
+    "persistence": ("previous", "light of the frame before"),
+    "crosstalk": ("constant", "light of one beam in the other"),
 }
+#: Kinds that only a detector may have, and the dependence of each.
+DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -131,11 +133,7 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
-    "background": "background in both beams",
-    "background_of_one_beam": "background in one beam",
-    "nonlinearity": "answer that is not linear",
-    "persistence": "light of the frame before",
-    "crosstalk": "light of one beam in the other",
+    **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 
 

@@ -187,8 +187,8 @@ def _run(i, train, observations):
 
 def _turned(run, name):
     """Return the run with each of its stages turned, those of the sky aside."""
-    own = {s: angles for s, angles in run.positions.items() if s not in (*_SKY, GROUP)}
-    own = {stage: angles for stage, angles in own.items() if angles.dtype.kind == "f"}
+    # states and groups are no angles
+    own = {s: a for s, a in run.positions.items() if s not in _SKY and a.dtype.kind == "f"}
     found = []
     for stage, by in product(own, _TURNED_BY):
         what = f"the run of {name} with {stage} turned by {by:g} deg"

@@ -494,8 +494,6 @@ class Effect:
         if place is None or (self.when is not None and not self.when(roles)):
             return False
         what, stage, *_ = (*split_run(self._dependence(roles))[0].split(":"), "")
-        if self._dependence(roles) == OWN_RUN:
-            return False
         needed = what in ("harmonic", "direction", "move")
         return not needed or any(o.stage == stage for o in roles.leaves)
 
@@ -505,7 +503,7 @@ class Effect:
     def _dependence(self, roles):
         """Return the dependence, with the name of the stage of the effect's own optic."""
         text = split_run(self.dependence)[0]
-        if ":own" not in text or self.dependence == OWN_RUN:
+        if ":own" not in text:
             return self.dependence
         stage = f":{self.where.anchor(roles).stage}"
         return text.replace(":own", stage) + self.dependence.removeprefix(text)

@@ -441,23 +441,15 @@ def _bound(name, what, where, kind, size, free="theta"):
 
 
 _HELD_EFFECTS = [
-    _held(
-        "hwp_misalignment", _PLATE, "orientation", _HALF_DEGREE,
-        _PHASE.format("the same at all wavelengths"),
-    ),
-    _held(
-        "derotator_misalignment", _DEROTATOR, "orientation", _HALF_DEGREE,
-        "pattern in derotator angle of a turned derotator, with its retardance",
-    ),
-    _held(
-        "polarizer_misalignment", _POLARIZER, "rotation", _HALF_DEGREE,
-        _PHASE.format("polarized data alone"),
-    ),
+    _held("hwp_misalignment", _PLATE, "orientation", _HALF_DEGREE,
+          _PHASE.format("the same at all wavelengths")),
+    _held("derotator_misalignment", _DEROTATOR, "orientation", _HALF_DEGREE,
+          "pattern in derotator angle of a turned derotator, with its retardance"),
+    _held("polarizer_misalignment", _POLARIZER, "rotation", _HALF_DEGREE,
+          _PHASE.format("polarized data alone")),
     # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
-    _held(
-        "mirror_misalignment", _MIRROR, "rotation", _size(1, 45, u.deg),
-        _PHASE.format("unpolarized data alone"), "far from where it should be",
-    ),
+    _held("mirror_misalignment", _MIRROR, "rotation", _size(1, 45, u.deg),
+          _PHASE.format("unpolarized data alone"), "far from where it should be"),
     _bound("hwp_angle_bound", "orientation", _PLATE, "orientation", _TEN_DEGREES),
     _bound("derotator_angle_bound", "orientation", _DEROTATOR, "orientation", _TEN_DEGREES),
     _bound("polarizer_angle_bound", "orientation", _POLARIZER, "rotation", _TEN_DEGREES),
@@ -494,16 +486,14 @@ def _followed(name, title, shows, *factors, needs="parallactic"):
     )  # fmt: skip
 
 
-_STAGES = {"hwp": ("half-wave plate", "plate"), "derotator": ("derotator", "derotator")}
+_STAGES = {"hwp": _PLATE, "derotator": _DEROTATOR}
 
 
 def _misread(name, title, shows, rate, what, *stages):
     """Return angles of stages that are not those of the table, but a function of them."""
-    words, role = _STAGES[stages[0]]
-    of = " and ".join(_STAGES[stage][0] for stage in stages)
-    return laws.Misread(
-        name, title.format(of), f"stage of the {words}", role, shows, stages, what, rate
-    )
+    title = title.format(" and ".join(_STAGES[stage].said for stage in stages))
+    role = _STAGES[stages[0]].optic
+    return laws.Misread(name, title, _AXES[role], role, shows, stages, what, rate)
 
 
 # a table that is a frame ahead has the angle before the last move, a late one that after the next
@@ -576,5 +566,5 @@ OF_RUNS = [
         f"{name}_zero", place, "zero of the angle", OWN_RUN,
         "all frames of one run, as an offset of the {}",
     )
-    for name, place in (("hwp", _PLATE), ("derotator", _DEROTATOR))
+    for name, place in _STAGES.items()
 ]  # fmt: skip
