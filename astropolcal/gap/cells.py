@@ -509,8 +509,6 @@ class Probes:
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
         seen = self.problem.flickering[i], self.problem.fluxes[i]
-        if seen[1] is None:
-            return
         # differences see the flicker of the lamp, sums do not
         by_channel = [self._detected(channel, sweep, fluxes) for fluxes in seen]
         weights = channel.slopes(sweep)
