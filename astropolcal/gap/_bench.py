@@ -18,6 +18,7 @@ import numpy as np
 from numpy.polynomial.legendre import legval, legvander
 from scipy.linalg import expm
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from astropolcal import instruments
 from astropolcal.chain import leaves, stages, with_beam
@@ -665,9 +666,7 @@ class Fault:
         if self.told["what"] == "hysteresis":
             # each move pulls, and what was pulled goes back slowly
             angle = clean.position(self.stage)
-            pull, found = np.diff(angle, prepend=angle[:1]), np.zeros(len(angle))
-            for i in range(1, len(angle)):
-                found[i] = 0.8 * found[i - 1] + pull[i]
+            found = lfilter([1.0], [1.0, -0.8], np.diff(angle, prepend=angle[:1]))
         else:
             found = rng.normal(0, 1, clean.n_frames)
             found = np.cumsum(found) if self.told["what"] == "wander" else found

@@ -24,14 +24,16 @@ from astropolcal.optics.positions import COORDINATES
 
 __all__ = []
 
-#: Kinds that only a detector may have, and the dependence of each.
-DETECTED = {
-    "background": "flux",
-    "background_of_one_beam": "flux",
-    "nonlinearity": "flux",
-    "persistence": "previous",
-    "crosstalk": "constant",
+# kinds that only a detector may have: dependence and words of each
+_DETECTED = {
+    "background": ("flux", "background in both beams"),
+    "background_of_one_beam": ("flux", "background in one beam"),
+    "nonlinearity": ("flux", "answer that is not linear"),
+    "persistence": ("previous", "light of the frame before"),
+    "crosstalk": ("constant", "light of one beam in the other"),
 }
+#: Kinds that only a detector may have, and the dependence of each.
+DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -42,18 +44,17 @@ _MOST_STEPS = 16
 _SAME = 1e-9
 # size (radian) of a retardance that is tried where its derivative vanishes
 FINITE = 0.1
-#: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
-SIZES = {
-    "retardance": 0.1,
-    "rotation": 0.02,
-    "diattenuation": 0.02,
-    "depolarization": 0.05,
+# usual size of a perturbation by kind, the scale of its prior, and the most that it may be (radian,
+# or a share): beyond it is no perturbation
+_SIZES = {
+    "retardance": (0.1, np.pi),
+    "rotation": (0.02, np.pi / 4),
+    "diattenuation": (0.02, 3.0),
+    "depolarization": (0.05, 3.0),
     # what follows the flux would follow the flicker of the lamp as well if it could be large
-    "background": 0.003,
-    "nonlinearity": 0.003,
-    "persistence": 0.003,
+    **dict.fromkeys(("background", "nonlinearity", "persistence"), (0.003, 0.5)),
 }
-_USUAL = 0.02
+_USUAL = 0.02, 0.5
 
 
 @dataclass(frozen=True, order=True)
@@ -102,7 +103,12 @@ class Cell:
     @property
     def scale(self):
         """Usual size, in radian or as a share."""
-        return SIZES.get(self.kind.partition("_")[0], _USUAL)
+        return _SIZES.get(self.kind.partition("_")[0], _USUAL)[0]
+
+    @property
+    def limit(self):
+        """The most that it may be, in radian or as a share."""
+        return _SIZES.get(self.kind.partition("_")[0], _USUAL)[1]
 
     @property
     def title(self):
@@ -127,11 +133,7 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
-    "background": "background in both beams",
-    "background_of_one_beam": "background in one beam",
-    "nonlinearity": "answer that is not linear",
-    "persistence": "light of the frame before",
-    "crosstalk": "light of one beam in the other",
+    **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 
 
@@ -507,8 +509,6 @@ class Probes:
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
         seen = self.problem.flickering[i], self.problem.fluxes[i]
-        if seen[1] is None:
-            return
         # differences see the flicker of the lamp, sums do not
         by_channel = [self._detected(channel, sweep, fluxes) for fluxes in seen]
         weights = channel.slopes(sweep)

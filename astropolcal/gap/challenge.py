@@ -237,8 +237,6 @@ def _score(case, answer):
 
 def _named(entry):
     """Return a fault or a cause in a few words."""
-    if isinstance(entry, str):
-        return entry
     cell = entry.get("cell") or entry
     parts = [cell[k] for k in ("place", "kind", "dependence") if cell.get(k) is not None]
     return str(entry.get("effect") or entry.get("what") or "/".join(map(str, parts)))

@@ -11,7 +11,7 @@ must be down to the noise, or have lost nearly all of its excess.
 """
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from scipy.special import gammaincinv, ndtr
@@ -78,8 +78,6 @@ class FrameFault:
     #: of these, or more than one, describes it, or ``"lamp"`` where only the brightness is off its
     #: drift, which does not harm the differences.
     what: str
-    #: Number of the frame with which it was exchanged.
-    with_: int | None = None
     #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
     value: float | None = None
     #: Its standard error; where other angles do as well, the distance to the farthest of them.
@@ -92,6 +90,8 @@ class FrameFault:
     words: str = ""
     #: ``"right"`` or ``"left"``, where the data tell which beam is off.
     beam: str | None = None
+    #: Number of the frame with which it was exchanged.
+    with_: int | None = None
     #: Index of the dataset and of the frame, and of that with which it was exchanged.
     place: tuple = field(default=(0, 0), repr=False)
     partner_place: tuple | None = field(default=None, repr=False)
@@ -100,18 +100,9 @@ class FrameFault:
 
     def to_dict(self):
         """Return the fault as JSON holds it (dict)."""
-        names = (
-            "dataset",
-            "frame",
-            "what",
-            "value",
-            "error",
-            "evidence",
-            "probability",
-            "words",
-            "beam",
-        )
-        return {name: getattr(self, name) for name in names} | {"with": self.with_}
+        # indices are for the diagnosis itself
+        told = [one.name for one in fields(self) if one.repr]
+        return {name.rstrip("_"): getattr(self, name) for name in told}
 
 
 def suspect_frames(model):

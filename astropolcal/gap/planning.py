@@ -19,10 +19,9 @@ from astropy.table import QTable
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
-from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.identifiability.linearized import orthonormal, ranked
 from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
 from astropolcal.gap.effects._laws import turned_by
 from astropolcal.gap.problem import OPEN, GapProblem
@@ -63,8 +62,6 @@ GROUP = "group"
 LEAST_GAIN = 1.0
 # a change of this size (radian or relative) has to be seen
 _WANTED = 0.01
-# nearer to a bound is at it
-_AT_BOUND = 1e-9
 # keeps open directions where they are, of columns of unit length; sizes are known within this
 # factor of the usual one
 _HOLD, _WIDE = 1e-10, 3.0
@@ -190,8 +187,8 @@ def _run(i, train, observations):
 
 def _turned(run, name):
     """Return the run with each of its stages turned, those of the sky aside."""
-    own = {s: angles for s, angles in run.positions.items() if s not in (*_SKY, GROUP)}
-    own = {stage: angles for stage, angles in own.items() if angles.dtype.kind == "f"}
+    # states and groups are no angles
+    own = {s: a for s, a in run.positions.items() if s not in _SKY and a.dtype.kind == "f"}
     found = []
     for stage, by in product(own, _TURNED_BY):
         what = f"the run of {name} with {stage} turned by {by:g} deg"
@@ -461,9 +458,8 @@ class Forecast:
         self.causes = np.zeros(problem.size, dtype=bool)
         for numbers in self.own.values():
             self.causes[numbers] = True
-        at_bound = (q <= problem.low + _AT_BOUND) | (q >= problem.high - _AT_BOUND)
         #: Coefficients that the data may move.
-        self.live = self.causes | ~at_bound
+        self.live = self.causes | ~problem.at_bound(q)
         norm = np.linalg.norm(slopes, axis=0)
         self.scale = np.where(norm > 0, norm, 1.0)
         self.slopes = slopes / self.scale

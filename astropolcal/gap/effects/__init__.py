@@ -5,6 +5,7 @@ The library of effects that a model of a polarimeter may lack.
 One row each of ``astropolcal.gap.effects.library``, in `EFFECTS`; `register_effect` adds your own.
 """
 
+import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import leaves
@@ -13,7 +14,6 @@ from astropolcal.gap.effects.effect import KINDS, Context, Edit, Effect, EffectP
 from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.where import Roles, adapted
 from astropolcal.gap.problem import GapProblem
-from astropolcal.units import to_unit
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = [
@@ -254,13 +254,7 @@ def _check_parameter(effect, parameter, problem, nominal):
     if parameter.basis is not None and len(parameter.basis) != slot.size:
         raise _failed(effect, f"{name}: a law for {len(parameter.basis)} of {slot.size} values")
     for what in ("scale", "limit"):
-        size = getattr(parameter, what)
-        try:
-            is_positive = to_unit(size, slot.unit, slot.name) > 0
-        except AstropolcalError as error:
-            raise _failed(effect, str(error)) from error
-        if not is_positive:
-            raise _failed(effect, f"{name}: {what} = {size} not positive")
+        effect._check_size(what, getattr(parameter, what), slot.unit or u.one)
 
 
 def _check_derivative(effect, problem, parameter):

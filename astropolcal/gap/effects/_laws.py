@@ -8,7 +8,7 @@ from scipy.linalg import helmert
 from astropolcal import optics
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
-from astropolcal.gap.effects.effect import Edit, Effect, EffectParameter
+from astropolcal.gap.effects.effect import NUMBER, Edit, Effect, EffectParameter
 from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
@@ -311,6 +311,10 @@ class Recoating(Effect):
 class Held(Effect):
     """Parameters of one optic that become free, within their bounds or wider ones."""
 
+    degree = NUMBER
+    #: Whether the bounds of the optic itself hold.
+    is_bounded = True
+
     def is_open(self, parameter):
         """Return whether the effect may act on a parameter: one that is fixed, or at a bound."""
         if self.kind != "bound":
@@ -347,18 +351,23 @@ class Held(Effect):
 
     def released(self, optic, keys, context):
         """Return a copy of an optic with parameters free, and what the effect says of these."""
-        fresh, found = optic.copy(), []
+        fresh, found, law = self.copied(optic, keys, context), [], self.law(context)
         for key in keys:
             parameter = getattr(fresh, key)
             # where it was held is where the effect is absent
             known = parameter.prior
             value = parameter.value if known is None else known.mean()
             value = u.Quantity(value, parameter.unit or u.one)
-            parameter.bounds = around(parameter, self.limit, getattr(type(optic), key).bounds)
+            possible = getattr(type(optic), key).bounds if self.is_bounded else (None, None)
+            parameter.bounds = around(parameter, self.limit, possible)
             parameter.fixed, parameter.prior = False, None
             name = f"{optic.name}.{key}"
-            found.append(EffectParameter(name, self.scale, self.limit, neutral=value))
+            found.append(EffectParameter(name, self.scale, self.limit, law, value))
         return fresh, found
+
+    def copied(self, optic, keys, context):
+        """Return a copy of an optic, of which parameters will be free."""
+        return optic.copy()
 
 
 def _in_unit(quantity, parameter):
@@ -384,27 +393,20 @@ def around(parameter, limit, possible):
 class StandardPolarization(Held):
     """Polarization of a star itself, which the model holds at zero or at a catalogue's value."""
 
+    # the law is of the error of the catalogue's values; a lamp that is known to be nearly fully
+    # polarized is outside the bounds of one that is fitted
+    degree, is_bounded = 2, False
+
     def held(self, roles):
         """Return the first star whose polarization is held, and the names of its parameters."""
         star = held_star(roles.leaves)
         return star, () if star is None else self.free
 
-    def released(self, optic, keys, context):
-        """Return a copy of a star with q and u free, and what the effect says of these."""
-        size, found = len(context.wavelength), []
-        values = {key: np.broadcast_to(getattr(optic, key).value, size) for key in keys}
-        fresh = optic.with_parameters(**values)
-        for key, held in values.items():
-            parameter = getattr(fresh, key)
-            # a lamp that is known to be nearly fully polarized is outside the bounds of one
-            # that is fitted
-            parameter.bounds = around(parameter, self.limit, (None, None))
-            parameter.fixed, parameter.prior = False, None
-            # of the error of the catalogue's values
-            law = None if size == 1 else context.basis(self.degree)
-            name = f"{optic.name}.{key}"
-            found.append(EffectParameter(name, self.scale, self.limit, law, np.array(held)))
-        return fresh, found
+    def copied(self, optic, keys, context):
+        """Return a copy of a star with q and u at each wavelength."""
+        size = len(context.wavelength)
+        held = {key: np.broadcast_to(getattr(optic, key).value, size) for key in keys}
+        return optic.with_parameters(**held)
 
 
 def held_star(optics_of_chain):

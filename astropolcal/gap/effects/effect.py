@@ -30,9 +30,6 @@ __all__ = []
 
 #: What an effect may be.
 KINDS = ("optic", "parameter", "bound", "detector", "source", "discrete")
-# the most that a kind may be: beyond it is no perturbation
-_LIMITS = {"retardance": np.pi, "rotation": np.pi / 4, "diattenuation": 3.0, "depolarization": 3.0}
-_LIMIT = 0.5
 # the dependence of what is in one of several runs, each of which is asked for
 OWN_RUN = "dataset:own"
 # kinds that are several generators; an error of an orientation is a rotation and one back
@@ -503,8 +500,6 @@ class Effect:
         if place is None or (self.when is not None and not self.when(roles)):
             return False
         what, stage, *_ = (*split_run(self._dependence(roles))[0].split(":"), "")
-        if self._dependence(roles) == OWN_RUN:
-            return False
         needed = what in ("harmonic", "direction", "move")
         return not needed or any(o.stage == stage for o in roles.leaves)
 
@@ -514,7 +509,7 @@ class Effect:
     def _dependence(self, roles):
         """Return the dependence, with the name of the stage of the effect's own optic."""
         text = split_run(self.dependence)[0]
-        if ":own" not in text or self.dependence == OWN_RUN:
+        if ":own" not in text:
             return self.dependence
         stage = f":{self.where.anchor(roles).stage}"
         return text.replace(":own", stage) + self.dependence.removeprefix(text)
@@ -587,8 +582,8 @@ class Effect:
         scale, limit = self.scale, self.limit
         if limit is None:
             # those of a usual perturbation, in radian or as a share
-            limit = _LIMITS.get(kind.partition("_")[0], _LIMIT)
-            scale = Cell("", kind, "").scale if scale is None else scale
+            cell = Cell("", kind, "")
+            scale, limit = cell.scale if scale is None else scale, cell.limit
             if isinstance(self.inserted, optics.Optic):
                 unit = getattr(self.inserted, self.free_of(self.inserted)[0]).unit
                 return scale * (u.rad if unit else 1), limit * (u.rad if unit else 1)
@@ -736,8 +731,8 @@ class CellEffect(Effect):
         place, dependence, settings = cell.place, cell.dependence, {"words": cell.place}
         if cell.kind in DETECTOR:
             optic, free, more = DETECTOR[cell.kind]
-            settings |= {"inserted": optic, "free": (free,), "scale": cell.scale, "limit": _LIMIT}
-            settings |= more
+            sizes = {"scale": cell.scale, "limit": cell.limit}
+            settings |= {"inserted": optic, "free": (free,)} | sizes | more
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))

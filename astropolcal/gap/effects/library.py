@@ -59,8 +59,9 @@ def _effect(name, title, place, kind, optic, free, size, shows, reference, **mor
     return more.pop("cls", Effect)(name, title, place, kind, **size, **more)
 
 
-def _encoder(name, n, place, optic, like, shows):
+def _encoder(name, n, place, like, shows):
     """Return a scale off its axis by d, which reads wrong by d sin(angle) over its radius."""
+    optic = place.said
     how = ("once a turn (eccentric encoder)", "twice a turn (encoder not round)")[n - 1]
     return _effect(
         name, f"angle of the {optic} wrong {how}", place, "orientation",
@@ -70,18 +71,17 @@ def _encoder(name, n, place, optic, like, shows):
     )  # fmt: skip
 
 
-def _angle_off(name, optic, place, title, dependence, shows):
+def _angle_off(name, place, title, dependence, shows):
     """Return an offset of the angle of a stage in some of the frames."""
+    optic = place.said
     return Effect(
-        name, title.format(optic), place, "orientation", dependence, NUMBER,
+        name, f"{title} of the {optic}", place, "orientation", dependence, NUMBER,
         shows=shows.format(optic), reference=_HOLSTEIN, words=f"stage of the {optic}",
         category="parameter", **_size(0.1, 5, u.deg),
     )  # fmt: skip
 
 
-_BACKLASH = (
-    "backlash of the {}", "direction:own", "opposite offsets of the {} after moves to either side",
-)  # fmt: skip
+_BACKLASH = "backlash", "direction:own", "opposite offsets of the {} after moves to either side"
 
 
 def _transmission(name, n, title):
@@ -128,7 +128,7 @@ _PLATE_EFFECTS = [
         _PLATE, "diattenuation_h", optics.Diattenuator(), "diattenuation", _size(0.003, 0.1),
         "harmonic 2 of the plate angle in sums and in differences of unpolarized light", _BRYAN,
     ),
-    _angle_off("hwp_backlash", "half-wave plate", _PLATE, *_BACKLASH),
+    _angle_off("hwp_backlash", _PLATE, *_BACKLASH),
     _transmission(
         "hwp_transmission", 2, "transmission of the half-wave plate that changes twice a turn",
     ),
@@ -154,11 +154,11 @@ _PLATE_EFFECTS = [
         degree=NUMBER, dependence="harmonic:own:2",
     ),
     _encoder(
-        "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
+        "hwp_encoder_eccentricity", 1, _PLATE, "Millar-Blanchaer et al. 2016",
         "harmonics 3 and 5 of the plate angle, none for unpolarized light",
     ),
     _encoder(
-        "hwp_encoder_two_lobe", 2, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
+        "hwp_encoder_two_lobe", 2, _PLATE, "Millar-Blanchaer et al. 2016",
         "harmonics 2 and 6 of the plate angle, none for unpolarized light",
     ),
 ]  # fmt: skip
@@ -205,12 +205,12 @@ _DEROTATOR_EFFECTS = [
     ),
     *(
         _encoder(
-            name, n, _DEROTATOR, "derotator", "van Holstein et al. 2020",
+            name, n, _DEROTATOR, "van Holstein et al. 2020",
             "rotation of Q and U with the derotator angle, the same at all wavelengths",
         )
         for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)
     ),
-    _angle_off("derotator_backlash", "derotator", _DEROTATOR, *_BACKLASH),
+    _angle_off("derotator_backlash", _DEROTATOR, *_BACKLASH),
     # for internal sources the derotator is static during an exposure: bench data would tie the
     # lag to a rate that they do not have
     _effect(
@@ -420,52 +420,42 @@ _DETECTOR_EFFECTS = [
     ),
 ]  # fmt: skip
 
-_HELD = "orientation of the {}, which the model holds fixed"
 _PHASE = "phase of harmonic 4 of the plate angle, {}"
 _HALF_DEGREE, _TEN_DEGREES = _size(0.5, 5, u.deg), _size(1, 10, u.deg)
 
 
-def _held(name, title, where, kind, size, shows, free="theta", reference=_HOLSTEIN, **more):
-    more = {"cls": laws.Held, "category": "parameter"} | more
-    return _effect(name, title, where, kind, None, free, size, shows, reference, **more)
+def _held(name, where, kind, size, shows, how="which the model holds fixed"):
+    return _effect(
+        name, f"orientation of the {where.said}, {how}", where, kind, None, "theta", size, shows,
+        _HOLSTEIN, cls=laws.Held, category="parameter",
+    )  # fmt: skip
 
 
 def _bound(name, what, where, kind, size, free="theta"):
-    return _held(
-        name, f"{what} beyond its bound", where, kind, size,
-        "along the derivative to the parameter that is at its bound", free,
-        "residual of a constrained fit; Nocedal & Wright 2006, chapter 12", category="bound",
+    return _effect(
+        name, f"{what} of the {where.said} beyond its bound", where, kind, None, free, size,
+        "along the derivative to the parameter that is at its bound",
+        "residual of a constrained fit; Nocedal & Wright 2006, chapter 12",
+        cls=laws.Held, category="bound",
     )  # fmt: skip
 
 
 _HELD_EFFECTS = [
-    _held(
-        "hwp_misalignment", _HELD.format("half-wave plate"), _PLATE, "orientation", _HALF_DEGREE,
-        _PHASE.format("the same at all wavelengths"),
-    ),
-    _held(
-        "derotator_misalignment", _HELD.format("derotator"), _DEROTATOR, "orientation",
-        _HALF_DEGREE, "pattern in derotator angle of a turned derotator, with its retardance",
-    ),
-    _held(
-        "polarizer_misalignment", _HELD.format("calibration polarizer"), _POLARIZER, "rotation",
-        _HALF_DEGREE, _PHASE.format("polarized data alone"),
-    ),
+    _held("hwp_misalignment", _PLATE, "orientation", _HALF_DEGREE,
+          _PHASE.format("the same at all wavelengths")),
+    _held("derotator_misalignment", _DEROTATOR, "orientation", _HALF_DEGREE,
+          "pattern in derotator angle of a turned derotator, with its retardance"),
+    _held("polarizer_misalignment", _POLARIZER, "rotation", _HALF_DEGREE,
+          _PHASE.format("polarized data alone")),
     # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
-    _held(
-        "mirror_misalignment",
-        "orientation of the mirror upstream of the half-wave plate, far from where it should be",
-        _MIRROR, "rotation", _size(1, 45, u.deg), _PHASE.format("unpolarized data alone"),
-    ),
-    _bound("hwp_angle_bound", "orientation of the half-wave plate", _PLATE, "orientation",
-           _TEN_DEGREES),
-    _bound("derotator_angle_bound", "orientation of the derotator", _DEROTATOR, "orientation",
-           _TEN_DEGREES),
-    _bound("polarizer_angle_bound", "orientation of the calibration polarizer", _POLARIZER,
-           "rotation", _TEN_DEGREES),
-    _bound("hwp_thickness_bound", "thickness of a layer of the half-wave plate", _PLATE,
-           "retardance_h", _size(0.02, 0.5, u.mm), ("w_sio2", "w_mgf2")),
-    _bound("derotator_retardance_bound", "retardance of the derotator", _DEROTATOR, "retardance_h",
+    _held("mirror_misalignment", _MIRROR, "rotation", _size(1, 45, u.deg),
+          _PHASE.format("unpolarized data alone"), "far from where it should be"),
+    _bound("hwp_angle_bound", "orientation", _PLATE, "orientation", _TEN_DEGREES),
+    _bound("derotator_angle_bound", "orientation", _DEROTATOR, "orientation", _TEN_DEGREES),
+    _bound("polarizer_angle_bound", "orientation", _POLARIZER, "rotation", _TEN_DEGREES),
+    _bound("hwp_thickness_bound", "thickness of a layer", _PLATE, "retardance_h",
+           _size(0.02, 0.5, u.mm), ("w_sio2", "w_mgf2")),
+    _bound("derotator_retardance_bound", "retardance", _DEROTATOR, "retardance_h",
            _size(5, 180, u.deg), ("retardance", "horizontal", "diagonal", "circular")),
 ]  # fmt: skip
 
@@ -496,16 +486,14 @@ def _followed(name, title, shows, *factors, needs="parallactic"):
     )  # fmt: skip
 
 
-_STAGES = {"hwp": ("half-wave plate", "plate"), "derotator": ("derotator", "derotator")}
+_STAGES = {"hwp": _PLATE, "derotator": _DEROTATOR}
 
 
 def _misread(name, title, shows, rate, what, *stages):
     """Return angles of stages that are not those of the table, but a function of them."""
-    words, role = _STAGES[stages[0]]
-    of = " and ".join(_STAGES[stage][0] for stage in stages)
-    return laws.Misread(
-        name, title.format(of), f"stage of the {words}", role, shows, stages, what, rate
-    )
+    title = title.format(" and ".join(_STAGES[stage].said for stage in stages))
+    role = _STAGES[stages[0]].optic
+    return laws.Misread(name, title, _AXES[role], role, shows, stages, what, rate)
 
 
 # a table that is a frame ahead has the angle before the last move, a late one that after the next
@@ -575,12 +563,10 @@ LIBRARY = (
 #: What may differ between several runs, in each of which it is asked for.
 OF_RUNS = [
     _angle_off(
-        f"{name}_zero", optic, place, "zero of the angle of the {}", OWN_RUN,
+        f"{name}_zero", place, "zero of the angle", OWN_RUN,
         "all frames of one run, as an offset of the {}",
     )
-    for name, optic, place in (
-        ("hwp", "half-wave plate", _PLATE), ("derotator", "derotator", _DEROTATOR),
-    )
+    for name, place in _STAGES.items()
 ]  # fmt: skip
 # of any axis, which is one optic and two or three cells
 OF_RUNS += [
