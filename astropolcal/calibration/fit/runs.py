@@ -27,7 +27,7 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.calibration.fit.calibrate import ERRORS, _result
+from astropolcal.calibration.fit.calibrate import ERRORS, FittedMeasurement
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
@@ -255,8 +255,8 @@ class _Run:
         around = Problem(measurement, weighting).around()
         weighting = weighting.updated(measurement, around)
         measurement.weighting = weighting
-        scatter = Scatter(measurement, weighting, around) if errors == "scatter" else None
-        self.scatter = scatter if scatter is not None and scatter.is_known else None
+        is_white = errors == "white"
+        self.scatter = None if is_white else Scatter.of(measurement, weighting, around)
         #: Of the fit of this run alone, canonical.
         self.fitted, self.level = measurement.vector(), weighting.level
         self.stands_out = stands_out(measurement)
@@ -508,25 +508,19 @@ class RunsCalibration:
         measurement = one.measurement
         measurement.stand_at(model.vectors[run])
         whitened = Problem(measurement, measurement.weighting).around()
-        covariance = self._covariance(run)
+        settings = {
+            "instrument": None,
+            "fitter": "calibrate_runs",
+            "strategy": "runs",
+            "loss": "linear",
+            "errors": "scatter" if one.scatter is not None else "white",
+            "gauge": "least change from the first run",
+            "runs": {"count": len(self), "varying": self._varying()},
+        }
         told = {"converged": self.converged, "message": f"one likelihood of {len(self)} runs"}
-        return _result(
-            measurement,
-            whitened,
-            settings={
-                "instrument": None,
-                "fitter": "calibrate_runs",
-                "strategy": "runs",
-                "loss": "linear",
-                "errors": "scatter" if one.scatter is not None else "white",
-                "gauge": "least change from the first run",
-                "runs": {"count": len(self), "varying": self._varying()},
-            },
-            fit=told | {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0},
-            stages=[],
-            cross_validate=False,
-            covariance=covariance,
-        )
+        told |= {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0}
+        fitted = FittedMeasurement(measurement, whitened, settings, told, stages=[])
+        return fitted.calibration(covariance=self._covariance(run))
 
     def summary(self):
         """

@@ -36,6 +36,7 @@ from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_roughness,
+    rms,
 )
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.noise.weighting import (
@@ -458,5 +459,4 @@ def _taken(title, step, measurement):
     _copy_fitted(step, measurement)
     step.put_back()
     values = {slot.name: step.free.values_of(slot.name) for slot in step.free.slots}
-    rms = float(np.sqrt(np.mean(step.residuals() ** 2)))
-    return {"title": title, "parameters": values, "residual_rms": rms}
+    return {"title": title, "parameters": values, "residual_rms": rms(step.residuals())}
