@@ -365,10 +365,7 @@ def warn_beyond(chain, positions):
         for key, law in leaf._follows.items():
             words = law.beyond(positions)
             if words:
-                warn(
-                    f"the law of {leaf.name}.{key} is extrapolated: {words}",
-                    stacklevel=3,
-                )
+                warn(f"the law of {leaf.name}.{key} is extrapolated: {words}", stacklevel=3)
 
 
 def states_of(chain):

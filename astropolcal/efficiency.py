@@ -53,11 +53,7 @@ def sky_path(chain):
     found = leaves(chain)
     # the first optic that treats the two beams differently is the beam splitter
     end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
-    moving = (
-        i
-        for i, leaf in enumerate(found)
-        if leaf.stage is not None and leaf.stage not in COORDINATES
-    )
+    moving = (i for i, leaf in enumerate(found) if leaf.stage and leaf.stage not in COORDINATES)
     train = list(found[next(moving, end) : end])
     if not train:
         raise ChainError("the chain has no optic on a stage upstream of a beam splitter")

@@ -24,12 +24,7 @@ import numpy as np
 from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 
-from astropolcal.calibration.fit.branches import (
-    ROUNDED,
-    BinProblem,
-    bent_valleys,
-    undecided_signs,
-)
+from astropolcal.calibration.fit.branches import ROUNDED, BinProblem, bent_valleys, undecided_signs
 from astropolcal.calibration.fit.strategies import (
     joint,
     known_noises,
@@ -53,10 +48,7 @@ from astropolcal.calibration.noise.weighting import (
     robust_weighting,
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
-from astropolcal.calibration.uncertainty.covariance import (
-    covariance_around,
-    errors_at_bounds,
-)
+from astropolcal.calibration.uncertainty.covariance import covariance_around, errors_at_bounds
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves

@@ -433,10 +433,7 @@ def _next(calibration, free, wrong, sky):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, _more_angles(turning)),
-        (
-            "star" in missing,
-            f"an unpolarized standard star; the telescope {telescope}",
-        ),
+        ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
         (
             any(entry["status"] == "by priors" for entry in _orientations(free).values()),
