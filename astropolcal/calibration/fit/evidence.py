@@ -13,6 +13,7 @@ import numpy as np
 from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError, warn
+from astropolcal.units import iso_date
 
 __all__ = []
 
@@ -34,11 +35,7 @@ _RANK = 1e-12
 
 def moment_of(when, name):
     """Return a date as a `Time` that no table of leap seconds limits: a decade ahead, too."""
-    try:
-        return Time(getattr(when, "isot", when), scale="tai")
-    except (ValueError, TypeError):
-        words = f"{name} {when!r} is not a date; allowed are dates such as 2025-10-05"
-        raise ParameterError(words) from None
+    return Time(iso_date(when, name), scale="tai")
 
 
 def chances_of(dates, events, usual):

@@ -32,6 +32,7 @@ from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.linearized import STILL, Whitened
+from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance
@@ -294,8 +295,7 @@ class _Run:
         rows = root @ (found.singular[: found.rank, None] * found.right[: found.rank])
         targets = rows @ (vector / self.scale) + root @ (along.T @ residual)
         square = float(residual @ residual)
-        rms = np.sqrt(square / residual.size)
-        return _Rows(rows, targets, square / self.level**2, rms, self.stands_out)
+        return _Rows(rows, targets, square / self.level**2, rms(residual), self.stands_out)
 
 
 # runs that a process has prepared, by what calls for them and number
@@ -406,7 +406,7 @@ class RunsCalibration:
         model, rows = self._model, []
         if model.dates is None:
             return Table(names=("what", "course"), dtype=(str, str))
-        own = {}
+        own, days = {}, sorted(self.dates.isot)
         for term in model.terms:
             own.setdefault(term.what, []).append(term)
         for what, terms in own.items():
@@ -416,7 +416,7 @@ class RunsCalibration:
             row = {"what": what, "course": terms[-1].course}
             row["probability"] = (1 - told.chances["constant"]) * share
             row |= told.chances
-            row["when"] = ", ".join(self._between(gap) for gap in gaps)
+            row["when"] = ", ".join(f"{days[k][:10]} to {days[k + 1][:10]}" for k in gaps)
             rows.append(row | {"or": ", ".join(rivals)})
         for what, told in model.weighed().items():
             if what == optic(what) and what not in map(optic, own):
@@ -436,10 +436,6 @@ class RunsCalibration:
                 "stands_out": [one.stands_out for one in model.rows],
             }
         )
-
-    def _between(self, gap):
-        days = sorted(self.dates.isot)
-        return f"{days[gap][:10]} to {days[gap + 1][:10]}"
 
     def values(self, name):
         """

@@ -338,8 +338,7 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     for name, key in _CALIBRATIONS.items():
         result[key] = found.get(name, zero * np.nan)
     result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
-    for key, value in propagate_accuracy(dolp, aolp, s_rel, s_abs).items():
-        result[key] = value
+    result.update(propagate_accuracy(dolp, aolp, s_rel, s_abs))
     missing = [name for name in given if name not in found]
     words = f"all three calibrations count, by their {column}"
     if missing:
