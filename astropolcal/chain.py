@@ -223,12 +223,9 @@ def insert_optic(chain, optic, *, after=None, before=None):
     """
     if (after is None) == (before is None):
         raise ChainError("name exactly one neighbour: after=... or before=...")
-    neighbour = find_optic(chain, after or before)
-    result = []
-    for leaf in leaves(chain):
-        pair = [leaf, optic] if after else [optic, leaf]
-        result.extend(pair if leaf is neighbour else [leaf])
-    return _again(chain, result)
+    found, neighbour = leaves(chain), find_optic(chain, after or before)
+    found.insert(found.index(neighbour) + bool(after), optic)
+    return _again(chain, found)
 
 
 def remove_optic(chain, name):

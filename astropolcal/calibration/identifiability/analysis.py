@@ -212,14 +212,9 @@ def complete(measurement, whitened, level, view):
         finding.near_null = near_null_directions(
             free, whitened, level, lambda changes: consequences_along(view, changes)
         )
-    angles = {
-        # commanded angles repeat in many frames; a microradian is none
-        round(float(angle), 6)
-        for dataset in measurement.datasets
-        if "hwp" in dataset.observations.frame_columns
-        for angle in dataset.observations.position("hwp")
-    }
-    finding.sampling = harmonic_words(np.array(sorted(angles))) if angles else []
+    tables = [dataset.observations for dataset in measurement.datasets]
+    angles = [table.position("hwp") for table in tables if "hwp" in table.frame_columns]
+    finding.sampling = harmonic_words(np.concatenate(angles)) if angles else []
     finding.sampling += telescope_words(finding, measurement)
     # open directions that a star of known polarization would close
     leads = [

@@ -84,11 +84,9 @@ class Covariance:
         variances = np.diag(self.matrix)
         # the parameters have units of their own, and with them the rounding errors
         stds = np.sqrt(np.where(np.isfinite(variances), np.abs(variances), 0.0))
-        with np.errstate(invalid="ignore", over="ignore"):
-            same = np.abs(self.matrix - self.matrix.T) <= _ASYMMETRY * np.outer(stds, stds)
-        # equal infinities have no difference
-        missing = np.isnan(self.matrix)
-        same |= (self.matrix == self.matrix.T) | (missing & missing.T)
+        with np.errstate(over="ignore"):
+            slack = _ASYMMETRY * np.outer(stds, stds)
+            same = np.isclose(self.matrix, self.matrix.T, rtol=0, atol=slack, equal_nan=True)
         if not same.all():
             row, column = np.argwhere(~same)[0]
             raise ParameterError(

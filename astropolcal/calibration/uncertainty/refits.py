@@ -149,11 +149,8 @@ def _crossing(values, root, rise):
     above = np.flatnonzero(root > rise)
     if not above.size:
         return np.inf
-    i = above[0]
-    if i == 0:
-        return float(values[0])
-    share = (rise - root[i - 1]) / (root[i] - root[i - 1])
-    return float(values[i - 1] + share * (values[i] - values[i - 1]))
+    near = slice(max(above[0] - 1, 0), above[0] + 1)
+    return float(np.interp(rise, root[near], values[near]))
 
 
 @in_one_thread
