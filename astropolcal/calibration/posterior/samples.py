@@ -176,8 +176,8 @@ class Convergence:
         worst = np.argmax(self.r_hat)
         if not self.r_hat[worst] <= LARGEST_R_HAT:
             found.append(
-                f"R-hat of {names[worst]} is {self.r_hat[worst]:.3f}, but {LARGEST_R_HAT} is the most "
-                "for walkers that agree"
+                f"R-hat of {names[worst]} is {self.r_hat[worst]:.3f}, but {LARGEST_R_HAT} is the "
+                "most for walkers that agree"
             )
         for kind, size in (("bulk", self.ess_bulk), ("tail", self.ess_tail)):
             worst = np.argmin(size)
