@@ -17,6 +17,7 @@ most probable first.
 """
 
 import json
+import os
 import uuid
 from dataclasses import dataclass
 
@@ -38,7 +39,7 @@ from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, understood
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
 from astropolcal.measurement.parameters import told_prior
@@ -201,18 +202,13 @@ class _Checkpoint:
 
     def __init__(self, path, keys):
         self.path, self.keys, self.fits = path, keys, {}
-        if path is None:
+        if path is None or not os.path.exists(path):
             return
-        try:
-            with open(path, encoding="utf-8") as stream:
-                self.fits = json.load(stream)["fits"]
-            valid = all(np.isfinite(vector).all() for vector in self.fits.values())
-        except FileNotFoundError:
-            return
-        except (ValueError, KeyError, TypeError, AttributeError, OSError):
-            valid = False
-        if not valid:
-            raise FitError(f"{path} is not a checkpoint of calibrate_runs; give another file")
+        words = "is not a checkpoint of calibrate_runs, give another file"
+        with understood(path, FitError, words), open(path, encoding="utf-8") as stream:
+            self.fits = json.load(stream)["fits"]
+            if not all(np.isfinite(vector).all() for vector in self.fits.values()):
+                raise ValueError("a value is not finite")
 
     def __getitem__(self, i):
         return self.fits.get(self.keys[i])
