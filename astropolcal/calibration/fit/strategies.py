@@ -372,8 +372,8 @@ def two_step(measurement, weighting, fitter, search, options):
         chains = measurement.put_back() if stages else loose
         step = _step_of(measurement, chains, held, options)
         if step.free.size:
-            how = (fitter,) if outcomes else (fitter, search)
-            outcome, weighting = (run if outcomes else joint)(step, weighting, *how)
+            # what the first step has found needs no search
+            outcome, weighting = joint(step, weighting, fitter, search and not outcomes)
             outcomes.append(outcome)
         stages.append(_taken(title, step, measurement))
     return outcomes, weighting, stages
@@ -397,8 +397,7 @@ def sequential(measurement, weights, fitter, search, options):
         step = _step_of(measurement, measurement.put_back(), held, options, rows)
         if step.free.size:
             weighting = first_weighting(step, weights)
-            how = (fitter,) if stages else (fitter, search)
-            outcomes.append((run if stages else joint)(step, weighting, *how)[0])
+            outcomes.append(joint(step, weighting, fitter, search and not stages)[0])
         title = f"{kind}, what came before held" if stages else kind
         stages.append(_taken(title, step, measurement))
         # what this step has found is known for the next ones

@@ -358,9 +358,7 @@ class Calibration:
             flat = (np.ravel(known[key]) for key in keys)
             rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
         types = (str, float, float, bool, bool, float, str, float, str, str)
-        table = ParameterTable(
-            rows=rows or None, names=("name", *keys, "unit"), dtype=None if rows else types
-        )
+        table = ParameterTable(rows=rows or None, names=("name", *keys, "unit"), dtype=types)
         table["value"].info.format, table["std"].info.format = ".6g", ".3g"
         return table["name", "value", "std", "unit", "status", *_OF_ELEMENTS[1:]]
 

@@ -92,7 +92,7 @@ def verdict(calibration, targets=TARGETS):
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
-    bright = target_accuracies(calibration, TARGETS[:1])
+    bright = tables[:1] if targets is TARGETS else target_accuracies(calibration, TARGETS[:1])
     found = {}
     for lead, change in _open_leads(calibration, free).items():
         for what in _seen(change):

@@ -380,8 +380,7 @@ def widening(calibration):
     measurement, whitened, weighting = problem.measurement, problem.around(), problem.weighting
     scatter = _scatter_of(calibration, problem, whitened)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
-    has_scatter = scatter is not None
-    found = sandwich(measurement, whitened, weighting, middle, has_scatter=has_scatter)
+    found = sandwich(measurement, whitened, weighting, middle, has_scatter=scatter is not None)
     stated = found.stds * measurement.free.factors()
     plain = weighting.level * np.sqrt(np.diag(whitened.covariance()))
     with np.errstate(invalid="ignore", divide="ignore"):

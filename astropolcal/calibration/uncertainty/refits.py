@@ -610,10 +610,7 @@ def robust_covariance(calibration, groups="derotator"):
     """
     problem = problem_of(calibration)
     measurement, whitened = problem.measurement, problem.around()
-    if isinstance(groups, str):
-        labels = labels_of(measurement, groups)
-    else:
-        labels = labels_as_given(measurement, groups)
+    labels = (labels_of if isinstance(groups, str) else labels_as_given)(measurement, groups)
     numbers = _numbered(labels, "", " groups for a robust covariance")
     residuals = problem.residuals(problem.solution)[: measurement.n_data]
     # derivatives to the determined directions, each in units of its standard error
