@@ -247,9 +247,8 @@ def _measured(rows, aolp):
         if np.ndim(aolp):
             raise ParameterError(f"aolp has shape {np.shape(aolp)}; one angle is needed")
         angle = 2 * finite_position(aolp, "aolp")
-        total, difference = np.moveaxis(
-            rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
-        )
+        light = np.array([1.0, np.cos(angle), np.sin(angle), 0.0])
+        total, difference = np.moveaxis(rows @ light, -1, 0)
         # (2, ...): q from 0 and 45 deg, u from 22.5 and 67.5 deg
         double = (difference[0::2] - difference[1::2]) / (total[0::2] + total[1::2])
         return np.hypot(*double)

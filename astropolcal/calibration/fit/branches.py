@@ -492,9 +492,8 @@ def other_signs(problem, vector):
     """Return starts in which one of a few wavelengths is in another branch."""
     costs, found = problem.costs(vector), []
     for branch in problem.branches(vector)[1:] if problem.n_bins <= COARSE else ():
-        found += [
-            start for _, start in _one_by_one(problem, vector, costs, *problem.polish(branch))
-        ]
+        others = _one_by_one(problem, vector, costs, *problem.polish(branch))
+        found += [start for _, start in others]
     return found
 
 

@@ -225,13 +225,9 @@ class Model:
         """Solve until no run moves by more than a share of its error."""
         for k in range(_MOST_ROUNDS):
             old = self.solve()
-            moved = max(
-                np.abs(one.rows @ ((new - then) / scale)).max(initial=0.0)
-                for one, new, then, scale in zip(
-                    self.rows, self.vectors, old, self.scales, strict=True
-                )
-            )
-            if moved < _ARRIVED:
+            runs = zip(self.rows, self.vectors, old, self.scales, strict=True)
+            moves = (one.rows @ ((new - then) / scale) for one, new, then, scale in runs)
+            if max(np.abs(move).max(initial=0.0) for move in moves) < _ARRIVED:
                 return k + 1, True
         return _MOST_ROUNDS, False
 
@@ -297,9 +293,8 @@ class Model:
             odds = {what: one.odds_of(among) for what, one in found.items()}
             what = max(odds, key=odds.get, default=None)
             if what is not None and odds[what] > _ENOUGH:
-                self._take(
-                    [*self.terms, self._term(what, self.varying[what], found[what].best(among))]
-                )
+                new = self._term(what, self.varying[what], found[what].best(among))
+                self._take([*self.terms, new])
                 gained += odds[what] + self._exchange()
             elif among == COURSES[1:]:
                 break

@@ -125,13 +125,12 @@ def fit_once(measurement, weighting, fitter):
         return {"converged": found.success, "message": found.message, "evaluations": found.nfev}
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
+    how = {"weights": weights, "maxiter": _MAX_EVALUATIONS, "inplace": True}
     with warnings.catch_warnings(record=True) as caught:
         # recorded, not shown: whether the fit arrived is told once, in the words of this package
         warnings.simplefilter("always", AstropyWarning)
         try:
-            fitter(
-                canonical, index, observed, weights=weights, maxiter=_MAX_EVALUATIONS, inplace=True
-            )
+            fitter(canonical, index, observed, **how)
         except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
             said = one_line(str(error))
             raise FitError(f"{type(fitter).__name__} failed: {said}") from error

@@ -268,9 +268,6 @@ def _filters(instrument, wavelength):
     if not names or len(names) != np.size(instrument.wavelength):
         return [""] * wavelength.size
     centres = instrument.wavelength.to_value(u.nm)
-    lam = wavelength.to_value(u.nm)[:, None]
-    nearest = np.abs(lam / centres - 1)
-    return [
-        str(names[i]) if off[i] <= _SAME_FILTER else ""
-        for off, i in zip(nearest, nearest.argmin(axis=1), strict=True)
-    ]
+    off = np.abs(wavelength.to_value(u.nm)[:, None] / centres - 1)
+    nearest = np.array(names, dtype=str)[off.argmin(axis=1)]
+    return np.where(off.min(axis=1) <= _SAME_FILTER, nearest, "")

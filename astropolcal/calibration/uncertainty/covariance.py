@@ -173,9 +173,8 @@ class Covariance:
         if not rows:
             return self
         steps = np.array([declared_step(unit) for unit in self.units])
-        _, sizes, right = np.linalg.svd(
-            np.vstack([self.factor, *rows]) / steps, full_matrices=False
-        )
+        rows = np.vstack([self.factor, *rows]) / steps
+        _, sizes, right = np.linalg.svd(rows, full_matrices=False)
         factor, matrix = sizes[:, None] * right * steps, np.full(self.matrix.shape, np.nan)
         known = np.ix_(*(np.flatnonzero(np.isfinite(variances)),) * 2)
         matrix[known] = (factor.T @ factor)[known]
@@ -486,9 +485,8 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     n, level = measurement.n_data, measurement.weighting.level
     # columns of an orthonormal basis, and the root of how these are pulled
     variances, axes = np.linalg.eigh(_middle(scatter, level, *np.split(columns @ inverse, [n])))
-    root = (
-        inverse @ axes * np.sqrt(variances.clip(0)) * _few_at_bounds(measurement, whitened, scatter)
-    )
+    few = _few_at_bounds(measurement, whitened, scatter)
+    root = inverse @ axes * np.sqrt(variances.clip(0)) * few
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
         i = names.index(name)

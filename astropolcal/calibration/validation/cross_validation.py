@@ -599,9 +599,8 @@ def _words(table, same_source):
     moved = table.meta["open_percent"]
     if moved > _WORTH_A_CAUTION * np.nanmedian(table["s_standard"].value):
         words += (
-            f"; along what the calibration does not determine the prediction moves by "
-            f"up to {moved:.2g} % "
-            "a degree, so its gauge counts"
+            "; along what the calibration does not determine the prediction moves by up to "
+            f"{moved:.2g} % a degree, so its gauge counts"
         )
     return words
 
