@@ -223,12 +223,9 @@ def insert_optic(chain, optic, *, after=None, before=None):
     """
     if (after is None) == (before is None):
         raise ChainError("name exactly one neighbour: after=... or before=...")
-    neighbour = find_optic(chain, after or before)
-    result = []
-    for leaf in leaves(chain):
-        pair = [leaf, optic] if after else [optic, leaf]
-        result.extend(pair if leaf is neighbour else [leaf])
-    return _again(chain, result)
+    found, neighbour = leaves(chain), find_optic(chain, after or before)
+    found.insert(found.index(neighbour) + bool(after), optic)
+    return _again(chain, found)
 
 
 def remove_optic(chain, name):
@@ -365,10 +362,7 @@ def warn_beyond(chain, positions):
         for key, law in leaf._follows.items():
             words = law.beyond(positions)
             if words:
-                warn(
-                    f"the law of {leaf.name}.{key} is extrapolated: {words}",
-                    stacklevel=3,
-                )
+                warn(f"the law of {leaf.name}.{key} is extrapolated: {words}", stacklevel=3)
 
 
 def states_of(chain):

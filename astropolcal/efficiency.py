@@ -53,11 +53,7 @@ def sky_path(chain):
     found = leaves(chain)
     # the first optic that treats the two beams differently is the beam splitter
     end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
-    moving = (
-        i
-        for i, leaf in enumerate(found)
-        if leaf.stage is not None and leaf.stage not in COORDINATES
-    )
+    moving = (i for i, leaf in enumerate(found) if leaf.stage and leaf.stage not in COORDINATES)
     train = list(found[next(moving, end) : end])
     if not train:
         raise ChainError("the chain has no optic on a stage upstream of a beam splitter")
@@ -251,9 +247,8 @@ def _measured(rows, aolp):
         if np.ndim(aolp):
             raise ParameterError(f"aolp has shape {np.shape(aolp)}; one angle is needed")
         angle = 2 * finite_position(aolp, "aolp")
-        total, difference = np.moveaxis(
-            rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
-        )
+        light = np.array([1.0, np.cos(angle), np.sin(angle), 0.0])
+        total, difference = np.moveaxis(rows @ light, -1, 0)
         # (2, ...): q from 0 and 45 deg, u from 22.5 and 67.5 deg
         double = (difference[0::2] - difference[1::2]) / (total[0::2] + total[1::2])
         return np.hypot(*double)

@@ -610,25 +610,22 @@ class BoundPrior:
     def log_densities(self, canonical):
         """Return the log density per declared unit at each value."""
         canonical = np.asarray(canonical, dtype=float)
-        value = canonical / self.factor
         if self._is_normal:
-            mean, std = self._moments
-            # scipy's logpdf checks its arguments at every call, which
-            # a sampler makes a million times
-            return self._log_peak - 0.5 * ((value - mean) / std) ** 2
+            return self._log_peak - 0.5 * self.residual(canonical) ** 2
         if self.is_flat:
             # canonical, as bounds are: the edges in the declared unit may lie beyond by rounding
             low, high = self.support
             inside = (canonical >= low) & (canonical <= high)
             return np.where(inside, self._log_peak, -np.inf)
-        return self.distribution.logpdf(value)
+        return self.distribution.logpdf(canonical / self.factor)
 
     def residual(self, canonical):
         """Return signed residuals whose half square is minus the log density, less its least."""
         value = np.asarray(canonical, dtype=float) / self.factor
         if self._is_normal:
             mean, std = self._moments
-            # signed, and without the square root below, whose slope jumps at the mode
+            # without the square root below, whose slope jumps at the mode, and without scipy, which
+            # checks its arguments at every one of a sampler's million calls
             return (value - mean) / std
         # r = sign(x - mode) sqrt(2 (log p(mode) - log p(x))), so
         # that r^2 / 2 is minus the log density

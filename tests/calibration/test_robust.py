@@ -208,7 +208,7 @@ def test_groups_make_standard_errors_robust(few):
 def test_bad_choices_are_refused(few):
     for options, message in [
         ({"groups": "night"}, "block = 'night'; allowed are derotator, pair"),
-        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one per datum"),
+        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed is \(96,\), one per datum"),
         ({"groups": np.zeros(96)}, "1 groups for a robust covariance; 3 are needed"),
     ]:
         with pytest.raises(FitError, match=message):

@@ -256,7 +256,7 @@ def test_wrong_input_is_refused_in_one_line():
         (tables, {"vary": {"hwp": "steps"}}, "there is no event between the runs"),
         (tables, {"vary": "all"}, "vary = 'all'"),
         (tables, {"events": twice}, "another one lies between 2001-03-01 and 2002-03-01"),
-        (tables, {"events": ["soon"]}, "event 'soon' is not a date"),
+        (tables, {"events": ["soon"]}, "event = 'soon' is not a date"),
         (with_meta(date=None), {}, "run 2 .* has no date"),
         (with_meta(date="2001-03-01"), {}, "runs 1 and 2 are both of 2001-03-01"),
         (with_meta(instrument="irdis"), {}, "different instruments: charis, irdis"),

@@ -231,7 +231,7 @@ def test_bad_weights_are_refused(truth, data):
         ("given", FitError, "was not fitted with a noise given"),
         (0.0, ParameterError, "must be positive"),
         ([0.1, 0.2], ParameterError, r"shape \(2,\); allowed are one value, 4"),
-        (3 * u.mm, ParameterError, "wrong unit"),
+        (3 * u.mm, ParameterError, "noise has unit"),
         (1 / 0.002, ParameterError, "noise of 5e[+]04 %: weights takes the noise"),
     ]:
         with pytest.raises(error, match=message):

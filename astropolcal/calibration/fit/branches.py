@@ -14,6 +14,7 @@ from itertools import pairwise, product
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration.identifiability.analysis import other_turn
 from astropolcal.calibration.identifiability.sky import mean_errors, seen_with
 from astropolcal.calibration.noise.weighting import Problem
 from astropolcal.chain import leaves
@@ -239,9 +240,8 @@ class BinProblem(Problem):
             if set(_ELLIPTICAL) <= set(rows):
                 own = self.elements[[rows[key] for key in _ELLIPTICAL]]
                 for one in found[:2]:
-                    # turning by d about an axis is turning by d - 360 deg about it
-                    other, length = one.copy(), np.linalg.norm(one[own], axis=0)
-                    other[own] *= 1 - 2 * np.pi / np.where(length > 0, length, np.inf)
+                    other = one.copy()
+                    other[own] = other_turn(one[own])
                     found.append(np.clip(other, self._low, self._high))
         return found
 
@@ -492,9 +492,8 @@ def other_signs(problem, vector):
     """Return starts in which one of a few wavelengths is in another branch."""
     costs, found = problem.costs(vector), []
     for branch in problem.branches(vector)[1:] if problem.n_bins <= COARSE else ():
-        found += [
-            start for _, start in _one_by_one(problem, vector, costs, *problem.polish(branch))
-        ]
+        others = _one_by_one(problem, vector, costs, *problem.polish(branch))
+        found += [start for _, start in others]
     return found
 
 

@@ -14,7 +14,6 @@ user names another gauge by holding parameters (``fix=``) or by a prior.
 
 import platform
 import time
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +24,7 @@ import numpy as np
 from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 
-from astropolcal.calibration.fit.branches import BinProblem, bent_valleys, undecided_signs
+from astropolcal.calibration.fit.branches import ROUNDED, BinProblem, bent_valleys, undecided_signs
 from astropolcal.calibration.fit.strategies import (
     joint,
     known_noises,
@@ -49,15 +48,11 @@ from astropolcal.calibration.noise.weighting import (
     robust_weighting,
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
-from astropolcal.calibration.uncertainty.covariance import (
-    covariance_around,
-    errors_at_bounds,
-    white_covariance,
-)
+from astropolcal.calibration.uncertainty.covariance import covariance_around, errors_at_bounds
 from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalWarning, FitError
+from astropolcal.exceptions import FitError, warn
 from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
@@ -230,16 +225,11 @@ class FittedMeasurement:
         """Whether the fit converged."""
         return self.fit["converged"]
 
-    def calibration(self, *, cross_validate=False):
-        """Return the calibration, with its errors."""
-        return _result(
-            self.measurement,
-            self.whitened,
-            settings=dict(self.settings),
-            fit=dict(self.fit),
-            stages=self.stages,
-            cross_validate=cross_validate,
-        )
+    def calibration(self, *, cross_validate=False, covariance=None):
+        """Return the calibration, with its errors; ``covariance`` is that of more data."""
+        calibration = _result(self, covariance)
+        stage("cross-validation")
+        return calibration.cross_validate() if cross_validate else calibration
 
 
 def fitted(
@@ -267,9 +257,7 @@ def fitted(
     if loss != "linear":
         outcome, weighting = _robust(measurement, loss, fitter)
     if not outcome["converged"]:
-        warnings.warn(
-            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=3
-        )
+        warn(f"the fit did not converge: {outcome['message']}", stacklevel=3)
     taken, whitened = _at_gauge(measurement, weighting, origin, chosen["gauge"])
     gauge = describe_gauge(chosen["gauge"], taken, measurement.free, held)
     settings = {"instrument": instrument, "fitter": type(fitter).__name__, **chosen, "gauge": gauge}
@@ -370,8 +358,6 @@ _LONGEST = 2.0
 _SPOILT = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
-# residuals below this are rounding, of data without noise
-_ROUNDED = 1e-6
 
 
 def _at_gauge(measurement, weighting, origin, gauge):
@@ -476,8 +462,10 @@ def describe_gauge(gauge, chosen, free, held):
 # ---- the result ------------------------------------------------------------------
 
 
-def _result(measurement, whitened, *, settings, fit, stages, cross_validate, covariance=None):
+def _result(fitted, covariance=None):
     """Return the calibration; ``covariance`` is that of more data than its own."""
+    measurement, whitened = fitted.measurement, fitted.whitened
+    settings, fit = fitted.settings, dict(fitted.fit)
     vector, names = measurement.vector(), measurement.free.names
     residuals, weighting = measurement.residuals(vector), measurement.weighting
     view = view_of_measurement(measurement, vector, settings["instrument"])
@@ -485,12 +473,9 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     if covariance is not None and not measurement.free.priors:
         # by the data of all runs, too
         finding.identifiable |= np.isfinite(covariance.stds)
-    scatter = None
-    if settings["errors"] == "white":
-        own = white_covariance(measurement, whitened, weighting)
-    else:
-        scatter = Scatter(measurement, weighting, whitened)
-        own = covariance_around(measurement, whitened, weighting, scatter)
+    is_white = settings["errors"] == "white"
+    scatter = None if is_white else Scatter.of(measurement, weighting, whitened)
+    own = covariance_around(measurement, whitened, weighting, scatter)
     if np.isfinite(weighting.level):
         own, curved = _along_valleys(measurement, whitened, own, view)
         finding.near_null += curved
@@ -499,7 +484,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
-    lacking = scatter and model_error(measurement, scatter, errors_of_signs)
+    lacking = None if is_white else model_error(measurement, scatter, errors_of_signs)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
@@ -515,7 +500,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
         },
         fit=fit,
         ties=dict(measurement.free.ties),
-        stages=stages,
+        stages=fitted.stages,
         measurement=measurement,
         provenance=provenance()
         | {"scipy": installed("scipy"), "python": platform.python_version()},
@@ -531,9 +516,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate, cov
     rows = zip(*outliers.values(), strict=True)
     fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
     fit["model_error"] = lacking
-    keep_sky_accuracy(calibration, view)
-    stage("cross-validation")
-    return calibration.cross_validate() if cross_validate else calibration
+    return keep_sky_accuracy(calibration, view)
 
 
 def _along_valleys(measurement, whitened, covariance, view):
@@ -553,7 +536,7 @@ def _off_minimum(measurement, whitened, covariance):
     # a step of Newton's; of data without noise residuals are rounding
     pull = problem.jacobian(vector).T @ problem.residuals(vector) * whitened.scale
     step = np.abs(factor.T @ (factor @ pull)) * whitened.scale / free.factors()
-    known = (covariance.stds > 0) & (rms(measurement.residuals()) > _ROUNDED)
+    known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED)
     times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
     worst = int(np.argmax(times))
     return {"parameter": free.names[worst], "errors": float(times[worst])}
@@ -575,7 +558,7 @@ def _lack_of_fit(calibration, whitened):
         found.append(
             {
                 "noise": noise.method,
-                "noise_percent": 100 * float(np.sqrt(np.mean(noise.sigma_of_data**2))),
+                "noise_percent": 100 * rms(noise.sigma_of_data),
                 "times_noise": float(np.sqrt(ratio)),
                 "p_value": float(test.p_value),
                 "words": test.words,

@@ -7,18 +7,20 @@ g-prior), averaged over three orders of magnitude, and over laws in wavelength o
 numbers per parameter, or one per wavelength.
 """
 
-import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
 from astropy.time import Time
 
-from astropolcal.exceptions import AstropolcalWarning, ParameterError
+from astropolcal.exceptions import ParameterError, warn
+from astropolcal.units import iso_date
 
 __all__ = []
 
 #: What an optic may do from run to run.
 COURSES = ("constant", "steps", "drift", "walk", "scatter")
+#: Courses that follow a law.
+SIMPLE = ("steps", "drift")
 #: Sizes of a deviation in standard errors of one run, and numbers per parameter of its law in
 #: wavelength; None is one per wavelength.
 SIZES, LAWS = (3.0, 10.0, 30.0, 100.0, 1000.0), (1, 3, None)
@@ -33,11 +35,7 @@ _RANK = 1e-12
 
 def moment_of(when, name):
     """Return a date as a `Time` that no table of leap seconds limits: a decade ahead, too."""
-    try:
-        return Time(getattr(when, "isot", when), scale="tai")
-    except (ValueError, TypeError):
-        words = f"{name} {when!r} is not a date; allowed are dates such as 2025-10-05"
-        raise ParameterError(words) from None
+    return Time(iso_date(when, name), scale="tai")
 
 
 def chances_of(dates, events, usual):
@@ -47,8 +45,7 @@ def chances_of(dates, events, usual):
     for event in events:
         gap = int(np.searchsorted(ordered.mjd, moment_of(event, "event").mjd)) - 1
         if not 0 <= gap < len(found):
-            words = f"event {event} is not between two of the runs, and has no part"
-            warnings.warn(words, AstropolcalWarning, stacklevel=3)
+            warn(f"event {event} is not between two of the runs, and has no part", stacklevel=3)
             continue
         if found[gap] == EVENT:
             raise ParameterError(
@@ -189,10 +186,9 @@ def weigh(deviations, waves, chances):
     for deviation in deviations:
         share = -np.log(len(deviations) * len(SIZES))
         for course, times in waves.items():
-            whole = course in ("walk", "scatter")
-            if whole and times.shape[1] * deviation.targets.shape[1] > _MOST_NUMBERS:
+            simple = course in SIMPLE
+            if not simple and times.shape[1] * deviation.targets.shape[1] > _MOST_NUMBERS:
                 continue
-            simple = course in ("steps", "drift")
             normal = deviation.along(times, each=simple)
             prior = np.log(_OTHER if course != "steps" else base * chances / (1 - chances))
             for size in SIZES:

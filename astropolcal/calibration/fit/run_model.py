@@ -15,6 +15,7 @@ import numpy as np
 from astropolcal.calibration.fit.evidence import (
     COURSES,
     EVENT,
+    SIMPLE,
     Deviation,
     Term,
     Weighed,
@@ -38,8 +39,6 @@ _RIVAL = 5.0
 _MOST_TERMS, _MOST_SEARCHES = 12, 5
 # prior probability of a step anywhere, and between two runs at the most
 _CHANGED, _MOST_CHANGED = 0.3, 0.05
-# courses that follow a law
-_SIMPLE = ("steps", "drift")
 # the solution has arrived where no determined direction moves by this share of its error
 _ARRIVED, _MOST_ROUNDS, _HALVINGS, _SHORTER = 0.01, 20, 6, 1.1
 # so far beyond a bound, in steps of a degree or so, is rounding
@@ -226,13 +225,9 @@ class Model:
         """Solve until no run moves by more than a share of its error."""
         for k in range(_MOST_ROUNDS):
             old = self.solve()
-            moved = max(
-                np.abs(one.rows @ ((new - then) / scale)).max(initial=0.0)
-                for one, new, then, scale in zip(
-                    self.rows, self.vectors, old, self.scales, strict=True
-                )
-            )
-            if moved < _ARRIVED:
+            runs = zip(self.rows, self.vectors, old, self.scales, strict=True)
+            moves = (one.rows @ ((new - then) / scale) for one, new, then, scale in runs)
+            if max(np.abs(move).max(initial=0.0) for move in moves) < _ARRIVED:
                 return k + 1, True
         return _MOST_ROUNDS, False
 
@@ -268,7 +263,7 @@ class Model:
         for k in range(_MOST_SEARCHES):
             stage(f"what changed, look {k + 1}")
             # far from a run its rows mislead: what was found is looked for again from where it led
-            gained, terms = self._grown(_SIMPLE)
+            gained, terms = self._grown(SIMPLE)
             if len(terms) > 1:
                 # a walk does what several steps do, and the other way round
                 other = self._grown(COURSES[1:])
@@ -298,9 +293,8 @@ class Model:
             odds = {what: one.odds_of(among) for what, one in found.items()}
             what = max(odds, key=odds.get, default=None)
             if what is not None and odds[what] > _ENOUGH:
-                self._take(
-                    [*self.terms, self._term(what, self.varying[what], found[what].best(among))]
-                )
+                new = self._term(what, self.varying[what], found[what].best(among))
+                self._take([*self.terms, new])
                 gained += odds[what] + self._exchange()
             elif among == COURSES[1:]:
                 break
@@ -310,7 +304,7 @@ class Model:
 
     def _term(self, what, names, best):
         # a size that is given to what follows no law keeps it from following the noise
-        prior = np.inf if best.course in _SIMPLE else best.prior
+        prior = np.inf if best.course in SIMPLE else best.prior
         return replace(best, what=what, names=names, prior=prior)
 
     def _exchange(self):

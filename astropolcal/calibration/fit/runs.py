@@ -17,6 +17,7 @@ most probable first.
 """
 
 import json
+import os
 import uuid
 from dataclasses import dataclass
 
@@ -27,17 +28,18 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.calibration.fit.calibrate import ERRORS, _result
+from astropolcal.calibration.fit.calibrate import ERRORS, FittedMeasurement
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.linearized import STILL, Whitened
+from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, understood
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
 from astropolcal.measurement.parameters import told_prior
@@ -200,18 +202,13 @@ class _Checkpoint:
 
     def __init__(self, path, keys):
         self.path, self.keys, self.fits = path, keys, {}
-        if path is None:
+        if path is None or not os.path.exists(path):
             return
-        try:
-            with open(path, encoding="utf-8") as stream:
-                self.fits = json.load(stream)["fits"]
-            valid = all(np.isfinite(vector).all() for vector in self.fits.values())
-        except FileNotFoundError:
-            return
-        except (ValueError, KeyError, TypeError, AttributeError, OSError):
-            valid = False
-        if not valid:
-            raise FitError(f"{path} is not a checkpoint of calibrate_runs; give another file")
+        words = "is not a checkpoint of calibrate_runs, give another file"
+        with understood(path, FitError, words), open(path, encoding="utf-8") as stream:
+            self.fits = json.load(stream)["fits"]
+            if not all(np.isfinite(vector).all() for vector in self.fits.values()):
+                raise ValueError("a value is not finite")
 
     def __getitem__(self, i):
         return self.fits.get(self.keys[i])
@@ -255,8 +252,8 @@ class _Run:
         around = Problem(measurement, weighting).around()
         weighting = weighting.updated(measurement, around)
         measurement.weighting = weighting
-        scatter = Scatter(measurement, weighting, around) if errors == "scatter" else None
-        self.scatter = scatter if scatter is not None and scatter.is_known else None
+        is_white = errors == "white"
+        self.scatter = None if is_white else Scatter.of(measurement, weighting, around)
         #: Of the fit of this run alone, canonical.
         self.fitted, self.level = measurement.vector(), weighting.level
         self.stands_out = stands_out(measurement)
@@ -294,8 +291,7 @@ class _Run:
         rows = root @ (found.singular[: found.rank, None] * found.right[: found.rank])
         targets = rows @ (vector / self.scale) + root @ (along.T @ residual)
         square = float(residual @ residual)
-        rms = np.sqrt(square / residual.size)
-        return _Rows(rows, targets, square / self.level**2, rms, self.stands_out)
+        return _Rows(rows, targets, square / self.level**2, rms(residual), self.stands_out)
 
 
 # runs that a process has prepared, by what calls for them and number
@@ -406,7 +402,7 @@ class RunsCalibration:
         model, rows = self._model, []
         if model.dates is None:
             return Table(names=("what", "course"), dtype=(str, str))
-        own = {}
+        own, days = {}, sorted(self.dates.isot)
         for term in model.terms:
             own.setdefault(term.what, []).append(term)
         for what, terms in own.items():
@@ -416,7 +412,7 @@ class RunsCalibration:
             row = {"what": what, "course": terms[-1].course}
             row["probability"] = (1 - told.chances["constant"]) * share
             row |= told.chances
-            row["when"] = ", ".join(self._between(gap) for gap in gaps)
+            row["when"] = ", ".join(f"{days[k][:10]} to {days[k + 1][:10]}" for k in gaps)
             rows.append(row | {"or": ", ".join(rivals)})
         for what, told in model.weighed().items():
             if what == optic(what) and what not in map(optic, own):
@@ -436,10 +432,6 @@ class RunsCalibration:
                 "stands_out": [one.stands_out for one in model.rows],
             }
         )
-
-    def _between(self, gap):
-        days = sorted(self.dates.isot)
-        return f"{days[gap][:10]} to {days[gap + 1][:10]}"
 
     def values(self, name):
         """
@@ -508,25 +500,19 @@ class RunsCalibration:
         measurement = one.measurement
         measurement.stand_at(model.vectors[run])
         whitened = Problem(measurement, measurement.weighting).around()
-        covariance = self._covariance(run)
+        settings = {
+            "instrument": None,
+            "fitter": "calibrate_runs",
+            "strategy": "runs",
+            "loss": "linear",
+            "errors": "scatter" if one.scatter is not None else "white",
+            "gauge": "least change from the first run",
+            "runs": {"count": len(self), "varying": self._varying()},
+        }
         told = {"converged": self.converged, "message": f"one likelihood of {len(self)} runs"}
-        return _result(
-            measurement,
-            whitened,
-            settings={
-                "instrument": None,
-                "fitter": "calibrate_runs",
-                "strategy": "runs",
-                "loss": "linear",
-                "errors": "scatter" if one.scatter is not None else "white",
-                "gauge": "least change from the first run",
-                "runs": {"count": len(self), "varying": self._varying()},
-            },
-            fit=told | {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0},
-            stages=[],
-            cross_validate=False,
-            covariance=covariance,
-        )
+        told |= {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0}
+        fitted = FittedMeasurement(measurement, whitened, settings, told, stages=[])
+        return fitted.calibration(covariance=self._covariance(run))
 
     def summary(self):
         """

@@ -36,6 +36,7 @@ from astropolcal.calibration.noise.estimates import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_roughness,
+    rms,
 )
 from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.noise.weighting import (
@@ -124,13 +125,12 @@ def fit_once(measurement, weighting, fitter):
         return {"converged": found.success, "message": found.message, "evaluations": found.nfev}
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
+    how = {"weights": weights, "maxiter": _MAX_EVALUATIONS, "inplace": True}
     with warnings.catch_warnings(record=True) as caught:
         # recorded, not shown: whether the fit arrived is told once, in the words of this package
         warnings.simplefilter("always", AstropyWarning)
         try:
-            fitter(
-                canonical, index, observed, weights=weights, maxiter=_MAX_EVALUATIONS, inplace=True
-            )
+            fitter(canonical, index, observed, **how)
         except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
             said = one_line(str(error))
             raise FitError(f"{type(fitter).__name__} failed: {said}") from error
@@ -371,8 +371,8 @@ def two_step(measurement, weighting, fitter, search, options):
         chains = measurement.put_back() if stages else loose
         step = _step_of(measurement, chains, held, options)
         if step.free.size:
-            how = (fitter,) if outcomes else (fitter, search)
-            outcome, weighting = (run if outcomes else joint)(step, weighting, *how)
+            # what the first step has found needs no search
+            outcome, weighting = joint(step, weighting, fitter, search and not outcomes)
             outcomes.append(outcome)
         stages.append(_taken(title, step, measurement))
     return outcomes, weighting, stages
@@ -396,8 +396,7 @@ def sequential(measurement, weights, fitter, search, options):
         step = _step_of(measurement, measurement.put_back(), held, options, rows)
         if step.free.size:
             weighting = first_weighting(step, weights)
-            how = (fitter,) if stages else (fitter, search)
-            outcomes.append((run if stages else joint)(step, weighting, *how)[0])
+            outcomes.append(joint(step, weighting, fitter, search and not stages)[0])
         title = f"{kind}, what came before held" if stages else kind
         stages.append(_taken(title, step, measurement))
         # what this step has found is known for the next ones
@@ -458,5 +457,4 @@ def _taken(title, step, measurement):
     _copy_fitted(step, measurement)
     step.put_back()
     values = {slot.name: step.free.values_of(slot.name) for slot in step.free.slots}
-    rms = float(np.sqrt(np.mean(step.residuals() ** 2)))
-    return {"title": title, "parameters": values, "residual_rms": rms}
+    return {"title": title, "parameters": values, "residual_rms": rms(step.residuals())}

@@ -212,14 +212,9 @@ def complete(measurement, whitened, level, view):
         finding.near_null = near_null_directions(
             free, whitened, level, lambda changes: consequences_along(view, changes)
         )
-    angles = {
-        # commanded angles repeat in many frames; a microradian is none
-        round(float(angle), 6)
-        for dataset in measurement.datasets
-        if "hwp" in dataset.observations.frame_columns
-        for angle in dataset.observations.position("hwp")
-    }
-    finding.sampling = harmonic_words(np.array(sorted(angles))) if angles else []
+    tables = [dataset.observations for dataset in measurement.datasets]
+    angles = [table.position("hwp") for table in tables if "hwp" in table.frame_columns]
+    finding.sampling = harmonic_words(np.concatenate(angles)) if angles else []
     finding.sampling += telescope_words(finding, measurement)
     # open directions that a star of known polarization would close
     leads = [
@@ -382,7 +377,7 @@ def mirror_branches(measurement, vector, view):
             if None not in slots:
                 retarders[leaf.name] = slots
     turns = "a retardance d (length |d|) and d (1 - 360 deg / |d|) are the same optic"
-    candidates = [(f"{name}: {turns}", [name], _other_turn) for name in retarders]
+    candidates = [(f"{name}: {turns}", [name], other_turn) for name in retarders]
     candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", retarders, _other_hand))
     low, high = measurement.free.bounds()
     for words, names, edit in candidates:
@@ -438,12 +433,11 @@ def _other_instrument(measurement, vector, view):
     return [{"words": words, "sky": sky}] if matters(sky) else []
 
 
-def _other_turn(retardance):
+def other_turn(retardance):
     """Turn the other way round the same axis; shape (1 or 3, n)."""
     length = np.linalg.norm(retardance, axis=0)
     # turning by d about an axis is turning by d - 360 deg about it
-    safe = np.where(length > 0, length, 1.0)
-    return retardance * np.where(length > 0, 1 - 2 * np.pi / safe, 1.0)
+    return retardance * (1 - 2 * np.pi / np.where(length > 0, length, np.inf))
 
 
 def _other_hand(retardance):

@@ -357,7 +357,7 @@ def near_null_directions(free, whitened, level, sky_of):
     skies = sky_of(changes[:_ON_SKY]) if worst else []
     skies += [None] * (len(worst) - len(skies))
     return [
-        _near_null(free, errors[i], times_large[i], condition[i], sky)
+        _near_null(free, leads[i], errors[i], times_large[i], condition[i], sky)
         for i, sky in zip(worst, skies, strict=True)
     ]
 
@@ -389,9 +389,8 @@ def curved_directions(free, vector, valleys, stds, sky_of):
     return found
 
 
-def _near_null(free, error, times_large, condition, sky):
+def _near_null(free, lead, error, times_large, condition, sky):
     """Return one direction: words, what it changes at one standard error, and on sky."""
-    lead = int(ranked(times_large)[0])
     slot = free.by_name[free.names[lead].split("[")[0]]
     _, size, unit = step_of(slot.unit)
     part = np.abs(error[slot.slice]) * size

@@ -335,6 +335,18 @@ def light_of(dolp, double=_DOUBLE):
     return np.stack([np.ones_like(double), dolp * np.cos(double), dolp * np.sin(double)])
 
 
+def weights_of(dolp, double):
+    """Return how q, u, degree and angle follow from the nine changes, (4, n_angles, 9)."""
+    light = light_of(dolp, double).T
+    # dQ = sum of M_Qc S_c, and of q = Q / I also what is found of I changes
+    change = np.eye(3)[:, None, :, None] * light[None, :, None, :]
+    dq, du = (change[i] - light[:, i, None, None] * change[0] for i in (1, 2))
+    cosine, sine = np.cos(double)[:, None, None], np.sin(double)[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.where(dolp > 0, (cosine * du - sine * dq) / np.float64(2 * dolp), np.nan)
+    return np.stack([dq, du, cosine * dq + sine * du, turn]).reshape(4, len(light), 9)
+
+
 # ---- in words ---------------------------------------------------------------------------
 
 
@@ -387,11 +399,8 @@ def _size(value):
 
 def _small(matrices, dolp):
     """Return the changes of angle and degree (of itself) to first order."""
-    light = light_of(dolp)
-    change, (q, u) = matrices @ light, light[1:]
-    # q is Q / I, and what is found of I may change, too
-    dq, du = (change[..., i, :] - light[i] * change[..., 0, :] for i in (1, 2))
-    return (q * du - u * dq) / (2 * dolp**2), (q * dq + u * du) / dolp**2
+    along = matrices.reshape(-1, 9) @ weights_of(dolp, _DOUBLE)[2:].swapaxes(1, 2)
+    return along[1], along[0] / dolp
 
 
 def _whole(matrices, dolp):

@@ -180,6 +180,13 @@ class _Part:
 class Scatter:
     """Covariance of the residuals of a fit; of the weighting only its pattern counts."""
 
+    @classmethod
+    def of(cls, *problem):
+        """Return it where the residuals of all datasets tell how they scatter, else None."""
+        found = cls(*problem)
+        told = (found._level, *(part.amplitude for part in found.parts))
+        return found if all(np.isfinite(one).all() for one in told) else None
+
     def __init__(self, measurement, weighting, whitened):
         self.measurement = measurement
         weight = 1.0 if weighting.weight is None else weighting.weight
@@ -194,10 +201,6 @@ class Scatter:
         ]
         for part in self.parts:
             part.shares = self._shares(part, residuals[part.rows])
-        #: Whether the residuals of all datasets tell how they scatter.
-        self.is_known = all(
-            np.isfinite(x).all() for x in (self._level, *(p.amplitude for p in self.parts))
-        )
 
     def _part(self, i, groups, residuals, leverage):
         dataset, rows = self.measurement.datasets[i], self.measurement.segments[i]
@@ -348,9 +351,9 @@ def model_error(measurement, scatter, signs):
     tell, whose mean squares are ``signs``, where there are such.
     """
     squares, settings = {"relative": [], "absolute": []}, []
-    if not scatter.is_known and not signs.any():
+    if scatter is None and not signs.any():
         return None
-    for i, dataset in enumerate(measurement.datasets if scatter.is_known else ()):
+    for i, dataset in enumerate(() if scatter is None else measurement.datasets):
         polarized = kind_of_source(dataset.observations.source) == "polarized"
         square = scatter.at_settings(i) ** 2
         squares["relative" if polarized else "absolute"].append(square)
@@ -383,3 +386,13 @@ def labels_of(measurement, block):
     """Return the number of the block of each datum; datasets have their own blocks."""
     check_choice("block", block, BLOCKS, FitError)
     return leave_out_groups(measurement, block)
+
+
+def labels_as_given(measurement, groups):
+    """Return the labels of the groups of data, of which a user gives one per datum."""
+    labels = np.asarray(groups)
+    if labels.shape != (measurement.n_data,):
+        raise FitError(
+            f"groups of shape {labels.shape}; allowed is ({measurement.n_data},), one per datum"
+        )
+    return labels

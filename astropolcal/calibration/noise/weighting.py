@@ -20,6 +20,7 @@ from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavel
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA, brightness
 from astropolcal.observations.pointings import frame_names
+from astropolcal.units import to_unit
 from astropolcal.words import check_choice, did_you_mean
 
 __all__ = ["outlying_data"]
@@ -515,10 +516,7 @@ def _by_wavelength(measurement, leverage):
 
 def given_noise(measurement, noise):
     """Return the noise of every datum from one value, one per wavelength or one per datum."""
-    try:
-        noise = u.Quantity(noise).to_value(u.dimensionless_unscaled)
-    except (TypeError, u.UnitConversionError):
-        raise ParameterError(f"noise = {noise!r} is not a number, or has a wrong unit") from None
+    noise = to_unit(noise, None, "noise")
     if not np.all(np.isfinite(noise) & (noise > 0)):
         raise ParameterError(f"noise must be positive and finite; the least is {np.min(noise)}")
     if noise.shape == measurement.wavelength.shape:

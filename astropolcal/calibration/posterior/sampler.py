@@ -7,8 +7,6 @@ be killed at any moment; called again it goes on with the same random numbers, s
 the same as without the interruption.
 """
 
-import warnings
-
 import numpy as np
 
 from astropolcal.calibration.noise.weighting import (
@@ -17,7 +15,6 @@ from astropolcal.calibration.noise.weighting import (
     Weighting,
     given_noise,
     noise_of,
-    problem_of,
     weighting_of,
 )
 from astropolcal.calibration.posterior.checkpoint import Chain
@@ -25,7 +22,7 @@ from astropolcal.calibration.posterior.samples import ENOUGH, Posterior, need
 from astropolcal.calibration.result.calibration import Calibration
 from astropolcal.calibration.uncertainty.covariance import widening
 from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement.parameters import told_prior
 from astropolcal.progress import in_one_thread, shown, steps
 from astropolcal.units import check_seed
@@ -487,13 +484,12 @@ def _warn(posterior):
         complaints = "; ".join(posterior.convergence.complaints(posterior.names))
         doubts.append(f"the chain is {problem}: {complaints}")
     for doubt in filter(None, doubts):
-        warnings.warn(doubt, AstropolcalWarning, stacklevel=3)
+        warn(doubt, stacklevel=3)
 
 
 def _narrow(calibration, log_posterior):
     """Return in words by how much the errors of the fit exceed those of independent data."""
-    has_scatter = calibration.settings.get("errors") != "white"
-    times = widening(problem_of(calibration), has_scatter)[log_posterior.sampled]
+    times = widening(calibration)[log_posterior.sampled]
     worst = int(np.argmax(times))
     words = (
         "the samples take data as independent; by the scatter of the residuals the error of "

@@ -172,18 +172,19 @@ class Convergence:
             found.append(f"{ENOUGH} times are needed; run {wanted} steps or more")
         if self.r_hat is None:
             return found
-        worst, value = _extreme(self.r_hat, names, largest=True)
-        if not value <= LARGEST_R_HAT:
+        # what is not a number is the worst for numpy, too
+        worst = np.argmax(self.r_hat)
+        if not self.r_hat[worst] <= LARGEST_R_HAT:
             found.append(
-                f"R-hat of {worst} is {value:.3f}, but {LARGEST_R_HAT} is the most for walkers "
-                "that agree"
+                f"R-hat of {names[worst]} is {self.r_hat[worst]:.3f}, but {LARGEST_R_HAT} is the "
+                "most for walkers that agree"
             )
         for kind, size in (("bulk", self.ess_bulk), ("tail", self.ess_tail)):
-            worst, value = _extreme(size, names, largest=False)
-            if not value >= FEWEST_SAMPLES:
+            worst = np.argmin(size)
+            if not size[worst] >= FEWEST_SAMPLES:
                 found.append(
-                    f"{worst} has an effective sample size ({kind}) of {value:.0f}, but "
-                    f"{FEWEST_SAMPLES} are needed"
+                    f"{names[worst]} has an effective sample size ({kind}) of {size[worst]:.0f}, "
+                    f"but {FEWEST_SAMPLES} are needed"
                 )
         return found
 
@@ -196,13 +197,6 @@ class Convergence:
             f"R-hat is {self.r_hat.max():.3f} or less, the effective sample size "
             f"{size:.0f} or more."
         )
-
-
-def _extreme(values, names, largest):
-    """Return name and value of the worst; what is not a number is worse than any."""
-    bad = np.where(np.isnan(values), np.inf, values if largest else -values)
-    i = int(np.argmax(bad))
-    return names[i], values[i]
 
 
 # ---- samples of a posterior: quantiles, covariance, and whether to believe them ----

@@ -27,8 +27,8 @@ from astropolcal.calibration.validation.cross_validation import (
 )
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.datasets import as_tables
 from astropolcal.measurement.parameters import element_names
-from astropolcal.observations import Observations
 from astropolcal.observations.reading import dates_of
 from astropolcal.units import iso_date
 from astropolcal.words import html
@@ -358,9 +358,7 @@ class Calibration:
             flat = (np.ravel(known[key]) for key in keys)
             rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
         types = (str, float, float, bool, bool, float, str, float, str, str)
-        table = ParameterTable(
-            rows=rows or None, names=("name", *keys, "unit"), dtype=None if rows else types
-        )
+        table = ParameterTable(rows=rows or None, names=("name", *keys, "unit"), dtype=types)
         table["value"].info.format, table["std"].info.format = ".6g", ".3g"
         return table["name", "value", "std", "unit", "status", *_OF_ELEMENTS[1:]]
 
@@ -491,7 +489,7 @@ def measurement_of_all(calibration, observations, positions=None):
 
     Tables are recognized by content, and the residuals have to be those of the fit.
     """
-    given = [observations] if isinstance(observations, Observations) else list(observations)
+    given = as_tables(observations)
     positions = [positions] if isinstance(positions, dict) else positions
     if positions is not None and len(positions) != len(given):
         raise CalibrationFileError(f"{len(positions)} positions for {len(given)} tables")

@@ -3,7 +3,7 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
 from astropolcal import instruments
 from astropolcal.calibration.identifiability.sky import known_instrument
@@ -91,12 +91,10 @@ def compare(members):
     twice = sorted({label for label in labels if labels.count(label) > 1})
     if twice:
         raise ParameterError(f"{', '.join(twice)} occurs twice; give labels, as a dict")
-    rows = [row for label, member in pairs for row in _rows(label, *_resolved(label, member))]
-    table = QTable({key: [row[key] for row in rows] for key in rows[0]})
+    table = vstack([_table(label, *_resolved(label, member)) for label, member in pairs])
     for key in table.colnames:
         if key.removesuffix("_std").endswith("_retardance"):
             table[key] = np.asarray(table[key]) * u.deg
-    table["wavelength"] = np.asarray(table["wavelength"]) * u.nm
     return table
 
 
@@ -145,17 +143,16 @@ def _resolved(label, member):
     )
 
 
-def _rows(label, chain, wavelength, instrument, calibration):
+def _table(label, chain, wavelength, instrument, calibration):
     optics = _Optics(chain, wavelength)
     columns = {"label": [label] * wavelength.size, "filter": _filters(instrument, wavelength)}
-    columns["wavelength"] = wavelength.to_value(u.nm)
+    columns["wavelength"] = wavelength.to(u.nm)
     columns |= dict(zip(_COMPARED, optics.values(chain), strict=True))
     stds = np.full((len(_COMPARED), wavelength.size), np.nan)
     if calibration is not None:
         stds = propagate(calibration, lambda chain, *_: optics.values(chain)).std
         stds = np.where(stds > _NO_ERROR, stds, np.nan)
-    columns |= {f"{key}_std": std for key, std in zip(_COMPARED, stds, strict=True)}
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return QTable(columns | {f"{key}_std": std for key, std in zip(_COMPARED, stds, strict=True)})
 
 
 class _Optics:
@@ -271,9 +268,6 @@ def _filters(instrument, wavelength):
     if not names or len(names) != np.size(instrument.wavelength):
         return [""] * wavelength.size
     centres = instrument.wavelength.to_value(u.nm)
-    lam = wavelength.to_value(u.nm)[:, None]
-    nearest = np.abs(lam / centres - 1)
-    return [
-        str(names[i]) if off[i] <= _SAME_FILTER else ""
-        for off, i in zip(nearest, nearest.argmin(axis=1), strict=True)
-    ]
+    off = np.abs(wavelength.to_value(u.nm)[:, None] / centres - 1)
+    nearest = np.array(names, dtype=str)[off.argmin(axis=1)]
+    return np.where(off.min(axis=1) <= _SAME_FILTER, nearest, "")

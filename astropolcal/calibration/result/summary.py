@@ -248,9 +248,8 @@ def _target_lines(calibration, targets):
 def _target_row(table):
     angle = table.meta["aolp"]
     dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
-    row = f"  {dolp:4.3g} %" + (
-        f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
-    )
+    shown = "any" if angle is None else f"{angle.to_value(u.deg):.4g}"
+    row = f"  {dolp:4.3g} %{shown:>10}"
     for key in ("s_Q", "s_U", "s_p", "s_chi"):
         # s_Q and s_U only lead to s_p: their worst values would crowd the table
         worst = (np.max,) if key in ("s_p", "s_chi") else ()

@@ -92,7 +92,7 @@ def verdict(calibration, targets=TARGETS):
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
-    bright = target_accuracies(calibration, TARGETS[:1])
+    bright = tables[:1] if targets is TARGETS else target_accuracies(calibration, TARGETS[:1])
     found = {}
     for lead, change in _open_leads(calibration, free).items():
         for what in _seen(change):
@@ -433,10 +433,7 @@ def _next(calibration, free, wrong, sky):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, _more_angles(turning)),
-        (
-            "star" in missing,
-            f"an unpolarized standard star; the telescope {telescope}",
-        ),
+        ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
         (
             any(entry["status"] == "by priors" for entry in _orientations(free).values()),

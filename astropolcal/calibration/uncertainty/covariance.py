@@ -84,11 +84,9 @@ class Covariance:
         variances = np.diag(self.matrix)
         # the parameters have units of their own, and with them the rounding errors
         stds = np.sqrt(np.where(np.isfinite(variances), np.abs(variances), 0.0))
-        with np.errstate(invalid="ignore", over="ignore"):
-            same = np.abs(self.matrix - self.matrix.T) <= _ASYMMETRY * np.outer(stds, stds)
-        # equal infinities have no difference
-        missing = np.isnan(self.matrix)
-        same |= (self.matrix == self.matrix.T) | (missing & missing.T)
+        with np.errstate(over="ignore"):
+            slack = _ASYMMETRY * np.outer(stds, stds)
+            same = np.isclose(self.matrix, self.matrix.T, rtol=0, atol=slack, equal_nan=True)
         if not same.all():
             row, column = np.argwhere(~same)[0]
             raise ParameterError(
@@ -175,9 +173,8 @@ class Covariance:
         if not rows:
             return self
         steps = np.array([declared_step(unit) for unit in self.units])
-        _, sizes, right = np.linalg.svd(
-            np.vstack([self.factor, *rows]) / steps, full_matrices=False
-        )
+        rows = np.vstack([self.factor, *rows]) / steps
+        _, sizes, right = np.linalg.svd(rows, full_matrices=False)
         factor, matrix = sizes[:, None] * right * steps, np.full(self.matrix.shape, np.nan)
         known = np.ix_(*(np.flatnonzero(np.isfinite(variances)),) * 2)
         matrix[known] = (factor.T @ factor)[known]
@@ -338,19 +335,25 @@ def full_covariance(calibration):
         is_open = (np.abs(null[:, undetermined]) > STILL).any(axis=1)
         return Covariance(known.names, known.units, known.matrix, null=null[is_open] * steps)
     problem = problem_of(calibration)
-    how = white_covariance if calibration.settings.get("errors") == "white" else covariance_around
-    return how(problem.measurement, problem.around(), problem.weighting)
+    whitened = problem.around()
+    scatter = _scatter_of(calibration, problem, whitened)
+    return covariance_around(problem.measurement, whitened, problem.weighting, scatter)
 
 
-def covariance_around(measurement, whitened, weighting, scatter=None):
+def _scatter_of(calibration, problem, whitened):
+    """Return how the residuals of a calibration scatter, where its errors follow from that."""
+    is_white = calibration.settings.get("errors") == "white"
+    return None if is_white else Scatter.of(problem.measurement, problem.weighting, whitened)
+
+
+def covariance_around(measurement, whitened, weighting, scatter):
     """Return the covariance with its directions, of a problem that is decomposed once.
 
     It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and are
     correlated; where they do not tell, that of independent data. What is at a bound may go inward
     by its error.
     """
-    scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
-    if not scatter.is_known:
+    if scatter is None:
         return white_covariance(measurement, whitened, weighting)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
     slack = _inward(measurement, whitened, scatter)[-1] if whitened.held.any() else None
@@ -362,22 +365,21 @@ def _middle(scatter, level, data, priors):
 
     Without ``scatter`` data are independent.
     """
-    known = scatter is not None and scatter.is_known
-    own = scatter.middle(data) if known else level**2 * data.T @ data
+    own = level**2 * data.T @ data if scatter is None else scatter.middle(data)
     return own + level**2 * priors.T @ priors
 
 
-def widening(problem, with_scatter):
+def widening(calibration):
     """Return by how much the scatter makes the error of each parameter larger, (n_free,).
 
     Over that where chi-square with the weights of the fit rises by one; of what is at a bound
     inward, and one of what has no error.
     """
+    problem = problem_of(calibration)
     measurement, whitened, weighting = problem.measurement, problem.around(), problem.weighting
-    scatter = Scatter(measurement, weighting, whitened) if with_scatter else None
+    scatter = _scatter_of(calibration, problem, whitened)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
-    known = scatter is not None and scatter.is_known
-    found = sandwich(measurement, whitened, weighting, middle, has_scatter=known)
+    found = sandwich(measurement, whitened, weighting, middle, has_scatter=scatter is not None)
     stated = found.stds * measurement.free.factors()
     plain = weighting.level * np.sqrt(np.diag(whitened.covariance()))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -483,9 +485,8 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     n, level = measurement.n_data, measurement.weighting.level
     # columns of an orthonormal basis, and the root of how these are pulled
     variances, axes = np.linalg.eigh(_middle(scatter, level, *np.split(columns @ inverse, [n])))
-    root = (
-        inverse @ axes * np.sqrt(variances.clip(0)) * _few_at_bounds(measurement, whitened, scatter)
-    )
+    few = _few_at_bounds(measurement, whitened, scatter)
+    root = inverse @ axes * np.sqrt(variances.clip(0)) * few
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
         i = names.index(name)
@@ -498,8 +499,7 @@ def errors_at_bounds(measurement, whitened, scatter=None):
 
 def _few_at_bounds(measurement, whitened, scatter):
     """Return `_of_few` of what is released from its bounds."""
-    known = scatter is not None and scatter.is_known
-    told = known or measurement.weighting.from_residuals
+    told = scatter is not None or measurement.weighting.from_residuals
     return _of_few(measurement, whitened, told, more=int(whitened.held.sum()))
 
 

@@ -389,14 +389,13 @@ def _leaf(chains, name):
 
 def of_law(calibration, optic, law, lam):
     """Return a law of an optic, with exact derivatives where it gives them."""
-    free, leaf = free_of(calibration), _leaf(calibration.chains, optic)
+    leaf = _leaf(calibration.chains, optic)
     if law in leaf._laws:
         # a thickness cannot be stepped below zero, and phases of mirrors jump by a turn
         value, slopes = leaf._laws_at(lam)[law]
-        slopes = per_canonical(free, {f"{optic}.{key}": slope for key, slope in slopes.items()})
+        slopes = {f"{optic}.{key}": slope for key, slope in slopes.items()}
         mix = between(np.atleast_1d(lam.to_value(u.nm)), calibration.wavelength.to_value(u.nm))
-        slopes = spread_out(free, slopes, lam.shape, mix, -1).reshape(-1, free.size)
-        found = derive(calibration, free, value * (leaf._laws[law] or u.one), slopes)
+        found = _by_name(calibration, value * (leaf._laws[law] or u.one), slopes, -1, mix)
     else:
         found = propagate(calibration, lambda *chains: getattr(_leaf(chains, optic), law)(lam))
     return replace(found, wavelength=lam)
@@ -451,10 +450,10 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     return _by_name(calibration, value, system_mueller_derivatives(chain, lam, positions), -3)
 
 
-def _by_name(calibration, value, slopes, axis):
+def _by_name(calibration, value, slopes, axis, mix=None):
     """Return a quantity with its error from derivatives by name, see `spread_out`."""
     free = free_of(calibration)
-    mix = np.eye(len(calibration.wavelength))
+    mix = np.eye(len(calibration.wavelength)) if mix is None else mix
     slopes = spread_out(free, per_canonical(free, slopes), np.shape(value), mix, axis)
     return derive(calibration, free, value, slopes.reshape(-1, free.size))
 

@@ -16,7 +16,6 @@ Sandwich: the residuals of whole groups of data tell how far each group pulls th
 1980; Liang & Zeger 1986).
 """
 
-import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -24,7 +23,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL, Whitened
-from astropolcal.calibration.noise.scatter import labels_of
+from astropolcal.calibration.noise.scatter import labels_as_given, labels_of
 from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty.covariance import (
     Covariance,
@@ -33,7 +32,7 @@ from astropolcal.calibration.uncertainty.covariance import (
     white_covariance,
     widening,
 )
-from astropolcal.exceptions import AstropolcalWarning, FitError, ParameterError
+from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement.parameters import declared_step
 from astropolcal.progress import counting, in_one_thread, shown
 from astropolcal.units import check_seed, to_unit
@@ -150,11 +149,8 @@ def _crossing(values, root, rise):
     above = np.flatnonzero(root > rise)
     if not above.size:
         return np.inf
-    i = above[0]
-    if i == 0:
-        return float(values[0])
-    share = (rise - root[i - 1]) / (root[i] - root[i - 1])
-    return float(values[i - 1] + share * (values[i] - values[i - 1]))
+    near = slice(max(above[0] - 1, 0), above[0] + 1)
+    return float(np.interp(rise, root[near], values[near]))
 
 
 @in_one_thread
@@ -228,8 +224,7 @@ def profile(calibration, name, values=None, n=21):
         if not (grid[0] >= low and grid[-1] <= high):
             raise ParameterError(f"{name}: values outside its bounds {low:g} to {high:g}")
     chi2, vectors = _follow(refit, index, grid * factor, int(np.argmin(np.abs(grid - best))))
-    is_white = calibration.settings.get("errors") == "white"
-    sigma = refit.weighting.level * widening(refit, not is_white)[index]
+    sigma = refit.weighting.level * widening(calibration)[index]
     rise = (chi2 - chi2.min()) / sigma**2
     quantity = 1 if unit is None else u.Unit(unit)
     return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
@@ -437,8 +432,7 @@ def _numbered(labels, before, after):
     if count < _FEWEST:
         raise FitError(f"{words}; {_FEWEST} are needed, and many more to be accurate")
     if count < _ENOUGH:
-        words += f"; of fewer than {_ENOUGH} errors are rough, mostly too small"
-        warnings.warn(words, AstropolcalWarning, stacklevel=3)
+        warn(f"{words}; of fewer than {_ENOUGH} errors are rough, mostly too small", stacklevel=3)
     return numbers
 
 
@@ -616,11 +610,7 @@ def robust_covariance(calibration, groups="derotator"):
     """
     problem = problem_of(calibration)
     measurement, whitened = problem.measurement, problem.around()
-    labels = labels_of(measurement, groups) if isinstance(groups, str) else np.asarray(groups)
-    if labels.shape != (measurement.n_data,):
-        raise FitError(
-            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one per datum"
-        )
+    labels = (labels_of if isinstance(groups, str) else labels_as_given)(measurement, groups)
     numbers = _numbered(labels, "", " groups for a robust covariance")
     residuals = problem.residuals(problem.solution)[: measurement.n_data]
     # derivatives to the determined directions, each in units of its standard error

@@ -18,7 +18,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors, rms
-from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
+from astropolcal.calibration.noise.scatter import groups_by, labels_as_given, leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.calibration.system import free_of
 from astropolcal.chain import join, leaves
@@ -156,11 +156,7 @@ def _without(problem):
 
 
 def _checked(measurement, groups):
-    groups = np.asarray(groups)
-    if groups.shape != (measurement.n_data,):
-        raise FitError(
-            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one per datum"
-        )
+    groups = labels_as_given(measurement, groups)
     labels, counts = np.unique(groups, return_counts=True)
     if (counts < 2).any():
         raise FitError(
@@ -603,9 +599,8 @@ def _words(table, same_source):
     moved = table.meta["open_percent"]
     if moved > _WORTH_A_CAUTION * np.nanmedian(table["s_standard"].value):
         words += (
-            f"; along what the calibration does not determine the prediction moves by "
-            f"up to {moved:.2g} % "
-            "a degree, so its gauge counts"
+            "; along what the calibration does not determine the prediction moves by up to "
+            f"{moved:.2g} % a degree, so its gauge counts"
         )
     return words
 

@@ -344,9 +344,7 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     table = star_stokes(calibration, chain, observations, positions)
     table.meta |= {"name": observations.name, "star": known.name}
     q, stokes_u, covariance = known.stokes(table["wavelength"])
-    accuracy = star_accuracy(table, q, stokes_u)
-    for key in accuracy.colnames[1:]:
-        table[key] = accuracy[key]
+    table.update(star_accuracy(table, q, stokes_u))
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)

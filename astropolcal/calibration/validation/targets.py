@@ -12,7 +12,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL
-from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
+from astropolcal.calibration.identifiability.sky import settings_of, view_of_calibration, weights_of
 from astropolcal.calibration.noise.estimates import mean_of_known, rms
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
@@ -52,7 +52,7 @@ def _errors_on_sky(calibration, view, targets, ignore):
     covariance = _products(along[0] * axes.sigmas) + _products(extra)[:, None]
     matrices, count = (covariance, *map(_products, along)), view.good.sum(axis=1)[:, None]
     for dolp, double in targets:
-        weights = _weights(dolp, double).reshape(-1, 9)
+        weights = weights_of(dolp, double).reshape(-1, 9)
         # sums of squares: what cancels leaves the rounding of its terms, of either sign
         variance, known, is_open, blind = (
             np.sum((matrix @ weights.T) * weights.T, axis=-2).clip(0) for matrix in matrices
@@ -78,18 +78,6 @@ def _errors_on_sky(calibration, view, targets, ignore):
 
 def _products(rows):
     return rows @ np.swapaxes(rows, -1, -2)
-
-
-def _weights(dolp, double):
-    """Return how q, u, degree and angle follow from the nine changes, (4, n_angles, 9)."""
-    light = light_of(dolp, double).T
-    # dQ = sum of M_Qc S_c, and of q = Q / I also what is found of I changes
-    change = np.eye(3)[:, None, :, None] * light[None, :, None, :]
-    dq, du = (change[i] - light[:, i, None, None] * change[0] for i in (1, 2))
-    cosine, sine = np.cos(double)[:, None, None], np.sin(double)[:, None, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turn = np.where(dolp > 0, (cosine * du - sine * dq) / np.float64(2 * dolp), np.nan)
-    return np.stack([dq, du, cosine * dq + sine * du, turn]).reshape(4, len(light), 9)
 
 
 # ---- what an accuracy means for a target, and four accuracies side by side ----
@@ -338,8 +326,7 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     for name, key in _CALIBRATIONS.items():
         result[key] = found.get(name, zero * np.nan)
     result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
-    for key, value in propagate_accuracy(dolp, aolp, s_rel, s_abs).items():
-        result[key] = value
+    result.update(propagate_accuracy(dolp, aolp, s_rel, s_abs))
     missing = [name for name in given if name not in found]
     words = f"all three calibrations count, by their {column}"
     if missing:
