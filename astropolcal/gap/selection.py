@@ -574,8 +574,11 @@ def _simple(state, found, fitted, instead):
     # what derivatives ask a law for may be in the second order
     constant = found.constant(fitted[0].chosen[0])
     constant = constant and _extended(state, (constant,), instead)
-    if constant and constant.evidence(found.temper) > fitted[0].evidence(found.temper):
-        fitted[0] = constant
+    few = [fitted[0]]
+    if constant and constant.model.fit.chi2 - few[0].model.fit.chi2 < 2 * ENOUGH * found.temper:
+        # what it leaves asks for no other cause
+        few.append(constant)
+    fitted[0] = max(few, key=lambda one: one.evidence(found.temper))
     return new
 
 
