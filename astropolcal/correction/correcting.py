@@ -183,8 +183,8 @@ def correct(
     _check(frames, mode, weights, open_directions, n_samples, seed)
     provenance = dict(provenance or {})
     if hasattr(calibration, "datasets"):
-        name = provenance.get("calibration", "the calibration")
-        provenance["calibration_faults"] = faults_of(calibration, name)
+        faults = faults_of(calibration, provenance.get("calibration", "the calibration"))
+        provenance["calibration_faults"] = faults
         chain = _chain_at(calibration, frames, chain, max_age=max_age, dates=not any_date)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
@@ -200,9 +200,7 @@ def correct(
     }
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    if systematic is not None and systematic.is_open:
-        unmeasured.append(_OPEN)
-    unmeasured += _weighted(by_variance, frames.source)
+    unmeasured += _of_errors(systematic, by_variance, frames.source)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -222,9 +220,10 @@ def correct(
     )
 
 
-def _weighted(by_variance, source):
-    """Say what weights by variances that follow the fluxes do."""
-    return [_BIASED] if by_variance and getattr(source, "estimated", False) else []
+def _of_errors(systematic, by_variance, source):
+    """Say where errors are open, and what weights by variances that follow the fluxes do."""
+    is_open = systematic is not None and systematic.is_open
+    return [_OPEN] * is_open + [_BIASED] * (by_variance and getattr(source, "estimated", False))
 
 
 def _check(frames, mode, weights, *choices):

@@ -161,13 +161,10 @@ class Model:
         return (1 + same) / (1 - same) if same > _CORRELATED / np.sqrt(count) else 1.0
 
     def unsteadiness(self, name):
-        """
-        Return how much larger the variance of an effect's size is than noise says, and its error.
+        """Return by what the variance of an effect's size exceeds that of noise, and its error.
 
-        As the frames tell, by how much each of them pulls at the size (White 1980,
-        doi:10.2307/1912934), in units of the mean square of the residuals. It is more than 1 of
-        noise that is alike at several wavelengths, has heavy tails, or is larger in the frames or
-        at the wavelengths that show the effect.
+        As the frames pull at it (White 1980, doi:10.2307/1912934): noise that is correlated, has
+        heavy tails or is larger in some frames or at some wavelengths gives more than 1.
         """
         seen, pulls = self.without([name]).residual - self.linear.residual, []
         for channel, rows in zip(self.problem.channels, self.problem.segments, strict=True):
@@ -257,8 +254,7 @@ class Model:
     def off_half_waves(self):
         """Return the model with retardances moved that its fit left at half a wave, None of none.
 
-        Where the data ask for more than half a wave can do, something is missing that no derivative
-        shows there: another retarder does nothing to first order.
+        Another retarder does nothing there to first order.
         """
         vector = self.problem.vector(self.fit.coefficients).copy()
         before = vector.copy()

@@ -356,9 +356,7 @@ def _worse(best, steps, history, groups):
 def _of_noise(best, base):
     """Return the numbers of causes whose pattern may be that of the noise itself.
 
-    That may be where the residuals without any cause are no larger than noise, and where they are
-    all that tells it: then noise may as well be larger in these few frames, unless it is beyond
-    doubt that there is a cause.
+    Either the residuals are no larger than noise, or they alone tell how large it is.
     """
     stated, few = all(channel.stated for channel in base.problem.channels), []
     for i, one in enumerate(best.chosen if base.p_value > _NOISE or not stated else ()):

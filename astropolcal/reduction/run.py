@@ -317,8 +317,7 @@ def reduce_run(
     settings = masters.settings(layout)
     wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
     for frame in frames:
-        frame.doubts += wrong
-        frame.doubts += masters.doubts(frame.values, settings)
+        frame.doubts += [*wrong, *masters.doubts(frame.values, settings)]
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:

@@ -380,10 +380,7 @@ def undecided_signs(measurement, view, stds):
 
 
 def _refitted(problem, vector, costs, trial, new):
-    """Fit everything from other signs of a few wavelengths; return the vectors by wavelength.
-
-    What ``trial`` and its costs ``new`` have there are those of the fit.
-    """
+    """Return fits of everything from other signs by wavelength, put into ``trial`` and ``new``."""
     found, total = {}, np.sum(problem.residuals(vector) ** 2)
     for i, start in _one_by_one(problem, vector, costs, trial, new):
         found[i] = problem.fit(start, evaluations=GLANCE, gain=GAIN)[0]
@@ -498,10 +495,9 @@ def other_signs(problem, vector):
 
 
 def _one_by_one(problem, vector, costs, other, new):
-    """Yield the number of each of a few wavelengths, and vectors that have it as another one has.
+    """Yield each of a few wavelengths, and vectors that have its other sign.
 
-    Only where that is not as good and not far worse. Common parameters that are held make the
-    branch dear that they were not fitted to, and so few wavelengths have no neighbours that tell.
+    Only where that is not as good and not far worse.
     """
     few = problem.n_bins <= COARSE
     for i in np.flatnonzero(few & (_APART * costs < new) & (new < _ABSURD * costs)):

@@ -452,11 +452,7 @@ class Effect:
         return [self, *(self.at(name) for name in names if name not in first)]
 
     def per_run(self, runs):
-        """Return itself, or once for each run in which it may differ.
-
-        An orientation, which the model has for all runs, differs in the second of two as it does
-        in the first.
-        """
+        """Return itself, or once for each run in which it may differ: of two zeros only one."""
         if self.dependence != OWN_RUN:
             return [self]
         return [
