@@ -9,6 +9,7 @@ before any of it is loaded.
 
 import datetime
 import errno
+import json
 import os
 import re
 import secrets
@@ -41,6 +42,8 @@ _ADVICE = {errno.EFBIG: "the file is larger than this system allows; name anothe
 _ADVICE |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space or name another folder")
 _MAY_NOT = (errno.EACCES, errno.EPERM, errno.EROFS)
 _ADVICE |= dict.fromkeys(_MAY_NOT, "name a folder that you may write to")
+# what a line of JSON raises that was cut off, or is none of ours
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
 _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _KINDS |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "a device")
@@ -195,6 +198,28 @@ def append_line(path, line, error=AstropolcalError):
                 raise
     except OSError as problem:
         raise error(f"{path}: cannot be written: {_refusal(problem, path)}") from problem
+
+
+def read_lines(path, understand, kind, error=AstropolcalError, advice="take another name"):
+    """
+    Return what the lines of JSON in a file say, and how many of them cannot be understood.
+
+    The last line does not count: it may have been cut off. Without a file there are none; ``kind``
+    says in words what the file is.
+    """
+    found, n_bad, line = [], 0, "\n"
+    if not os.path.exists(path):
+        return found, n_bad
+    words = f"cannot be read as {kind}"
+    with understood(path, error, words), open(path, encoding="utf-8") as lines:
+        for line in lines:
+            try:
+                found.append(understand(json.loads(line)))
+            except _DAMAGE:
+                n_bad += 1
+    if n_bad and not found:
+        raise error(f"{path}: not {kind}; {advice}")
+    return found, n_bad - (not line.endswith("\n"))
 
 
 def write_bytes(number, content):

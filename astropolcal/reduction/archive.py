@@ -28,7 +28,7 @@ from astropolcal.exceptions import (
     ObservationError,
     warn,
 )
-from astropolcal.files import append_line, one_line, understood
+from astropolcal.files import append_line, one_line, read_lines
 from astropolcal.fitscheck import primary_header
 from astropolcal.pipeline.headers import recognized
 from astropolcal.pipeline.store import sha256_of
@@ -301,30 +301,12 @@ class Manifest:
     """
 
     def __init__(self, path):
-        self.path, self.entries = Path(path), {}
-        if os.path.exists(self.path):
-            self._read()
-
-    def _read(self):
-        n_bad, line = 0, "\n"
-        with (
-            understood(self.path, AstropolcalError, "cannot be read as a manifest"),
-            open(self.path, encoding="utf-8") as lines,
-        ):
-            for line in lines:
-                try:
-                    entry = json.loads(line)
-                    self.entries[str(entry["name"])] = entry
-                except (ValueError, KeyError, TypeError, RecursionError):
-                    n_bad += 1
-        if n_bad and not self.entries:
-            raise AstropolcalError(f"{self.path}: not a manifest; take another folder")
-        # the last one may have been cut off
-        if n_bad > (not line.endswith("\n")):
-            warn(
-                f"{self.path}: {n_bad} of its lines cannot be read; their sequences are done again",
-                stacklevel=3,
-            )
+        self.path = Path(path)
+        named, advice = (lambda e: (str(e["name"]), e)), "take another folder"
+        entries, n_bad = read_lines(path, named, "a manifest", advice=advice)
+        self.entries = dict(entries)
+        if n_bad > 0:
+            warn(f"{path}: {n_bad} of its lines cannot be read; their sequences are done again")
 
     def add(self, entry):
         """Write down what became of a sequence."""

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections import Counter
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import cycle
@@ -20,7 +20,7 @@ from astropolcal.exceptions import (
     ParameterError,
     warn,
 )
-from astropolcal.files import append_line, understood
+from astropolcal.files import append_line, read_lines
 from astropolcal.observations import Observations
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.reading import stated_date, write_table
@@ -597,18 +597,15 @@ def without_repeats(frames, reduction):
 
 # ---- journal -------------------------------------------------------------------------------------
 
-# what a line raises that was cut off, or is no frame
-_DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
-
-def _frame(content):
-    """Return a frame that has what a frame has, or raise."""
-    frame = Frame.from_dict(content)
+def _entry(content):
+    """Return key and frame of a line of a journal, with what a frame has, or raise."""
+    frame = Frame.from_dict(content["frame"])
     kinds = {"path": str, "values": dict, "errors": list, "doubts": list}
     sane = all(isinstance(getattr(frame, name), kind) for name, kind in kinds.items())
     if not (sane and all(isinstance(text, str) for text in frame.errors + frame.doubts)):
         raise TypeError("a frame has a path, values by name, and texts of errors and doubts")
-    return frame
+    return str(content["key"]), frame
 
 
 class Journal:
@@ -623,22 +620,10 @@ class Journal:
         self.path, self._left_file = None if path is None else Path(path), left_file
         text = json.dumps(settings, sort_keys=True, default=repr)
         self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._known = {} if self.path is None else self._read()
-
-    def _read(self):
-        if not os.path.exists(self.path):
-            return {}
-        with understood(self.path, ObservationError, "cannot be read as a journal"):
-            text = self.path.read_text(encoding="utf-8")
-        lines, known = text.splitlines(), {}
-        for line in lines:
-            # a line may have been cut off when a run was stopped
-            with suppress(*_DAMAGE):
-                entry = json.loads(line)
-                known[str(entry["key"])] = _frame(entry["frame"])
-        if lines and not known:
-            raise ObservationError(f"{self.path}: not a journal of a reduction; take another name")
-        return known
+        self._known = {}
+        if path is not None:
+            pairs, _ = read_lines(path, _entry, "a journal of a reduction", ObservationError)
+            self._known = dict(pairs)
 
     def _key(self, path):
         try:
