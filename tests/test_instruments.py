@@ -413,8 +413,8 @@ ALLOWED = {
 }
 # arguments of argparse whose texts may cite an instrument
 HELP = {"help", "epilog", "description", "metavar"}
-# constants that hold the options of a command as its help shows them, and examples
-TEXTS = {"OPTIONS", "EXAMPLES", "DESCRIPTION", "_SHARED", "MODEL"}
+# constants that hold the options of a command as its help shows them
+TEXTS = {"OPTIONS", "_SHARED", "MODEL"}
 
 
 def _private_names():

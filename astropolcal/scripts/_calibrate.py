@@ -1,5 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal calibrate``: fit an instrument's chain to observation tables."""
+"""
+Fit an instrument's chain of optics to observation tables.
+
+Without files, the packaged example is calibrated.
+
+For example::
+
+  astropolcal calibrate                          the packaged example
+  astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
+  astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
+  astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
+  astropolcal calibrate t1.ecsv t2.ecsv --own hwp.theta
+  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time"
+  astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
+  astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
+  astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
+"""
 
 import sys
 from functools import partial
@@ -14,22 +30,6 @@ from astropolcal.observations.grid import is_star
 from astropolcal.observations.observables import get_observable
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
-
-DESCRIPTION = """\
-Fit an instrument's chain of optics to observation tables.
-Without files, the packaged example is calibrated."""
-EXAMPLES = """\
-  astropolcal calibrate                          the packaged example
-  astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
-  astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
-  astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
-  astropolcal calibrate t1.ecsv t2.ecsv --own hwp.theta
-  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time"
-  astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
-  astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
-  astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
-"""
-
 
 OPTIONS = """
 files FILE * Input  observation tables (ECSV)

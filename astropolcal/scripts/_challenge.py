@@ -1,5 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal challenge``: the diagnosis against sealed simulated data."""
+"""
+Test the diagnosis, or another tool, on sealed simulated data.
+
+Their faults are random, and the answers are compared with the truth.
+
+For example::
+
+  astropolcal challenge -n 20
+  astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
+  astropolcal challenge make cases --count 100 --seed 7
+  astropolcal challenge score cases outputs --figure rates.png
+
+A run that was interrupted goes on if it is started again with the same
+checkpoint.
+"""
 
 import multiprocessing
 import signal
@@ -11,19 +25,6 @@ from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted
-
-DESCRIPTION = """\
-Test the diagnosis, or another tool, on sealed simulated data.
-Their faults are random, and the answers are compared with the truth."""
-EXAMPLES = """\
-  astropolcal challenge -n 20
-  astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
-  astropolcal challenge make cases --count 100 --seed 7
-  astropolcal challenge score cases outputs --figure rates.png
-
-A run that was interrupted goes on if it is started again with the same
-checkpoint.
-"""
 
 OPTIONS = """
 action {run,make,score} ? =run  run: make, diagnose and score (default); make DIR: write cases to

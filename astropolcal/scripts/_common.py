@@ -2,6 +2,7 @@
 """What the subcommands share: options, outputs, datasets, edits of the chains."""
 
 import argparse
+import inspect
 import json
 import os
 import re
@@ -206,14 +207,19 @@ def _are_same(path, other):
 # ---- options --------------------------------------------------------------------------------
 
 
-def add_command(commands, name, module):
-    """Add the subcommand whose texts, ``OPTIONS`` and ``run`` a module has; return its parser."""
+def texts_of(docstring):
+    """Return what a parser says of a command, whose module has this docstring."""
+    description, _, examples = inspect.cleandoc(docstring or "").partition("\n\nFor example::\n\n")
+    first = description.partition(".\n")[0]
+    texts = {"help": first[:1].lower() + first[1:], "description": description}
     # texts are shown as they are written
     form = argparse.RawDescriptionHelpFormatter
-    first = module.DESCRIPTION.partition(".\n")[0]
-    texts = {"help": first[0].lower() + first[1:], "description": module.DESCRIPTION}
-    texts["epilog"] = f"examples:\n{module.EXAMPLES}"
-    parser = place = commands.add_parser(name, formatter_class=form, **texts)
+    return texts | {"epilog": f"examples:\n{examples}", "formatter_class": form}
+
+
+def add_command(commands, name, module):
+    """Add the subcommand that a module has in its docstring, ``OPTIONS`` and ``run``."""
+    parser = place = commands.add_parser(name, **texts_of(module.__doc__))
     parser.set_defaults(run=module.run, **getattr(module, "DEFAULTS", {}))
     for entry in entries(module.OPTIONS):
         if entry.startswith("["):
@@ -221,7 +227,6 @@ def add_command(commands, name, module):
             continue
         flags, settings = option(entry, getattr(module, "TYPES", {}))
         place.add_argument(*flags, **settings)
-    return parser
 
 
 def entries(text):

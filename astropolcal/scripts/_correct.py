@@ -1,5 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal correct``: from science cubes to Stokes parameters."""
+r"""
+Correct science cubes with a calibration and write Stokes parameters.
+
+They are those of the light that entered the telescope, by least squares over
+all frames, with their errors. The cubes must be without sky background: it is
+not subtracted.
+
+For example::
+
+  astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
+  astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
+  astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \
+      --rotation pupil --camera-angle 113 --open-directions ignore
+  astropolcal correct --calibration library/ nights/ --archive out --workers 8
+"""
 
 import argparse
 import copy
@@ -23,19 +37,6 @@ from astropolcal.scripts import _common as common
 from astropolcal.scripts._archive import is_archive, run_archive
 from astropolcal.units import check_seed, plain_number
 from astropolcal.words import counted
-
-DESCRIPTION = """\
-Correct science cubes with a calibration and write Stokes parameters.
-They are those of the light that entered the telescope, by least squares over
-all frames, with their errors. The cubes must be without sky background: it is
-not subtracted."""
-EXAMPLES = """\
-  astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
-  astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
-  astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \\
-      --rotation pupil --camera-angle 113 --open-directions ignore
-  astropolcal correct --calibration library/ nights/ --archive out --workers 8
-"""
 
 OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)

@@ -1,18 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal diagnose``: which effect a model lacks, and how far that explains the gap."""
-
-from contextlib import suppress
-from pathlib import Path
-
-from astropolcal.exceptions import AstropolcalError, ParameterError
-from astropolcal.progress import in_one_thread, stage
-from astropolcal.scripts import _common as common
-
-DESCRIPTION = """\
+"""
 Find what a model lacks to explain the measurements.
+
 That is where the gap lies, which effect causes it, and how far it shrinks on
-left-out frames."""
-EXAMPLES = """\
+left-out frames.
+
+For example::
+
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
   astropolcal diagnose run.ecsv --derotator linear  a simpler model
@@ -22,6 +16,14 @@ EXAMPLES = """\
 
 Several tables are used together. The effects are listed by --effects help.
 """
+
+from contextlib import suppress
+from pathlib import Path
+
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.progress import in_one_thread, stage
+from astropolcal.scripts import _common as common
+
 _CORRECT = "correct the table, and calibrate with that"
 _HINT = "--full adds each cause with its sizes, and where the gap lies"
 # parameters that differ by fewer standard errors did not move

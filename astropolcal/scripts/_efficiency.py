@@ -1,5 +1,20 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal efficiency``: how much of the polarization an observation measures."""
+r"""
+Polarimetric efficiency over wavelength, derotator angle and pointing.
+
+It is the share of the linear polarization that an observation measures; and the
+derotator offset that loses least of it. Without a calibration the published
+values are taken. Without a half-wave plate, the efficiencies of I, Q, U and V
+in the frames that were calibrated.
+
+For example::
+
+  astropolcal efficiency                         published values of CHARIS
+  astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
+  astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2
+  astropolcal efficiency cal.asdf --target 75.2,28.3 \
+      --night 2025-11-03T08:00/2025-11-03T12:00
+"""
 
 from contextlib import suppress
 
@@ -19,19 +34,6 @@ from astropolcal.units import iso_date
 from astropolcal.words import counted
 
 _TITLE = "Polarimetric efficiency of {}"
-DESCRIPTION = """\
-Polarimetric efficiency over wavelength, derotator angle and pointing.
-It is the share of the linear polarization that an observation measures; and the
-derotator offset that loses least of it. Without a calibration the published
-values are taken. Without a half-wave plate, the efficiencies of I, Q, U and V
-in the frames that were calibrated."""
-EXAMPLES = """\
-  astropolcal efficiency                         published values of CHARIS
-  astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
-  astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2
-  astropolcal efficiency cal.asdf --target 75.2,28.3 \\
-      --night 2025-11-03T08:00/2025-11-03T12:00
-"""
 
 
 # altitude and others have no default, so that it is known whether the table was asked for

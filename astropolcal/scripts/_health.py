@@ -1,5 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal health``: how an instrument does, from all its calibrations."""
+"""
+What changed over all calibrations of an instrument, and what needs care.
+
+For each instrument and mode in a folder of calibrations: which optics are
+constant, drift or changed and when, and when the next calibration is due.
+
+For example::
+
+  astropolcal health library/
+  astropolcal health library/ --html health.html --goal 0.2
+  astropolcal health library/ --event 2029-06-10   the mirror was recoated
+"""
 
 from contextlib import suppress
 
@@ -10,15 +21,6 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted
 
-DESCRIPTION = """\
-What changed over all calibrations of an instrument, and what needs care.
-For each instrument and mode in a folder of calibrations: which optics are
-constant, drift or changed and when, and when the next calibration is due."""
-EXAMPLES = """\
-  astropolcal health library/
-  astropolcal health library/ --html health.html --goal 0.2
-  astropolcal health library/ --event 2029-06-10   the mirror was recoated
-"""
 OPTIONS = """
 library DIR Input  folder of calibrations
 --html FILE Output  write a self-contained page

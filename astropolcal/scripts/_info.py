@@ -1,5 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal info``: what a file holds, or what this installation can do."""
+"""
+Say what a calibration, a folder of them, a table, cube or product holds.
+
+Of a calibration also how good it is and for what it is valid. Without a file,
+what this installation knows.
+
+For example::
+
+  astropolcal info                     version, instruments and optics
+  astropolcal info cal.asdf --full     all of a calibration's summary
+  astropolcal info library/            the calibrations of a folder
+  astropolcal info library/ --frame frame.fits
+                                       which of them holds for a frame, and why
+  astropolcal info run.ecsv            frames, wavelengths and angles of a table
+"""
 
 import os
 from contextlib import suppress
@@ -21,10 +35,6 @@ from astropolcal.scripts import _common as common
 from astropolcal.version import version
 from astropolcal.words import counted
 
-DESCRIPTION = """\
-Say what a calibration, a folder of them, a table, cube or product holds.
-Of a calibration also how good it is and for what it is valid. Without a file,
-what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only
@@ -44,15 +54,6 @@ _OBSERVED = {"flux_right", "flux_left", "single_difference", "single_sum"}
 _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitude")
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
-
-EXAMPLES = """\
-  astropolcal info                     version, instruments and optics
-  astropolcal info cal.asdf --full     all of a calibration's summary
-  astropolcal info library/            the calibrations of a folder
-  astropolcal info library/ --frame frame.fits
-                                       which of them holds for a frame, and why
-  astropolcal info run.ecsv            frames, wavelengths and angles of a table
-"""
 
 
 def run(arguments):

@@ -1,5 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal reduce``: from FITS cubes to an observation table."""
+"""
+Measure both beams in FITS cubes and write an observation table.
+
+A file that cannot be used is left out and listed with the reason.
+
+For example::
+
+  astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
+  astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
+  astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside
+  astropolcal reduce nights/ --source star --archive tables/ --workers 8
+"""
 
 import sys
 from collections import Counter
@@ -19,16 +30,6 @@ from astropolcal.words import counted
 _PASSED_ON = ("source", "raw", "dark", "flat", "workers", "cluster", "resume", "hwp_sequence")
 # a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
-
-DESCRIPTION = """\
-Measure both beams in FITS cubes and write an observation table.
-A file that cannot be used is left out and listed with the reason."""
-EXAMPLES = """\
-  astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
-  astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
-  astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside
-  astropolcal reduce nights/ --source star --archive tables/ --workers 8
-"""
 
 
 OPTIONS = """

@@ -1,5 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal sample``: samples of the posterior of a calibration's parameters."""
+"""
+Sample the posterior of a calibration's parameters.
+
+An ensemble of walkers does so; the samples are kept with the calibration.
+
+For example::
+
+  astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
+  astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
+  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf
+
+The files are the tables that the calibration was made from, all of them. Which
+parameters vary, their bounds and their priors are those of the calibration.
+"""
 
 import sys
 import warnings
@@ -11,17 +24,6 @@ from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted, shortened
 
-DESCRIPTION = """\
-Sample the posterior of a calibration's parameters.
-An ensemble of walkers does so; the samples are kept with the calibration."""
-EXAMPLES = """\
-  astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
-  astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
-  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf
-
-The files are the tables that the calibration was made from, all of them. Which
-parameters vary, their bounds and their priors are those of the calibration.
-"""
 # what the library calls them
 _OPTIONS = {"n_walkers": "--walkers", "n_steps": "--steps", "burn_in": "--burn"}
 _COLUMNS = ("median", "lower", "upper", "fitted")

@@ -1,5 +1,17 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
+r"""
+Simulate an observation table or image cubes, with photon and read noise.
+
+The chain has the published values, or those of a calibration file.
+
+For example::
+
+  astropolcal simulate -o run.ecsv                      the packaged example
+  astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
+  astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers
+  astropolcal simulate --cubes star --source star --altitude 67,64 \
+      --parallactic 24,30 --derotator 97 --fix star.q=0.01
+"""
 
 import astropy.units as u
 import numpy as np
@@ -15,17 +27,6 @@ from astropolcal.words import counted
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
-
-DESCRIPTION = """\
-Simulate an observation table or image cubes, with photon and read noise.
-The chain has the published values, or those of a calibration file."""
-EXAMPLES = """\
-  astropolcal simulate -o run.ecsv                      the packaged example
-  astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
-  astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers
-  astropolcal simulate --cubes star --source star --altitude 67,64 \\
-      --parallactic 24,30 --derotator 97 --fix star.q=0.01
-"""
 
 # what of the options of --cubes tells of the image, the rest of the detector
 _IMAGE = ("psf", "fwhm", "halo", "motion", "seeing")

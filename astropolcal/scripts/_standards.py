@@ -1,5 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal standards``: standard stars, and which of them to observe."""
+"""
+List polarimetric standard stars and when they are observable.
+
+With a site and a night, those that rise above the limit, the best for the
+diattenuation of the telescope first. With a name, all that is known of a star.
+
+For example::
+
+  astropolcal standards --kind polarized --band H --magnitude 4,8
+  astropolcal standards --site subaru --night 2025-11-03 --plot night.png
+  astropolcal standards HD30675
+"""
 
 import math
 
@@ -13,10 +24,6 @@ from astropolcal.standards.priors import assumed_polarization
 from astropolcal.standards.visibility import SITES, location
 from astropolcal.words import counted, did_you_mean
 
-DESCRIPTION = """\
-List polarimetric standard stars and when they are observable.
-With a site and a night, those that rise above the limit, the best for the
-diattenuation of the telescope first. With a name, all that is known of a star."""
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
 --kind {polarized,unpolarized}  only stars of this kind
@@ -34,13 +41,6 @@ name NAME ?  a star, such as 'HD 293396'
 @ json online quiet
 """
 TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.numbers, 2)}
-
-
-EXAMPLES = """\
-  astropolcal standards --kind polarized --band H --magnitude 4,8
-  astropolcal standards --site subaru --night 2025-11-03 --plot night.png
-  astropolcal standards HD30675
-"""
 
 
 def run(arguments):

@@ -1,8 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Entry point of the ``astropolcal`` command.
+Calibrate polarimeters, and say how well their model fits.
 
-Exit status 0; 1 if sequences of an archive failed; or 2 with one clear line on bad input.
+Exit status: 0; 1 if sequences of an archive failed; 2 with one clear line on
+bad input.
+
+For example::
+
+  astropolcal calibrate                          the packaged example
+  astropolcal calibrate run.ecsv -o cal.asdf     fit a model to a table
+  astropolcal diagnose cal.asdf run.ecsv         find what the model lacks
+  astropolcal correct cubes/ --calibration cal.asdf -o stokes.fits
+  astropolcal info cal.asdf                      what a file holds
+  astropolcal calibrate --help                   the options of a command
 """
 
 import argparse
@@ -26,15 +36,6 @@ _COMMANDS = (
     *("reduce", "calibrate", "sample", "diagnose", "correct", "efficiency", "standards"),
     *("simulate", "challenge", "health", "info"),
 )
-_DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
-_EXAMPLES = """\
-  astropolcal calibrate                          the packaged example
-  astropolcal calibrate run.ecsv -o cal.asdf     fit a model to a table
-  astropolcal diagnose cal.asdf run.ecsv         find what the model lacks
-  astropolcal correct cubes/ --calibration cal.asdf -o stokes.fits
-  astropolcal info cal.asdf                      what a file holds
-  astropolcal calibrate --help                   the options of a command
-"""
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -93,11 +94,10 @@ class _PrintCompletion(argparse.Action):
 
 def build_parser():
     """Return the parser of the command and its subcommands."""
-    from astropolcal.scripts._common import add_command
+    from astropolcal.scripts._common import add_command, texts_of
 
-    form = argparse.RawDescriptionHelpFormatter
-    texts = {"description": _DESCRIPTION, "epilog": f"examples:\n{_EXAMPLES}"}
-    parser = _OneLineParser(prog="astropolcal", formatter_class=form, **texts)
+    texts = {key: words for key, words in texts_of(__doc__).items() if key != "help"}
+    parser = _OneLineParser(prog="astropolcal", **texts)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     words = "print what completes commands, options and files in a shell (needs shtab)"
     shells = {"choices": ("bash", "zsh", "tcsh"), "help": words}
