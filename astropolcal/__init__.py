@@ -10,25 +10,17 @@ costs next to nothing.
 
 from astropolcal.version import version as __version__
 
-_WHERE = {
-    "Calibration": "calibration",
-    "Corrected": "correction",
-    "Diagnosis": "gap",
-    "Library": "pipeline",
-    "Measurement": "measurement",
-    "Normal": "measurement",
-    "Observations": "observations",
-    "ScienceFrames": "correction",
-    "Tie": "measurement",
-    "calibrate": "calibration",
-    "correct": "correction",
-    "diagnose": "gap",
-    "half_wave_plate_cycles": "simulation",
-    "load": "pipeline",
-    "reduce_cubes": "reduction",
-    "sample": "calibration",
-    "simulate": "simulation",
+_NAMES = {
+    "calibration": ("Calibration", "calibrate", "sample"),
+    "correction": ("Corrected", "ScienceFrames", "correct"),
+    "gap": ("Diagnosis", "diagnose"),
+    "measurement": ("Measurement", "Normal", "Tie"),
+    "observations": ("Observations",),
+    "pipeline": ("Library", "load"),
+    "reduction": ("reduce_cubes",),
+    "simulation": ("half_wave_plate_cycles", "simulate"),
 }
+_WHERE = {name: room for room, names in _NAMES.items() for name in names}
 _ROOMS = ("instruments", "optics", "plotting")
 # what only some need is found, and is not among the first names
 _MORE = ("chain", "gap", "materials", "mueller", "standards")

@@ -22,30 +22,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
 GREY = "0.45"
 MINUS, SIGMA = "\N{MINUS SIGN}", "\N{GREEK SMALL LETTER SIGMA}"
 
-_SETTINGS = {
-    "font.size": 11,
-    "axes.titlesize": 11.5,
-    "axes.labelsize": 11.5,
-    "figure.titlesize": 13,
-    "legend.fontsize": 10.5,
-    "legend.title_fontsize": 10.5,
-    "legend.frameon": False,
-    "axes.grid": True,
-    "grid.color": "0.88",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    # "+9e1" in a corner is easily missed
-    "axes.formatter.useoffset": False,
-    "text.usetex": False,
-    "lines.linewidth": 1.5,
-    "lines.markersize": 5.5,
-    "errorbar.capsize": 2.5,
-    "figure.facecolor": "white",
-    "figure.autolayout": False,
-    "figure.constrained_layout.use": False,
-    "savefig.facecolor": "white",
-}
+_SHEET = Path(__file__).parents[1] / "data" / "figures.mplstyle"
 
 
 @contextmanager
@@ -57,7 +34,7 @@ def canvas(figure, width, height, layout="constrained"):
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_SETTINGS):
+    with mpl.rc_context(fname=_SHEET):
         if figure is None:
             figure = Figure(figsize=(width, height), layout=layout)
         elif isinstance(figure, Figure) and not (layout and figure.get_layout_engine()):
