@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Rows of the system Mueller matrix of a chain: values, derivatives and errors."""
 
-import copy
 from functools import cached_property
 
 import astropy.units as u
@@ -296,18 +295,18 @@ class MuellerMatrices:
         names = [f"{leaf.name}.{key}" for leaf in leaves(chain) for key in leaf.param_names]
         self._names = [name for name in names if self._free.lookup(name)[0] is not None]
 
-    def of(self, which):
-        """Return the same for other frames."""
-        new = copy.copy(self)
-        new.which = which
-        return new
-
     def values(self):
         """Return the matrices, (n_frames, n_wavelengths, 4, 4)."""
         return self._found(lambda at: system_mueller(self._chain, self._lam, at), (4, 4))
 
+    @property
     def factor(self):
-        """Return the changes for one sigma along each known direction, on a last axis."""
+        """Changes of ``value`` for one standard error along each direction that is determined.
+
+        Shape (..., 4, 4, rank). The covariance of any two elements, also of different frames,
+        wavelengths or beams, is the sum of the products of theirs. It is large: some megabytes for
+        ten frames.
+        """
         known = self._along[0] * self._axes.sigmas
         return self._found(lambda at: self._slopes(at) @ known, (4, 4, known.shape[-1]))
 
@@ -316,8 +315,9 @@ class MuellerMatrices:
         local = self._local
         return self._found(lambda at: self._slopes(at) @ local, (16, local.shape[-1]))
 
+    @property
     def std(self):
-        """Return the standard errors, infinite for what is open and NaN for what is blind."""
+        """Standard errors, infinite for what is open and NaN for what is blind."""
 
         def of_settings(at):
             slopes = self._slopes(at)

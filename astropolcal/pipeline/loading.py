@@ -5,7 +5,7 @@ Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from copy import copy
 from os import PathLike
 from pathlib import Path
 
@@ -52,8 +52,7 @@ from astropolcal.words import check_choice
 __all__ = ["LoadedCalibration", "SystemMueller", "load"]
 
 
-@dataclass
-class SystemMueller:
+class SystemMueller(MuellerMatrices):
     """
     System Mueller matrices of frames and wavelengths, with what is known of their errors.
 
@@ -93,44 +92,32 @@ class SystemMueller:
     ((3, 22, 4, 4), (2, 22, 16, 16), (22, 4, 4))
     """
 
-    value: np.ndarray
-    wavelength: u.Quantity
-    beam: str
-    positions: dict
-    assumed: tuple
-    _matrices: object = field(repr=False)
+    def __init__(self, beam, positions, assumed, *problem):
+        super().__init__(*problem)
+        self.value, self.wavelength, self.beam = self.values(), self._lam, beam
+        self.positions, self.assumed = positions, assumed
 
     def __getitem__(self, frames):
         """Return the matrices of some frames."""
-        if not self._matrices.which.ndim:
+        if not self.which.ndim:
             raise ParameterError(f"frames {frames!r}: the matrices are those of a single frame")
-        size = self._matrices.which.size
-        positions = {
+        some, size = copy(self), self.which.size
+        some.which, some.value = np.asarray(self.which[frames]), self.value[frames]
+        some.positions = {
             name: np.broadcast_to(position, (size, *position.shape[1:]), subok=True)[frames]
             for name, position in self.positions.items()
         }
-        matrices = self._matrices.of(np.asarray(self._matrices.which[frames]))
-        return replace(self, value=self.value[frames], positions=positions, _matrices=matrices)
-
-    @property
-    def factor(self):
-        """Changes of ``value`` for one standard error along each direction that is determined.
-
-        Shape (..., 4, 4, rank). The covariance of any two elements, also of different frames,
-        wavelengths or beams, is the sum of the products of theirs. It is large: some megabytes for
-        ten frames.
-        """
-        return self._matrices.factor()
+        return some
 
     @property
     def is_open(self):
         """Elements that move along a direction that the data do not determine."""
-        return self._matrices.flags()[0]
+        return self.flags()[0]
 
     @property
     def is_blind(self):
         """Elements that depend on parameters at a bound alone."""
-        return self._matrices.flags()[1]
+        return self.flags()[1]
 
     @property
     def covariance(self):
@@ -141,7 +128,7 @@ class SystemMueller:
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
-        is_open, is_blind = (each.reshape(matrix.shape[:-1]) for each in self._matrices.flags())
+        is_open, is_blind = (each.reshape(matrix.shape[:-1]) for each in self.flags())
         unknown = is_open | is_blind
         # no covariance with what has no error, whichever of the two it is
         matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
@@ -157,13 +144,8 @@ class SystemMueller:
         of the angles in the calibration gives an error that is right.
         """
         # rows: the elements of a matrix; columns: the parameters that move them
-        moved = self._matrices.local_factor()
+        moved = self.local_factor()
         return moved @ np.swapaxes(moved, -1, -2)
-
-    @property
-    def std(self):
-        """Standard error of each element, of the shape of ``value``."""
-        return self._matrices.std()
 
 
 # what a caller can do about a header that does not say enough
@@ -421,8 +403,6 @@ class LoadedCalibration:
         chain = with_beam(at_wavelengths(chain, mix, len(self.wavelength)), beam)
         settings, which = distinct(positions)
         which = which[0] if single else which
-        covariance = self._covariance
-        matrices = MuellerMatrices(self.calibration, covariance, chain, lam, settings, which, mix)
         shown = {}
         for name, position in positions.items():
             if name in PLACES:
@@ -431,7 +411,8 @@ class LoadedCalibration:
                 angle = u.Quantity(position)
                 angle = angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
             shown[name] = angle[0] if single else angle
-        return SystemMueller(matrices.values(), lam, beam, shown, assumed, matrices)
+        problem = self.calibration, self._covariance, chain, lam, settings, which, mix
+        return SystemMueller(beam, shown, assumed, *problem)
 
     def correct(
         self, stokes, header=None, *, positions=None, hwp=None, difference="right-left", **options
