@@ -425,6 +425,35 @@ def convert(column, value, layout, target):
     return (factor * plain_number(value) + offset) * unit.to(target)
 
 
+def frame_value(column, keyword, value, layout):
+    """Return what a header says of a column, a number in its unit or text, or raise ValueError."""
+    if column == "flc_state":
+        known = {"A": "A", "B": "B"} | layout.states
+        # a whole number may be written as 1.0
+        word = f"{value:g}" if isinstance(value, float) else str(value).strip()
+        if word not in known:
+            raise ValueError(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
+        return known[word]
+    if column in TEXTS or column in layout.texts:
+        return " ".join(str(value).split())
+    target = {"exposure_time": u.s}.get(column, unit_of(column, layout))
+    target = u.deg if column in ANGLES else target
+    try:
+        number = convert(column, value, layout, target)
+    except (TypeError, ValueError) as error:
+        stated = isinstance(layout.transforms.get(column), dict)
+        needed = error if stated else "a number is needed"
+        raise ValueError(f"{keyword} = {value!r}, {needed}") from None
+    # two turns: encoders count on past 360 deg, but what is further out is no angle
+    any_angle = (-720.0, 720.0) if target == u.deg else (-math.inf, math.inf)
+    low, high = RANGES.get(column, any_angle)
+    if not (math.isfinite(number) and low <= number <= high):
+        allowed = "finite numbers" if math.isinf(low) else "numbers above zero"
+        allowed = f"{low:g} to {high:g} {target}".strip() if math.isfinite(high) else allowed
+        raise ValueError(f"{keyword} = {value}, allowed are {allowed}")
+    return number
+
+
 def frame_time(header, layout):
     """
     Return when a frame was taken (UTC), None if the header does not say.

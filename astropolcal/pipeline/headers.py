@@ -31,10 +31,11 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
+from astropolcal.instruments.layout import ANGLES, TEXTS, frame_time, frame_value, look_up, unit_of
 from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import dates_of, numeric_column
 from astropolcal.optics.positions import PLACES
+from astropolcal.units import plain_number
 
 __all__ = []
 
@@ -170,37 +171,25 @@ class FrameAngles:
                 return [sky_angle(column, value) for value in values] * u.deg
             except ValueError as error:
                 raise ObservationError(f"{column}: {one_line(error)}") from None
-        words = [f"{v:g}" if isinstance(v, float) else str(v).strip() for v in values]
-        if column == "flc_state":
-            states = [layout.states.get(word, word) for word in words]
-            for i, state in enumerate(states):
-                if state not in ("A", "B"):
-                    raise ObservationError(
-                        f"frame {i}: {keyword} = {values[i]!r}, allowed are A and B"
-                    )
-            # as positions have them
-            return [float(state == "B") for state in states] * u.rad
-        texts = np.array([str(value).strip() for value in values])
         # states of a modulator, cameras and such
-        if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
+        texts = np.array([str(value).strip() for value in values])
+        if column not in (*ANGLES, *layout.transforms, "flc_state"):
+            try:
+                _ = [plain_number(value) for value in values]
+            except (TypeError, ValueError):
+                return texts
+        if column != "flc_state" and not unit_of(column, layout).is_equivalent(u.deg):
             return texts
-        # two turns: encoders count on past 360 deg, but what is further out is no angle
-        low, high = RANGES.get(column, (-720.0, 720.0))
-        angles = []
+        found = []
         for i, value in enumerate(values):
             try:
-                angle = convert(column, value, layout, u.deg)
-            except (TypeError, ValueError) as error:
-                if column not in (*ANGLES, *layout.transforms):
-                    return texts
-                needed = "a number is needed" if column in ANGLES else error
-                raise ObservationError(f"frame {i}: {keyword} = {value!r}, {needed}") from None
-            if not low <= angle <= high:
-                raise ObservationError(
-                    f"frame {i}: {keyword} = {value}, allowed are {low:g} to {high:g} deg"
-                )
-            angles.append(angle)
-        return angles * u.deg
+                found.append(frame_value(column, keyword, value, layout))
+            except ValueError as error:
+                raise ObservationError(f"frame {i}: {error}") from None
+        if column == "flc_state":
+            # as positions have them
+            return [float(state == "B") for state in found] * u.rad
+        return found * (u.deg if column in ANGLES else unit_of(column, layout))
 
     def position(self, column):
         """Return an angle of every frame in radian, a moment, a place, or the number of a state."""

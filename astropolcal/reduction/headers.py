@@ -26,14 +26,12 @@ from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.instruments.layout import (
     ANGLES,
-    RANGES,
-    TEXTS,
     card_value,
     convert,
+    frame_value,
     look_up,
     stated,
     time_of,
-    unit_of,
 )
 from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, sky_angle
@@ -249,39 +247,17 @@ def not_of_instrument(values, layout):
 
 def _convert(frame, column, keyword, value, layout):
     """Store a value in the unit of its column, or say why it cannot be right."""
-    if column == "flc_state":
-        known = {"A": "A", "B": "B"} | layout.states
-        # a whole number may be written as 1.0
-        word = f"{value:g}" if isinstance(value, float) else str(value).strip()
-        if word not in known:
-            frame.errors.append(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
-        elif known[word]:
-            frame.values["flc_state"] = known[word]
-        return
-    if column == "date":
-        try:
-            frame.values[column] = iso_date(value, keyword)
-        except ParameterError as error:
-            # the time may stand in another keyword
-            frame.doubts.append(f"{error}; it was left out")
-        return
-    if column in TEXTS or column in layout.texts:
-        frame.values[column] = " ".join(str(value).split())
-        return
-    target = {"exposure_time": u.s}.get(column, unit_of(column, layout))
-    target = u.deg if column in ANGLES else target
     try:
-        number = convert(column, value, layout, target)
-    except (TypeError, ValueError):
-        frame.errors.append(f"{keyword} = {value!r}, a number is needed")
-        return
-    low, high = RANGES.get(column, (-np.inf, np.inf))
-    if np.isfinite(number) and low <= number <= high:
-        frame.values[column] = number
-        return
-    allowed = "finite numbers" if np.isinf(low) else "numbers above zero"
-    allowed = f"{low:g} to {high:g} {target}".strip() if np.isfinite(high) else allowed
-    frame.errors.append(f"{keyword} = {value}, allowed are {allowed}")
+        is_date = column == "date"
+        found = iso_date(value, keyword) if is_date else frame_value(column, keyword, value, layout)
+    except ParameterError as error:
+        # the time may stand in another keyword
+        frame.doubts.append(f"{error}; it was left out")
+    except ValueError as error:
+        frame.errors.append(str(error))
+    else:
+        # a word for no modulation is none
+        frame.values |= {} if found == "" else {column: found}
 
 
 def add_pointing(frames, layout, needed=True):
