@@ -26,6 +26,7 @@ from astropolcal.observations.grid import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource, StateAnalyser
 from astropolcal.simulation import simulate
 from astropolcal.units import check_seed
+from astropolcal.words import check_choice
 
 __all__ = ["check_instrument"]
 
@@ -520,9 +521,8 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
     irdis passes 14 rules
     - calibrates not checked: skipped
     """
-    unknown = sorted(set(skip) - set(RULES))
-    if unknown:
-        raise InstrumentError(f"no rules {unknown}; there are {', '.join(RULES)}")
+    for rule in skip:
+        check_choice("rule", rule, RULES, InstrumentError)
     if inspect.isabstract(instrument):
         lacking = ", ".join(sorted(instrument.__abstractmethods__))
         raise InstrumentError(f"class: {instrument.__name__} lacks the methods {lacking}")

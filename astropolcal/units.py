@@ -104,12 +104,21 @@ def _known(found, value):
     return np.where(mask, np.nan, found) if np.any(mask) else found
 
 
-def positive_number(value, name):
-    """Return one number above zero as a float, or raise."""
-    number = to_unit(value, None, name)
-    if number.ndim or not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r} must be one positive number")
+def positive_number(value, name, unit=None, zero=False):
+    """Return one number above zero, or zero where that is allowed; a plain one has the unit."""
+    number = to_unit(value, None if getattr(value, "unit", None) is None else unit, name)
+    if number.ndim or not np.isfinite(number) or number < 0 or (number == 0 and not zero):
+        allowed = f"one number {'from zero on' if zero else 'above zero'}"
+        allowed += "" if unit is None else f", of {unit}"
+        raise ParameterError(f"{name} = {value!r} must be {allowed}")
     return float(number)
+
+
+def median_of_known(values):
+    """Return the median of what is not NaN as a float in the unit of the values."""
+    values = np.asarray(values, dtype=float)
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else np.nan
 
 
 def angle_to_rad(value, name="angle"):

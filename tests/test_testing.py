@@ -320,7 +320,7 @@ def test_seed_of_the_positions_does_not_decide():
 
 
 def test_unknown_rule_is_refused():
-    with pytest.raises(InstrumentError, match=r"no rules \['colour'\]; there are class, "):
+    with pytest.raises(InstrumentError, match=r"rule = 'colour'; allowed are class, "):
         check_instrument(Sound, skip=["colour"])
 
 

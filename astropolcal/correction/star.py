@@ -20,7 +20,7 @@ from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.stokes import angle_error, polarization_angle
-from astropolcal.units import angle_to_rad, to_unit
+from astropolcal.units import angle_to_rad, median_of_known, to_unit
 
 __all__ = []
 
@@ -167,7 +167,7 @@ def _noise(star, measured):
 
 def star_words(table):
     """Return degree and angle that were subtracted in words, the median over the wavelengths."""
-    middle = {name: _middle(table[name]) for name in COLUMNS[1:]}
+    middle = {name: median_of_known(table[name]) for name in COLUMNS[1:]}
     errors = {
         # what is not known is none
         name: np.hypot(*(np.nan_to_num(middle[f"{name}_{kind}"], posinf=np.inf) for kind in _KINDS))
@@ -183,9 +183,3 @@ def star_words(table):
         f"{100 * middle['dolp']:.3g} +- {100 * errors['s_p']:.2g} % at {angle:.4g} +- "
         f"{errors['s_chi']:.2g} deg{exact}"
     )
-
-
-def _middle(column):
-    values = u.Quantity(column).value
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else np.nan

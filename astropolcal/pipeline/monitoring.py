@@ -17,6 +17,7 @@ from astropolcal.instruments import Instrument
 from astropolcal.pipeline.headers import date_of, days_of
 from astropolcal.pipeline.history import courses
 from astropolcal.pipeline.library import Library
+from astropolcal.units import positive_number
 from astropolcal.words import counted, listed
 
 __all__ = ["health"]
@@ -91,8 +92,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     days = [moment_of(event, "event").isot[:10] for event in events]
     if len(set(days)) < len(days):
         raise ParameterError(f"events {', '.join(days)}: two of one date are not distinguishable")
-    goal = None if goal is None else _positive("goal", goal, u.percent)
-    limit = None if max_age is None else _positive("max_age", max_age, u.day)
+    goal = None if goal is None else positive_number(goal, "goal", u.percent)
+    limit = None if max_age is None else positive_number(max_age, "max_age", u.day)
     rows = {row["name"]: row for row in library.table()}
     groups = {}
     for entry in library.entries:
@@ -110,16 +111,6 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
             ],
         }
     )
-
-
-def _positive(name, value, unit):
-    try:
-        number = float(u.Quantity(value, unit).value)
-    except (TypeError, u.UnitConversionError):
-        number = np.nan
-    if not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value}; allowed are numbers of {unit} above zero")
-    return number
 
 
 def _start(entry):

@@ -11,6 +11,7 @@ from astropy.modeling import Fittable1DModel, Parameter
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics.sources import serkowski
 from astropolcal.units import angle_to_rad, check_range, length_to_um, to_unit
+from astropolcal.words import check_choice
 
 __all__ = ["SerkowskiLaw", "whittet_width"]
 
@@ -287,11 +288,8 @@ class SerkowskiLaw(Fittable1DModel):
     def _canonical_covariance(self, covariance):
         """Return the covariance of all five parameters in canonical units."""
         if hasattr(covariance, "keys"):
-            unknown = sorted(set(covariance) - set(self.param_names))
-            if unknown:
-                raise ParameterError(
-                    f"the law has no parameter {unknown[0]!r}; it has {', '.join(self.param_names)}"
-                )
+            for key in covariance:
+                check_choice("parameter of the law", key, self.param_names, ParameterError)
             errors = [
                 to_unit(covariance.get(n, 0 * _CANONICAL[n]), _CANONICAL[n], f"error of {n}")
                 for n in self.param_names

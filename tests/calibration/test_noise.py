@@ -100,9 +100,9 @@ def test_gain_may_have_its_unit(faint):
 def test_impossible_gain_is_refused(faint):
     wrong = 0.0, np.nan, -1.0, [1, 2], "a", 1 * u.adu
     for settings in [{"gain": gain} for gain in wrong]:
-        with pytest.raises((FitError, ParameterError), match=r"gain (= |has unit adu)"):
+        with pytest.raises(ParameterError, match=r"gain (= |has unit adu)"):
             noise_from_errors(faint, **settings)
-        with pytest.raises(FitError, match="read_noise = -1"):
+        with pytest.raises(ParameterError, match="read_noise = -1"):
             noise_from_errors(faint, gain=1.0, read_noise=-1.0)
     # table without errors needs a gain
     table = faint.datasets[0].observations.to_table()

@@ -377,7 +377,7 @@ def test_nonsense_in_a_file_is_told():
     cal.settings = {"validity": {"mode": "J", "color": "red"}}
     with pytest.raises(CalibrationFileError, match="allowed are mode, valid_from, valid_until"):
         validity_of(cal)
-    with pytest.raises(CalibrationFileError, match="validity: no 'color'; allowed are mode"):
+    with pytest.raises(CalibrationFileError, match="validity = 'color'; allowed are mode"):
         with_validity(cal, color="red")
     # stating nothing changes nothing
     cal = _calibration(_several())

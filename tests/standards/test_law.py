@@ -195,7 +195,7 @@ def test_bad_covariance_is_refused():
         (np.eye(4), "has 4 rows"),
         (np.full((5, 5), np.nan), "finite"),
         (np.ones(5), "square"),
-        ({"pmax": 0.1}, "no parameter 'pmax'"),
+        ({"pmax": 0.1}, "parameter of the law = 'pmax'"),
         ({"p_max": -0.1}, "not negative"),
         ({"theta": 0.1}, "needs a unit"),
     ]:

@@ -19,7 +19,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.units import angle_to_rad, to_unit
+from astropolcal.units import angle_to_rad, positive_number, to_unit
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -200,8 +200,8 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     if gain is None:
         sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
-        gain = _number("gain", gain, u.electron / u.adu, False)
-        read_noise = _number("read_noise", read_noise, u.electron, True)
+        gain = positive_number(gain, "gain", u.electron / u.adu)
+        read_noise = positive_number(read_noise, "read_noise", u.electron, zero=True)
         parts = []
         for part in measurement.datasets:
             beams = part.observations.flux_right, part.observations.flux_left
@@ -220,15 +220,6 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
         )
     words = f"{words}: not flicker, nor what moves between frames"
     return _of_data(measurement, sigma.copy(), np.inf, "errors", words)
-
-
-def _number(name, value, unit, closed):
-    # a plain number is one in the unit
-    number = to_unit(value, unit if str(getattr(value, "unit", "")) else None, name)
-    if number.ndim or not (np.isfinite(number) and (number > 0 or (closed and number == 0))):
-        what = f"one number {'from' if closed else 'above'} 0"
-        raise FitError(f"{name} = {value}; allowed is {what}")
-    return float(number)
 
 
 # ---- replicates ---------------------------------------------------------------------------

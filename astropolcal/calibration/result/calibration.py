@@ -31,7 +31,7 @@ from astropolcal.measurement.datasets import as_tables
 from astropolcal.measurement.parameters import element_names
 from astropolcal.observations.reading import dates_of
 from astropolcal.units import iso_date
-from astropolcal.words import html
+from astropolcal.words import check_choice, html
 
 __all__ = ["Calibration", "with_validity"]
 
@@ -743,9 +743,8 @@ def with_validity(calibration, **stated):
     >>> validity_of(with_validity(cal, valid_from="2025-10-01", mode="JHK")).valid_from
     '2025-10-01'
     """
-    unknown = sorted(set(stated) - set(_STATED))
-    if unknown:
-        raise CalibrationFileError(f"validity: no {unknown[0]!r}; allowed are {', '.join(_STATED)}")
+    for key in stated:
+        check_choice("validity", key, _STATED, CalibrationFileError)
     if not stated:
         return calibration
     clean = Validity(calibration.instrument, **stated).to_dict()

@@ -16,6 +16,7 @@ from astropolcal.calibration.validation.targets import TARGETS, target_accuracie
 from astropolcal.chain import leaves, stages
 from astropolcal.measurement.parameters import are_outside, limits
 from astropolcal.optics import COORDINATES
+from astropolcal.units import median_of_known
 from astropolcal.words import HEIGHT, WIDTH, counted, listed, p_words, shortened
 
 __all__ = ["Verdict"]
@@ -337,16 +338,11 @@ def _too_far(tables, sky):
         dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
         limits = (("s_p", "DoLP", "%", dolp), ("s_chi", "AoLP", "deg", _ABSURD_ANGLE.value))
         for key, what, unit, most in limits:
-            value = _median(table[key].value)
+            value = median_of_known(table[key])
             # what is open has been said, with its name
             if value > most and what not in sky:
                 known = f"known to {value:.2g} {unit} only" if np.isfinite(value) else "open"
                 yield f"the {what} of {dolp:g} % on sky is {known}"
-
-
-def _median(values):
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else np.nan
 
 
 # ---- accuracy, what is determined, what to do -----------------------------------------------
@@ -358,7 +354,7 @@ def _accuracy(tables, sky):
         return "On sky      unknown: the frames do not measure Q and U"
     dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
     s_p, s_chi = (
-        [_number(_median(t[key].value), what in sky, *limits) for t in tables]
+        [_number(median_of_known(t[key]), what in sky, *limits) for t in tables]
         for key, what, limits in (("s_p", "DoLP", (3, 100)), ("s_chi", "AoLP", (2, 45)))
     )
     degree, angle = _listed(s_p, "%"), _listed(s_chi, "deg")
@@ -529,7 +525,7 @@ def _fit(calibration):
 def _worst(calibration, key):
     """Return the largest of the datasets' medians over the wavelengths; NaN where none is known."""
     tables = (record.accuracy for record in calibration.datasets)
-    medians = [_median(table[key].value) for table in tables if key in table.colnames]
+    medians = [median_of_known(table[key]) for table in tables if key in table.colnames]
     return np.fmax.reduce(medians, initial=np.nan)
 
 
