@@ -200,11 +200,7 @@ def correct(
     }
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    if systematic is not None and systematic.is_open:
-        unmeasured.append(_OPEN)
-    # weights by variances that follow the fluxes
-    if by_variance and getattr(frames.source, "estimated", False):
-        unmeasured.append(_BIASED)
+    unmeasured += _of_errors(systematic, by_variance, frames.source)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -222,6 +218,12 @@ def correct(
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
+
+
+def _of_errors(systematic, by_variance, source):
+    """Say where errors are open, and what weights by variances that follow the fluxes do."""
+    is_open = systematic is not None and systematic.is_open
+    return [_OPEN] * is_open + [_BIASED] * (by_variance and getattr(source, "estimated", False))
 
 
 def _check(frames, mode, weights, *choices):
