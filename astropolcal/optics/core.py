@@ -31,7 +31,7 @@ from astropolcal.optics._modelling import (
 from astropolcal.optics.curves import curve_of
 from astropolcal.optics.positions import COORDINATES, PLACES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
-from astropolcal.words import did_you_mean, html
+from astropolcal.words import check_choice, did_you_mean, html
 
 __all__ = ["Optic"]
 
@@ -687,12 +687,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         ParameterError
             If a name or a value does not fit.
         """
-        unknown = set(values) - set(self.param_names)
-        if unknown:
-            raise ParameterError(
-                f"{type(self).__name__} has no parameter {sorted(unknown)}; "
-                f"it has {self.param_names}"
-            )
+        kind = f"parameter of {type(self).__name__}"
+        for key in values:
+            check_choice(kind, key, self.param_names, ParameterError)
         current = {}
         # astropy would take a value in another unit without its bounds
         for key in set(self.param_names) - set(values):
