@@ -108,7 +108,7 @@ def positive_number(value, name, unit=None, zero=False):
     """Return one number above zero, or zero where that is allowed; a plain one has the unit."""
     number = to_unit(value, None if getattr(value, "unit", None) is None else unit, name)
     if number.ndim or not np.isfinite(number) or number < 0 or (number == 0 and not zero):
-        allowed = f"one number {'from zero on' if zero else 'above zero'}"
+        allowed = "one number from zero on" if zero else "one positive number"
         allowed += "" if unit is None else f", of {unit}"
         raise ParameterError(f"{name} = {value!r} must be {allowed}")
     return float(number)
