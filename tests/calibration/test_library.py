@@ -112,7 +112,7 @@ def test_statement_that_makes_no_sense(calibration):
         ({"optics_in": "nbs"}, "names of optics are needed"),
         ({"optics_in": [3]}, "names of optics are needed"),
         ({"mode": 3}, "mode = 3; text is needed"),
-        ({"until": "2025-10-02"}, "no 'until'; allowed are mode, valid_from"),
+        ({"until": "2025-10-02"}, "= 'until'; allowed are mode, valid_from"),
     ]:
         with refused(message):
             with_validity(calibration, **stated)
