@@ -229,8 +229,9 @@ class Sweep:
         Return derivatives of a weighted sum of the two fluxes of each column, per canonical unit.
 
         ``wanted`` are pairs, index of the optic and of its parameter, the keys of what is
-        returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns).
-        A dictionary ``crossings`` receives what the method of that name returns.
+        returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns),
+        or several in front of these axes. A dictionary ``crossings`` receives what the method of
+        that name returns.
         """
         result, by_optic, rates = {}, {}, self._rates()
         for key in wanted:
@@ -249,7 +250,7 @@ class Sweep:
         _back(self._common[first:], adjoint, behind, by_optic, result, crossings)
         # of a coefficient: what its parameter does in each frame, times how it moves that
         result |= {key: result[to] * rate for key, (to, rate) in rates.items() if to in result}
-        shape = self._propagator.shape
+        shape = (*np.shape(weights[0])[:-2], *self._propagator.shape)
         return {key: np.broadcast_to(value, shape) for key, value in result.items()}
 
     def _rates(self):
@@ -388,5 +389,5 @@ def act(matrix, light):
 def act_back(matrix, adjoint):
     """Return the adjoint times matrix."""
     if matrix.ndim == 4:
-        return np.einsum("wci,wcij->wcj", adjoint, matrix)
+        return np.einsum("...wci,wcij->...wcj", adjoint, matrix)
     return adjoint @ matrix

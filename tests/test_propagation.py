@@ -296,6 +296,11 @@ def test_derivatives_asked_for_together_and_alone(random_chain, seed):
     for key in wanted[:: max(1, len(wanted) // 5)]:
         np.testing.assert_array_equal(sweep.derivatives([key], weights)[key], together[key])
     assert sweep.derivatives([], weights) == {}
+    # of several sums at once as of each
+    several = np.stack([weights, 2 * np.array(weights[::-1])], axis=1)
+    for key, both in sweep.derivatives(wanted, several).items():
+        for i, slope in enumerate(both):
+            np.testing.assert_allclose(slope, sweep.derivatives([key], several[:, i])[key])
 
 
 # --- what is refused ------------------------------------------------------------------------

@@ -59,16 +59,14 @@ class Rows:
         wanted = {place: name for place, name in self._named.items() if self._slot(name)}
         values, shape = self._values(None), self._light[0].shape
         result = {name: np.empty((2, *self._shape, n)) for name in wanted.values()}
-        ones, zeros = np.ones(shape), np.zeros(shape)
+        # the derivatives of both beams at once
+        weights = np.broadcast_to(np.eye(2)[:, :, None, None], (2, 2, *shape))
         for k, light in enumerate(self._light[:n]):
-            # one forward sweep serves the derivatives of both beams
-            sweep = light.forward(values)
-            for beam, weights in enumerate([(ones, zeros), (zeros, ones)]):
-                found = sweep.derivatives(list(wanted), weights)
-                for place, name in wanted.items():
-                    # what lies behind the splitter of the other beam leaves no trace
-                    slope = found.get(place, np.zeros(shape))
-                    result[name][beam, ..., k] = self._over_nodes(slope)
+            found = light.forward(values).derivatives(list(wanted), weights)
+            for place, name in wanted.items():
+                # what lies behind the splitter of the other beam leaves no trace
+                slope = found.get(place, np.zeros((2, *shape)))
+                result[name][..., k] = self._over_nodes(slope)
         return result
 
     def changes(self, gain, n=3, scale=1.0):

@@ -26,6 +26,7 @@ from astropolcal.exceptions import AstropolcalError, CalibrationFileError, Param
 from astropolcal.files import one_line
 from astropolcal.measurement.parameters import Normal, Uniform, parameter_table
 from astropolcal.optics import OPTICS, Optic
+from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.optics.core import with_value
 from astropolcal.optics.laws import law_of
 
@@ -197,14 +198,17 @@ def prior_node(prior, name):
 
 def _frozen(node):
     """Return the distribution of a node; only those of scipy can be named."""
-    import scipy.stats
+    name, args, kwds = node["distribution"], node["args"], node["kwds"]
+    if (name, len(args), kwds) == ("norm", 2, {}):
+        found = FrozenNormal(*args)
+    else:
+        import scipy.stats
 
-    name = node["distribution"]
-    # names of modules and functions are there too: only distributions pass the next line
-    family = getattr(scipy.stats, name, None) if isinstance(name, str) else None
-    if not isinstance(family, scipy.stats.rv_continuous):
-        raise ValueError(f"scipy.stats has no continuous distribution {name!r}")
-    found = family(*node["args"], **node["kwds"])
+        # names of modules and functions are there too: only distributions pass the next line
+        family = getattr(scipy.stats, name, None) if isinstance(name, str) else None
+        if not isinstance(family, scipy.stats.rv_continuous):
+            raise ValueError(f"scipy.stats has no continuous distribution {name!r}")
+        found = family(*args, **kwds)
     # scipy looks at the parameters when they are used, and gives NaN for those that cannot be
     low, high = found.support()
     if not low < high:

@@ -274,15 +274,18 @@ class GapProblem:
         """Add the derivative of a dataset's channels to a table, (n_coefficients, 2, W, F)."""
         dataset, flickering = self.datasets[number], self._flickering[number]
         keys = [key for key, *_ in dataset._live]
-        sums = dataset.forward(vector)
-        sweeps = (sums if flickering is None else flickering.forward(vector), sums)
-        for i, sweep in enumerate(sweeps):
-            slopes = sweep.derivatives(keys, channel.slopes(sweep)[i])
+        sums, own = dataset.forward(vector), [slice(None)]
+        sweeps = [sums]
+        if flickering is not None:
+            sweeps, own = [flickering.forward(vector), sums], [slice(0, 1), slice(1, 2)]
+        for channels, sweep in zip(own, sweeps, strict=True):
+            weights = np.swapaxes(channel.slopes(sweep)[channels], 0, 1)
+            slopes = sweep.derivatives(keys, weights)
             for key, where, factor, _ in dataset._live:
-                self._add(out[:, i], where, factor * slopes[key])
+                self._add(out[:, channels], where, factor * slopes[key])
 
     def _add(self, out, where, slope):
-        """Add the derivative to a free value to those to its coefficients."""
+        """Add the derivative to a free value, (channels, W, F), to those to its coefficients."""
         first = int(np.min(where))
         owners = zip(self.free.slots, self._blocks, strict=True)
         slot, block = next(o for o in owners if o[0].start <= first < o[0].start + o[0].size)
@@ -291,9 +294,9 @@ class GapProblem:
             rows[0] += slope
         elif len(block) == len(rows):
             # one number for each wavelength
-            rows[at, np.arange(len(at))] += slope
+            rows[at, :, np.arange(len(at))] += slope.swapaxes(0, 1)
         else:
-            rows += block[at].T[:, :, None] * slope
+            rows += block[at].T[:, None, :, None] * slope
 
     # ---- noise -----------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from astropy.table import QTable
 
 from astropolcal import instruments, progress
 from astropolcal.calibration import calibrate, target_accuracies
+from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
@@ -28,7 +29,7 @@ from astropolcal.gap.planning import plan
 from astropolcal.gap.problem import TOUCHES
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement import Measurement, Normal, parameter_table
 from astropolcal.observations.observables import default_observable
 from astropolcal.optics import Perturbation
 
@@ -435,22 +436,15 @@ def accuracies(model, cross_validate=True):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AstropolcalWarning)
-            made = model.calibration
-            calibration = (
-                with_causes(model, held=True, cross_validate=cross_validate, instrument=instrument)
-                if made is None
-                else made.calibration(cross_validate=cross_validate)
-            )
+            made = model.calibration or _with_causes_held(model, instrument)
+            tables = made.accuracies(cross_validate=cross_validate)
             # what is not known of the causes is not known on sky
-            seen = calibration
-            if model.added:
-                seen = with_causes(model, cross_validate=False, instrument=instrument)
+            seen = with_causes(model, instrument) if model.added else made.calibration()
             targets = target_accuracies(seen)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
                 targets = target_accuracies(seen, open_directions="ignore")
     except AstropolcalError:
         return found
-    tables = [record.accuracy for record in calibration.datasets]
     count = np.concatenate([table["n"] for table in tables])
     gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
     # what is left out may be all that determines a wavelength
@@ -459,9 +453,9 @@ def accuracies(model, cross_validate=True):
     return found | {
         "rms_percent": rms,
         "datasets": [
-            {"name": record.name, "source": record.source}
-            | {f"{key}_percent": _median(record.accuracy[key].value) for key in ACCURACIES}
-            for record in calibration.datasets
+            {"name": one.name, "source": one.source}
+            | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}
+            for one, table in zip(model.observations, tables, strict=True)
         ],
         "targets": [
             {
@@ -475,22 +469,31 @@ def accuracies(model, cross_validate=True):
     }
 
 
-def with_causes(model, *, held=False, **options):
+def _with_causes_held(model, instrument):
+    """Fit the chains of a model with its causes as found, for what the model leaves of the data."""
+    added = {p.name for parameters in model.added.values() for p in parameters}
+    # and what follows them
+    ties = model.problem.ties
+    held = sorted(added.union(name for name, tie in ties.items() if tie.source in added))
+    ties = {name: tie for name, tie in ties.items() if name not in held}
+    chains = [chain.copy() for chain in model.chains]
+    table = parameter_table(chains)
+    for parameter in (one for name in held for one in table[name]):
+        parameter.fixed = True
+    measurement, options = Measurement(chains, model.observations, ties=ties), {"observable": None}
+    how = {"search": not added, "instrument": instrument, "held": held, "options": options}
+    return fit_measurement(measurement, **how)
+
+
+def with_causes(model, instrument=None):
     """Calibrate the chains of a model, with what was found of its causes as priors of their sizes.
 
     Double differences, which are fitted, may not show them, and what is not known of them is not
-    known of the other parameters either. Another mirror branch could move them. Their sizes may
-    also be ``held``, for what the model leaves of the data.
+    known of the other parameters either. Another mirror branch could move them.
     """
     found, chains = Fitted(model), [chain.copy() for chain in model.chains]
     added = {p.name: p for parameters in model.added.values() for p in parameters}
-    ties = model.problem.ties
-    options |= {"search": False} if added else {}
-    if held:
-        # and what follows them
-        fix = {*added, *(name for name, tie in ties.items() if tie.source in added)}
-        ties = {name: tie for name, tie in ties.items() if name not in fix}
-        return calibrate(chains, model.observations, ties=ties, fix=sorted(fix), **options)
+    how = {"ties": model.problem.ties, "search": not added, "instrument": instrument}
     for name, parameter in added.items():
         slot = model.problem.free.by_name[name]
         optic, key = name.split(".")
@@ -501,7 +504,7 @@ def with_causes(model, *, held=False, **options):
             size, own = np.shape(getattr(leaf, key).value), getattr(leaf, key)
             mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
             own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
-    return calibrate(chains, model.observations, ties=ties, **options)
+    return calibrate(chains, model.observations, **how, cross_validate=False)
 
 
 def _median(values):

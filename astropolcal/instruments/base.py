@@ -30,6 +30,7 @@ from astropolcal.instruments.layout import COMMON, FileLayout
 from astropolcal.observations import grid as tables
 from astropolcal.observations import pointings
 from astropolcal.observations.reading import common_wavelengths
+from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.units import wavelengths_of
 from astropolcal.words import check_choice
 
@@ -222,7 +223,7 @@ def without_nuisance(chain):
 
 
 def _added(chain, observations, kind, name, size):
-    found, prior, zero = leaves(chain), shared._normal(0.0, NUISANCES[kind]), np.zeros(size)
+    found, prior, zero = leaves(chain), FrozenNormal(0.0, NUISANCES[kind]), np.zeros(size)
     split = next(i for i, leaf in enumerate(found) if leaf.splits_light)
     if kind == "lamp":
         source = optics.PolarizedSource(name=name)

@@ -13,6 +13,7 @@ import numpy as np
 from astropolcal import optics, standards
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, InstrumentError, warn
+from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.units import to_unit
 from astropolcal.words import check_choice
 
@@ -94,7 +95,8 @@ def _metal(kind, thickest, *, fixed=(), bounds=(), **settings):
     free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
     limits = {"film_thickness": (0, thickest), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
     mirror = kind(fixed=free | dict(fixed), bounds=limits | dict(bounds), **settings)
-    mirror.n_scale.prior, mirror.k_scale.prior = _normal(1, _N_SPREAD), _normal(1, _K_SPREAD)
+    mirror.n_scale.prior = FrozenNormal(1, _N_SPREAD)
+    mirror.k_scale.prior = FrozenNormal(1, _K_SPREAD)
     return mirror
 
 
@@ -112,12 +114,6 @@ def telescope(mirror, altitude="-altitude"):
     ]
 
 
-def _normal(mean, std):
-    from scipy.stats import norm
-
-    return norm(mean, std)
-
-
 def mounted(optic):
     """
     Return the optic, whose orientation is now known as well as its mounting.
@@ -126,7 +122,7 @@ def mounted(optic):
     taking it as exact.
     """
     spread = _MOUNTING.to_value(optic.theta.unit)
-    optic.theta.fixed, optic.theta.prior = False, _normal(float(optic.theta.value), spread)
+    optic.theta.fixed, optic.theta.prior = False, FrozenNormal(float(optic.theta.value), spread)
     return optic
 
 
@@ -217,7 +213,7 @@ def _with_priors(name, reference, values):
     for key, numbers in values.items():
         parameter = getattr(star, key)
         # a prior is one of the value in the unit of the parameter
-        parameter.prior = _normal(*(float(to_unit(x, parameter.unit, key)) for x in numbers))
+        parameter.prior = FrozenNormal(*(float(to_unit(x, parameter.unit, key)) for x in numbers))
     return star
 
 

@@ -27,6 +27,7 @@ from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import SubaruPolarimeter
 from astropolcal.observations.grid import is_star, mask_saturated
 from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
+from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.units import wavelengths_of
 
 __all__ = ["VAMPIRES"]
@@ -160,9 +161,9 @@ def liquid_crystal(size, switching=43):
         name="flc",
         **settings,
     )
-    crystal.retardance.prior, crystal.theta.prior = subaru._normal(180, 15), subaru._normal(0, 2)
+    crystal.retardance.prior, crystal.theta.prior = FrozenNormal(180, 15), FrozenNormal(0, 2)
     # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
-    crystal.switching_angle.prior = subaru._normal(switching, 2)
+    crystal.switching_angle.prior = FrozenNormal(switching, 2)
     return crystal
 
 
@@ -268,7 +269,7 @@ class VAMPIRES(SubaruPolarimeter):
             hwp = optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
         turning = subaru.derotator(derotator, _starts(grid, _DEROTATOR), _BOUNDS)
         if derotator == "elliptical":
-            turning.diagonal.prior = turning.circular.prior = subaru._normal(0, 10)
+            turning.diagonal.prior = turning.circular.prior = FrozenNormal(0, 10)
         # what stands between derotator and liquid crystal, the dichroics included
         relay = optics.DiattenuatorRetarder(
             diattenuation=np.full(size, 0.01),
@@ -277,14 +278,14 @@ class VAMPIRES(SubaruPolarimeter):
             bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
         )
         # wide: a retarder here looks like one in the derotator, unless that turns far
-        relay.retardance.prior = subaru._normal(0, 45)
+        relay.retardance.prior = FrozenNormal(0, 45)
         crystal = [liquid_crystal(size)] if "flc" in optics_in else []
         # an efficiency above one is none
         wollaston = optics.WollastonPrism(efficiency=np.full(size, 0.95), name="wollaston")
-        wollaston.efficiency.prior = subaru._normal(0.95, 0.03)
+        wollaston.efficiency.prior = FrozenNormal(0.95, 0.03)
         cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
         # pairs of both states see it in second order only, hence the prior
-        cameras.imbalance.prior = subaru._normal(0, 0.1)
+        cameras.imbalance.prior = FrozenNormal(0, 0.1)
         train = subaru.entrance(source, grid, star, target, m3, _mirror)
         return join([*train, hwp, turning, relay, *crystal, wollaston, cameras])
 

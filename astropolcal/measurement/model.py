@@ -138,9 +138,9 @@ class Measurement(ScalarParameters):
         #: Noise that a fit assumed of the data, a
         #: `~astropolcal.calibration.noise.weighting.Weighting`.
         self.weighting = None
-        # vector and sweeps of the last prediction: fitters ask for
-        # data and Jacobian at the same point
-        self._last = (None, None)
+        # vector, sweeps and derivatives of the last prediction: fitters, and those who ask for
+        # errors after them, want data and Jacobian at the same point
+        self._last = (None, None, {})
         self._param_names = tuple(self.free.labels)
         #: Factor of each parameter from its unit to the canonical one.
         self._factors = self.free.factors()
@@ -261,11 +261,11 @@ class Measurement(ScalarParameters):
 
     def _sweeps(self, vector):
         """Return the forward sweep of every dataset; the last one is remembered."""
-        known, sweeps = self._last
+        known, sweeps, _ = self._last
         if known is None or not np.array_equal(known, vector):
             sweeps = [dataset.forward(vector) for dataset in self.datasets]
             # a copy, because fitters change their vector in place
-            self._last = (vector.copy(), sweeps)
+            self._last = (vector.copy(), sweeps, {})
         return sweeps
 
     def predict(self, vector):
@@ -281,8 +281,12 @@ class Measurement(ScalarParameters):
         Where ``among``, (n_free,), is given and False, it is not worked out, and zero.
         """
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
-        parts = [d.jacobian(s, among) for d, s in zip(self.datasets, sweeps, strict=True)]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        known, which = self._last[-1], None if among is None else among.tobytes()
+        if which not in known:
+            parts = [d.jacobian(s, among) for d, s in zip(self.datasets, sweeps, strict=True)]
+            known[which] = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        # whoever asked may write into it
+        return known[which].copy()
 
     def evaluate(self, x, *parameters):
         """Return the predicted data of index ``x``; after the data come the priors."""

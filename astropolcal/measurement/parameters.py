@@ -26,6 +26,7 @@ import numpy as np
 
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
+from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.units import canonical_factor, to_unit
 from astropolcal.words import check_choice, check_type, counted
 
@@ -536,12 +537,10 @@ class Normal:
 
     def frozen(self, unit, name):
         """Return the scipy distribution of the value in ``unit``."""
-        from scipy.stats import norm
-
         mean, std = (_plain(to_unit(v, unit, f"prior of {name}")) for v in (self.mean, self.std))
         if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(std)) and np.all(std > 0)):
             raise ParameterError(f"prior of {name}: Normal({mean}, {std}) needs a positive std")
-        return norm(mean, std)
+        return FrozenNormal(mean, std)
 
 
 @dataclass(frozen=True)
@@ -651,7 +650,7 @@ def told_prior(prior):
 
 def bind_prior(prior, name, unit, bounds):
     """Check a prior against name, unit and bounds of its parameter; return a BoundPrior."""
-    distribution = prior.frozen(unit, name) if hasattr(prior, "frozen") else prior
+    distribution = prior.frozen(unit, name) if isinstance(prior, (Normal, Uniform)) else prior
     if not (hasattr(distribution, "logpdf") and hasattr(distribution, "support")):
         raise ParameterError(
             f"prior of {name} is a {type(prior).__name__}; allowed are Normal, Uniform and "
@@ -699,10 +698,10 @@ def _plain(value):
 
 def _mode(distribution):
     """Return where the density peaks, by a search between far quantiles."""
-    from scipy.optimize import minimize_scalar
-
     if distribution.dist.name in ("norm", "uniform"):
         return _plain(distribution.mean())
+    from scipy.optimize import minimize_scalar
+
     # a search needs finite ends; a peak beyond them would be one in a millionth of the probability
     ends = distribution.ppf([1e-6, 1 - 1e-6])
     inside = minimize_scalar(

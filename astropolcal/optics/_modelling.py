@@ -11,6 +11,7 @@ Bounds and ties do, because astropy drops their units.
 
 from collections import defaultdict
 from copy import copy, deepcopy
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -45,6 +46,43 @@ class Setting:
     def __set__(self, optic, value):
         checked = self.check(value, f"{type(optic).__name__}.{self.name}")
         optic.__dict__[f"_{self.name}"] = checked
+
+
+class FrozenNormal:
+    """A frozen normal distribution as those of `scipy.stats`, imported where more is asked of it.
+
+    The import takes longer than many a fit.
+    """
+
+    dist = SimpleNamespace(name="norm")
+
+    def __init__(self, mean, std):
+        self.args, self.kwds = (mean, std), {}
+
+    def __getattr__(self, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        from scipy.stats import norm
+
+        return getattr(norm(*self.args), name)
+
+    def mean(self):
+        """Return the mean."""
+        return 1.0 * self.args[0]
+
+    def std(self):
+        """Return the standard deviation."""
+        return 1.0 * self.args[1]
+
+    def support(self):
+        """Return where the density is not zero, NaN where this is no distribution."""
+        end = np.where(self.std() > 0, np.inf, np.nan)
+        return self.mean() - end, self.mean() + end
+
+    def logpdf(self, value):
+        """Return the logarithm of the density at values."""
+        away = (value - self.mean()) / self.std()
+        return -0.5 * away**2 - np.log(np.sqrt(2 * np.pi) * self.std())
 
 
 def phase(description):

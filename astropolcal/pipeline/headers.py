@@ -17,6 +17,7 @@ from astropolcal.calibration.result.calibration import (
     optics_words,
     validity_of,
 )
+from astropolcal.calibration.result.verdict import faults
 from astropolcal.calibration.system import split_chain
 from astropolcal.chain import leaves
 from astropolcal.exceptions import (
@@ -298,11 +299,11 @@ def date_of(calibration):
 
 def faults_of(calibration, name):
     """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
-    faults = [reason for reason in calibration.verdict().reasons if " on sky " not in reason]
-    if faults:
-        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(faults)}"
+    found = faults(calibration)
+    if found:
+        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(found)}"
         warn(words, stacklevel=3)
-    return faults
+    return found
 
 
 def check_frames(calibration, frames, name, *, ways, max_age=None, light="sky", dates=True):

@@ -16,6 +16,7 @@ For example::
 """
 
 import argparse
+import gc
 import os
 import re
 import sys
@@ -178,6 +179,8 @@ def _insist(lost):
 
 def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
+    # libraries define so many objects that a search among them for garbage takes its time
+    gc.set_threshold(50_000)
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
     from astropolcal.progress import shown

@@ -8,6 +8,7 @@ import pytest
 from astropolcal import optics
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise.scatter import leave_out_groups
+from astropolcal.calibration.noise.weighting import Problem, assumed
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     cross_validated_residuals,
@@ -234,6 +235,25 @@ def test_directions_that_no_datum_sees_do_not_spoil_predictions(make):
     held_out = cross_validated_residuals(m)
     assert np.isfinite(held_out).all()
     assert np.abs(held_out).max() < 0.02
+
+
+def test_fits_without_a_group_start_near_to_where_they_end(measurement, monkeypatch):
+    """Two evaluations are enough, and the predictions are those of fits from anywhere."""
+    evaluations, fit = [], Problem.fit
+
+    def counted(self, *arguments):
+        found = fit(self, *arguments)
+        evaluations.append(found[2].nfev)
+        return found
+
+    monkeypatch.setattr(Problem, "fit", counted)
+    held_out, groups = cross_validated_residuals(measurement), leave_out_groups(measurement)
+    assert np.mean(evaluations) < 2.5
+    problem = Problem(measurement, assumed(measurement, None))
+    for group in np.unique(groups):
+        vector, *_ = fit(problem, problem.solution, 1.0 * (groups != group))
+        expected = measurement.residuals(vector)[groups == group]
+        np.testing.assert_allclose(held_out[groups == group], expected, atol=1e-7)
 
 
 def test_weights_are_used(make, chain, measurement):

@@ -19,6 +19,8 @@ from astropolcal.calibration.result import verdict as verdicts
 from astropolcal.calibration.result.verdict import verdict
 from astropolcal.calibration.uncertainty.covariance import status_of
 from astropolcal.chain import follow
+from astropolcal.exceptions import AstropolcalWarning
+from astropolcal.pipeline.headers import faults_of
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -185,6 +187,25 @@ def test_a_fit_that_did_not_arrive_is_not_usable(make):
     cal.fit["converged"] = False
     assert cal.verdict().reasons == ["the fit did not converge"]
     assert verdict(cal).words[0] == "NOT USABLE AS IT IS: the fit did not converge"
+
+
+def test_what_is_wrong_is_told_without_looking_at_the_sky(make, monkeypatch):
+    """Which takes long; and not by what the words are: tables have any name."""
+    lam = [1.2, 1.6, 2.2] * u.um
+    chain = make.chain(wavelength=lam)
+    cal = calibrate(chain, make.observe(make.truth(chain), wavelength=lam, seed=1))
+    assert faults_of(cal, "night.asdf") == []
+    cal.fit["converged"] = False
+    cal.datasets[0].name, cal.datasets[0].source = "lamp on sky side", "unpolarized"
+    table = QTable({"diattenuation": [99, 98, 99] * u.percent})
+    table["diattenuation_err"] = [1, 1, 1] * u.percent
+    monkeypatch.setattr(verdicts, "mirror_names", lambda calibration: ["m3"])
+    monkeypatch.setattr(verdicts, "mirror_values", lambda calibration, name: table)
+    reasons = cal.verdict().reasons
+    monkeypatch.delattr(verdicts, "target_accuracies")
+    with pytest.warns(AstropolcalWarning, match="is lamp on sky side really 'unpolarized'"):
+        assert faults_of(cal, "night.asdf") == reasons
+    assert len(reasons) == 2
 
 
 def test_a_parameter_at_a_bound_nearly_everywhere():

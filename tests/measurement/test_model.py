@@ -341,6 +341,23 @@ def test_results_do_not_share_memory_with_what_is_remembered(chain, observations
         np.testing.assert_array_equal(method(vector), before)
 
 
+def test_derivatives_at_a_point_are_worked_out_once(chain, observations, monkeypatch):
+    measurement, asked = Measurement(chain, observations), []
+    worked_out = type(measurement.datasets[0]).jacobian
+
+    def counted(self, sweep, among=None):
+        asked.append(among)
+        return worked_out(self, sweep, among)
+
+    monkeypatch.setattr(type(measurement.datasets[0]), "jacobian", counted)
+    vector, among = measurement.vector(), np.arange(measurement.free.size) < 2
+    for which, count in ((None, 1), (None, 1), (among, 2), (None, 2), (among, 2)):
+        found = measurement.jacobian(vector, which)
+        assert (len(asked), found[2:].any()) == (count, which is None)
+    measurement.jacobian(vector + 0.01)
+    assert len(asked) == 3
+
+
 # --- parameters as astropy sees them ----------------------------------------------------------
 
 

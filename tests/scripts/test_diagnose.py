@@ -2,6 +2,8 @@
 """``astropolcal diagnose``."""
 
 import json
+import subprocess
+import sys
 
 import astropy.units as u
 import numpy as np
@@ -67,6 +69,27 @@ def complaint(capsys, *arguments):
     assert status == 2
     (line,) = [line for line in captured.err.splitlines() if "error" in line]
     return line
+
+
+_MODULES = """
+import sys
+from astropolcal import load
+from astropolcal.scripts.main import main
+main(["diagnose", *sys.argv[1:], "--save", "improved.asdf"])
+load("improved.asdf")
+print({"scipy.stats", "scipy.signal", "matplotlib"} & set(sys.modules))
+"""
+
+
+@pytest.mark.slow
+def test_no_module_is_imported_that_takes_long(folder, tmp_path):
+    """Nor to read what was found, with the priors of what is mounted."""
+    options = ["-q", "--derotator", "linear", "--effects", "beam_gain"]
+    tables = [folder / "polarized.ecsv", folder / "unpolarized.ecsv"]
+    command = [sys.executable, "-c", _MODULES, *map(str, tables), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout == "set()\n", done
+    assert b"distribution: norm" in (tmp_path / "improved.asdf").read_bytes()
 
 
 @pytest.mark.slow

@@ -49,7 +49,11 @@ from astropolcal.calibration.noise.weighting import (
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
 from astropolcal.calibration.uncertainty.covariance import covariance_around, errors_at_bounds
-from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
+from astropolcal.calibration.validation.cross_validation import (
+    accuracy_table,
+    cross_validated_residuals,
+    lack_of_fit,
+)
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, warn
@@ -224,6 +228,15 @@ class FittedMeasurement:
     def converged(self):
         """Whether the fit converged."""
         return self.fit["converged"]
+
+    def accuracies(self, *, cross_validate=True):
+        """Return the accuracies of each dataset, for which no errors of parameters are needed."""
+        live, held_out = self.measurement, None
+        if cross_validate:
+            stage("cross-validation")
+            held_out = cross_validated_residuals(live, live.weighting.weight)
+        each = range(len(live.datasets))
+        return [accuracy_table(live, i, live.residuals(), held_out) for i in each]
 
     def calibration(self, *, cross_validate=False, covariance=None):
         """Return the calibration, with its errors; ``covariance`` is that of more data."""

@@ -89,8 +89,7 @@ class Verdict:
 
 def verdict(calibration, targets=TARGETS):
     """Return whether a calibration can be used, and why not; ``targets`` are (DoLP, AoLP)."""
-    known = calibration.parameter_values()
-    free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
+    known, free = _known_and_free(calibration)
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
     bright = tables[:1] if targets is TARGETS else target_accuracies(calibration, TARGETS[:1])
@@ -105,18 +104,10 @@ def verdict(calibration, targets=TARGETS):
         for what, leads in found.items()
         if any("[" not in lead for lead in leads) or len(leads) > many
     }
-    # what must be wrong with the set-up or its description comes before what is not known
-    wrong = [_nothing(calibration), _angles(calibration, free)]
-    wrong += [*_mirrors(calibration, known), _misfit(calibration)]
-    unknown = [*_absurd(_without_laws(calibration, free)), _open_words(sky)]
-    unknown += [*_too_far(bright, sky), _hanging(free)]
+    unseen = [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
+    on_sky = [_open_words(sky), *_too_far(bright, sky)], unseen
+    reasons, wrong = _reasons(calibration, known, free, on_sky)
     held = calibration.settings.get("restarted", {}).get("open")
-    unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
-    unknown += [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
-    stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
-    reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
-    # what is not known runs to its bounds, too
-    wrong = any(wrong) or bool(stuck and not any(unknown))
     cautions = []
     if not reasons:
         excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
@@ -146,6 +137,34 @@ def verdict(calibration, targets=TARGETS):
         f"Next        {advice}",
     ]
     return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words], advice)
+
+
+def faults(calibration):
+    """Return why a calibration is not usable but for what is open on sky, which its errors tell."""
+    return _reasons(calibration, *_known_and_free(calibration))[0]
+
+
+def _known_and_free(calibration):
+    known = calibration.parameter_values()
+    return known, {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
+
+
+def _reasons(calibration, known, free, on_sky=((), ())):
+    """Return why a calibration is not usable, and whether something must be wrong.
+
+    ``on_sky`` is what is said of the sky, before and after what orientations hang on.
+    """
+    # what must be wrong with the set-up or its description comes before what is not known
+    wrong = [_nothing(calibration), _angles(calibration, free)]
+    wrong += [*_mirrors(calibration, known), _misfit(calibration)]
+    unknown = [*_absurd(_without_laws(calibration, free)), *on_sky[0], _hanging(free)]
+    held = calibration.settings.get("restarted", {}).get("open")
+    unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
+    unknown += on_sky[1]
+    stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
+    reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
+    # what is not known runs to its bounds, too
+    return reasons, any(wrong) or bool(stuck and not any(unknown))
 
 
 _UNKNOWN_ON_SKY = "On sky      unknown, as something is wrong"

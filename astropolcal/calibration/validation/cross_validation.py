@@ -42,6 +42,8 @@ _MOST_NAMES = 4
 _MANY = 16
 # a leverage this near to one is that of data which alone determine something
 _ALONE = 1e-7
+# up to this leverage of a group, along any direction, the others determine everything
+_MOSTLY = 0.5
 
 
 def accuracy_table(measurement, dataset, residuals, held_out=None):
@@ -104,12 +106,12 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     if not np.isfinite(problem.noise):
         # as many data as parameters tell no noise, against which a prior could weigh
         problem.noise = 0.0
-    without = _without(problem) if len(members) > _MANY else None
+    without, begin = _without(problem) if len(members) > _MANY else None, _begin(problem)
     for out in steps(members, "groups left out"):
         if without is not None:
             predicted, blind = without(out)
         else:
-            _, blind = _undetermined(problem, out)
+            start, blind = begin(out)
         if groups is not None and blind.any():
             share = np.abs(_undetermined(problem, out)[0] / measurement.free.steps)
             slots = measurement.free.slots
@@ -121,7 +123,7 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
         if without is None:
             counts = np.ones(measurement.n_data)
             counts[out] = 0.0
-            fitted, _, _ = problem.fit(problem.solution, counts)
+            fitted, _, _ = problem.fit(start, counts)
             predicted = measurement.residuals(fitted)[out]
         # along what the others leave open the fit still stands where all data have put it
         held_out[out] = np.where(blind, np.nan, predicted)
@@ -153,6 +155,35 @@ def _without(problem):
         return (residuals + change) / weights[out], blind
 
     return predicted
+
+
+def _begin(problem):
+    """Return what says where a fit without a group starts, and which of its data others leave open.
+
+    It starts a step of linear algebra from the fit of all data, where that leads down.
+    """
+    measurement, solution = problem.measurement, problem.solution
+    scale, residuals = measurement.free.steps, problem.residuals(solution)
+    whole = Whitened(problem.jacobian(solution).T, scale)
+    root, half = whole.slopes, whole.errors.half * scale
+    pull, (low, high) = root.T @ residuals, measurement.free.bounds()
+
+    def cost(vector, out):
+        return np.sum(np.delete(problem.residuals(vector), out) ** 2)
+
+    def begin(out):
+        own = root[out]
+        values, axes = np.linalg.eigh(own.T @ own)
+        if values[-1] > _MOSTLY:
+            # the others may determine nothing
+            return solution, _undetermined(problem, out)[1]
+        # normal equations in coordinates in which those of all data are the unit matrix
+        move = axes @ ((axes.T @ (pull - own.T @ residuals[out])) / (1 - values))
+        start = np.clip(solution - move @ half, low, high)
+        leads_down = cost(start, out) < np.sum(np.delete(residuals, out) ** 2)
+        return start if leads_down else solution, np.zeros(out.size, dtype=bool)
+
+    return begin
 
 
 def _checked(measurement, groups):
