@@ -343,8 +343,8 @@ class ScienceFrames:
             By what the left beam is multiplied, one number or one per frame.
         detectors : sequence of (object, object), optional
             Of the right and left beam in each frame, whose ``variance(pixels)`` gives the variances
-            where the files hold no errors; pixels from ``saturation`` on, if they have one, count
-            as without a value.
+            where the files hold no errors; pixels of images that their ``spoilt(pixels)``, if they
+            have it, calls so count as without a value.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 

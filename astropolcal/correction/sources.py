@@ -191,7 +191,7 @@ class _WholeCubes:
     """Cubes of both beams in FITS files, which are opened when they are needed.
 
     Inverse variances or errors (``weights``) may follow the cube's ``extension``, else those of
-    the ``detectors`` count. Pixels that these call saturated have no value. ``left_scale``
+    the ``detectors`` count. Pixels that these call spoilt have no value. ``left_scale``
     multiplies the left beam. Of ``stacked`` files the first axis are exposures, of which the mean
     is taken.
     """
@@ -283,10 +283,10 @@ class _WholeCubes:
         return mean, variance
 
     def _fluxes(self, beam, i, wavelengths):
-        """Return the fluxes of a file, NaN where pixels are saturated: they measure nothing."""
+        """Return the fluxes of a file, NaN where pixels measure nothing."""
         flux = self._section(beam, i, wavelengths, 0)
-        if self._detectors is not None:
-            flux[flux >= getattr(self._detectors[i][beam], "saturation", np.inf)] = np.nan
+        if spoilt := getattr(self._detectors and self._detectors[i][beam], "spoilt", None):
+            flux[spoilt(flux)] = np.nan
         return flux
 
     def _squared(self, known):

@@ -65,8 +65,8 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     Raises
     ------
     ParameterError
-        If the folder holds no calibration, the goal or the age is none, or an event is not a date
-        or of the same date as another.
+        If the folder holds no calibration, the goal or the age is none, or an event is not a date,
+        after ``now``, or of the same date as another.
 
     Examples
     --------
@@ -92,6 +92,9 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     days = [moment_of(event, "event").isot[:10] for event in events]
     if len(set(days)) < len(days):
         raise ParameterError(f"events {', '.join(days)}: two of one date are not distinguishable")
+    # days may be local
+    if late := [day for day in days if moment_of(day, "event") > moment + 1 * u.day]:
+        raise ParameterError(f"event {late[0]}: allowed are dates up to now, {moment.isot[:10]}")
     goal = None if goal is None else positive_number(goal, "goal", u.percent)
     limit = None if max_age is None else positive_number(max_age, "max_age", u.day)
     rows = {row["name"]: row for row in library.table()}
@@ -141,10 +144,13 @@ def _group(entries, rows, moment, goal, limit, events):
         "events": [],
         "left_out": left_out,
     }
+    newest = dated[-1] if dated else entries[-1]
+    # what was done since is seen in no calibration
+    since = [e for e in events if moment_of(e, "event") > moment_of(_start(newest) or e, "date")]
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         try:
-            found = courses(dated, events=events)
+            found = courses(dated, events=[event for event in events if event not in since])
         except (ParameterError, FitError) as problem:
             found = ()
             few = f"{counted(len(dated), 'calibration')} with a date; courses need at least three"
@@ -162,22 +168,28 @@ def _group(entries, rows, moment, goal, limit, events):
                 one |= {"to": days[1], "probability": chance, "words": words}
                 content["events"].append(one)
     content["events"].sort(key=lambda one: one["to"])
-    newest = dated[-1] if dated else entries[-1]
     known = known_instrument(newest.calibration.instrument) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
     verdict = newest.calibration.verdict()
     content["alarms"] = _alarms(content, newest, verdict, moment, goal, limit)
     content["alarms"] += dict.fromkeys(f"{doubt.message}." for doubt in doubts)
-    following = "Give the calibrations dates: with_validity(valid_from=) states one."
-    if late:
-        following = f"Calibrate: no calibration is of {moment.isot[:10]} or before."
-    if dated:
-        due, n = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day, len(dated)
-        words = "is due" if due < moment else f"is due by {due.isot[:10]}"
-        more = f"; {counted(3 - n, 'more run')} will show what changes" if n < 3 else ""
-        following = f"The next calibration {words}{more}."
+    words = "Something was done on {}, after all calibrations: none is sure for frames since then."
+    content["alarms"] += [words.format(event) for event in since]
+    following = _next(newest, len(dated), late, moment, limit)
     content["next"] = [following, f"{newest.name}: {verdict.advice}"]
     return content
+
+
+def _next(newest, n_dated, late, moment, limit):
+    """Return when to calibrate again."""
+    if not n_dated:
+        if late:
+            return f"Calibrate: no calibration is of {moment.isot[:10]} or before."
+        return "Give the calibrations dates: with_validity(valid_from=) states one."
+    due = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day
+    words = "is due" if due < moment else f"is due by {due.isot[:10]}"
+    more = f"; {counted(3 - n_dated, 'more run')} will show what changes" if n_dated < 3 else ""
+    return f"The next calibration {words}{more}."
 
 
 def _alarms(content, newest, verdict, moment, goal, limit):

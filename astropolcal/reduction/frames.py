@@ -43,6 +43,8 @@ from astropolcal.reduction.photometry import (
     evenly_lit,
     measure_internal,
     outside_share,
+    piled_up,
+    sharpest,
 )
 from astropolcal.reduction.stars import measure_stars
 from astropolcal.words import counted
@@ -185,10 +187,12 @@ def _read_beams(path, hdus, layout, masters):
         # no measurement is without noise, nor is one that is all noise a measurement
         good &= (weight > 0) & (weight < np.inf)
     primary, header = hdus[0].header, hdus[number].header
-    several = cube.shape != wanted
-    if several or masters is not None:
-        values = read_header(path, layout, header=primary).values
-        detector = detector_of(layout, _unit_of(header, primary), values)
+    values = read_header(path, layout, header=primary).values
+    detector = detector_of(layout, _unit_of(header, primary), values)
+    several, good = cube.shape != wanted, good & ~detector.blank(cube)
+    if (piled := piled_up(cube)).any() and np.isfinite(detector.saturation):
+        # cut off below the limit that is stated: as full as those above it
+        cube = np.where(piled, np.maximum(cube, 1.001 * detector.saturation), cube)
     if masters is not None:
         cube, good = masters.applied(cube, good, layout, detector)
     if not good.any():
@@ -482,10 +486,17 @@ def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=N
         if not seen.all():
             bad = files[int(np.argmin(seen))]
             raise ObservationError(f"{bad}: the star was not found{ways['centre']}")
-    detectors = [
-        beam_detectors(file, layout, f.values, f.unit) for file, f in zip(files, found, strict=True)
-    ]
+    detectors = [_detectors(*both, layout) for both in zip(files, found, strict=True)]
     return _angles(found), centre, _brightness(files, found, detectors), detectors
+
+
+def _detectors(file, frame, layout):
+    """Return those of both beams of a frame, which know how sharp an image of a star may be."""
+    widths = [] if frame.photometry is None else frame.photometry.fwhm
+    seen = np.asarray(widths)[np.asarray(widths) > 0]
+    factor = sharpest((np.median(seen) if seen.size else layout.fwhm) ** 2)
+    both = beam_detectors(file, layout, frame.values, frame.unit)
+    return tuple(replace(each, factor=factor) for each in both)
 
 
 def _brightness(files, frames, detectors):
@@ -514,9 +525,6 @@ def _warn_of_doubts(files, frames):
         for words in frame.doubts:
             odd.setdefault(words, []).append(file)
     for words, of in odd.items():
-        # only the photometry of the star leaves them out
-        used = "single pixels far off their neighbours, as a cosmic ray makes them, change q and u"
-        words = f"{used}; mask them (NaN)" if words == _SINGLE else words
         warn(f"{counted(len(of), 'file')}: {words}; the first is {of[0]}", stacklevel=4)
 
 

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import astropy.units as u
 import numpy as np
+from scipy import ndimage
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
@@ -87,6 +88,8 @@ class Detector:
     exposures: float = 1.0
     # that of the left beam, if it is another one
     left: "Detector | None" = None
+    # a pixel has at most so many times the light of its neighbours, see `sharpest`
+    factor: float = np.inf
 
     def variance(self, pixels):
         """Return the variance of pixels: photon noise of what is above zero, and read noise."""
@@ -96,6 +99,23 @@ class Detector:
     def photon_noise(self, signal):
         """Return the variance that the photons of a signal have, in squared units of the data."""
         return self.excess_noise**2 * signal / self.gain
+
+    def spoilt(self, pixels):
+        """Return which pixels of images (N, Y, X) measure nothing: full, blank or single ones."""
+        found = (pixels >= self.saturation) | piled_up(pixels) | self.blank(pixels)
+        if self.factor < np.inf:
+            known = np.isfinite(pixels) & ~found
+            found |= outliers(pixels, known, np.ones(pixels.shape[1:]), self, self.factor)
+        return found
+
+    def blank(self, pixels):
+        """Return which pixels lie among exact zeros, as of lost packets and dead regions."""
+        zero = pixels == 0
+        # without noise of the read-out zero is what no light gives
+        if not (self.read_noise > 0 and zero.any()):
+            return np.zeros_like(zero)
+        # a single one may be chance, in whole numbers
+        return ndimage.binary_opening(zero, np.ones((*[1] * (zero.ndim - 2), 3, 3)))
 
     def counts_in(self, unit):
         """Return whether another BUNIT is that of the data, or does not say."""
@@ -157,6 +177,29 @@ def detector_of(layout, unit=None, values=None):
     # may be rounded down, as files in other units have it in single precision
     full, noise = (1 - 5e-7) * how.saturation * how.gain / electrons, how.read_noise / electrons
     return Detector(own, electrons, noise, full, how.excess_noise, exposures)
+
+
+# so many pixels are not equal by chance
+_PILED = 5
+
+
+def piled_up(cube):
+    """
+    Return which pixels of images (..., Y, X) share the largest value, as those that are cut off do.
+
+    They are more than share any value below it: of few electrons, or without noise, many are equal.
+    """
+    with np.errstate(invalid="ignore"):
+        top = np.fmax.reduce(cube, axis=(-2, -1), keepdims=True)
+        found = cube == top
+    number = found.sum(axis=(-2, -1))
+    for place in zip(*np.nonzero(number >= _PILED), strict=True):
+        image, n = cube[place], number[place]
+        below = np.sort(image[image < top[place]])[-10 * n :]
+        if below.size < n or 2 * np.unique(below, return_counts=True)[1].max() > n:
+            found[place] = False
+    found[number < _PILED] = False
+    return found
 
 
 def flux_variance(photons, area, background_variance, n_background=np.inf):
@@ -292,6 +335,13 @@ def evenly_lit(cube, good, layout):
     mean, median = max(beams)
     # a rectangle whose median pixel has less than this part of the mean one holds a star
     return bool(median >= 0.5 * mean)
+
+
+def sharpest(square):
+    """Return how many times the light of its neighbours a pixel may have, by the squared width."""
+    # below no star is as sharp as a pixel that was hit; else three times what the peak of a star
+    # has over its neighbours at 1.2 pixels
+    return np.inf if square < 6.25 else 3.0 * np.exp(4 * np.log(2) * 1.44 / square)
 
 
 # damaged pixels may be beyond all numbers, and are then infinitely far off

@@ -19,7 +19,13 @@ from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
-from astropolcal.reduction.photometry import Photometry, flux_variance, outliers, shared_pixels
+from astropolcal.reduction.photometry import (
+    Photometry,
+    flux_variance,
+    outliers,
+    shared_pixels,
+    sharpest,
+)
 from astropolcal.reduction.wings import wing_shares
 from astropolcal.words import check_choice
 
@@ -136,12 +142,9 @@ def _mean(cube, good):
 def _without_single(result, cube, good, pair, detector, smoothing, reach):
     """Return the known pixels but single ones about the star that are sharper than any star."""
     # squared, before the image was smoothed
-    width = pair.fwhm**2 - (smoothing / 2) ** 2
-    # squared full width, in pixels, from which on no star is as sharp as a pixel that was hit
-    if width < 6.25:
+    factor, good = sharpest(pair.fwhm**2 - (smoothing / 2) ** 2), good.copy()
+    if np.isinf(factor):
         return good
-    # three times what the peak of a star has over its neighbours at 1.2 pixels
-    factor, good = 3.0 * np.exp(4 * np.log(2) * 1.44 / width), good.copy()
     for beam, place in enumerate(pair.positions):
         box = tuple(slice(max(int(x - reach), 0), int(x + reach) + 2) for x in place[::-1])
         cut, known, own = cube[:, *box], good[:, *box], detector.of(beam)

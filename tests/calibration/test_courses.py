@@ -226,11 +226,24 @@ def test_health_says_that_changes_about_a_restart_are_unsure(steady):
         (group,) = health(library, now="2021-01-01")["groups"]
         assert sum("whose errors are not in its own" in words for words in group["alarms"]) == count
         assert group["courses"]
-    # what lies before or after all runs is no reason for a change between two
-    for event, count in (("1990-01-01", 1), ("2031-01-01", 1), ("2020-03-01", 0)):
+    # what lies before all runs is no reason for a change between two
+    for event, count in (("1990-01-01", 1), ("2020-03-01", 0)):
         (group,) = health(library, now="2021-01-01", events=[event])["groups"]
         words = f"event {event} is not between two of the runs, and has no part."
         assert group["alarms"].count(words) == count, event
+
+
+def test_what_was_done_after_all_calibrations_is_an_alarm_and_what_is_to_come_is_refused(steady):
+    for calibrations in (steady[:1], steady[:3]):
+        library = Library([])
+        library.entries = [
+            Entry(f"{i}.asdf", one, validity_of(one), str(i)) for i, one in enumerate(calibrations)
+        ]
+        (group,) = health(library, now="2031-01-01", events=["2030-12-31"])["groups"]
+        told = [words for words in group["alarms"] if "done on 2030-12-31" in words]
+        assert len(told) == 1, group["alarms"]
+        with pytest.raises(ParameterError, match="event 2031-01-03: allowed are dates up to now"):
+            health(library, now="2031-01-01", events=["2031-01-03"])
 
 
 @pytest.mark.slow

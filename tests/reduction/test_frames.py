@@ -6,12 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
-from reduction_lab import HEADER, expose, write_cube
+from reduction_lab import HEADER, expose, pair, star_image, write_cube
 
 from astropolcal import instruments
 from astropolcal.exceptions import ObservationError
 from astropolcal.reduction import reduce_run
-from astropolcal.reduction.frames import Frame, _check_header, check_stars, open_cube, reduce_frame
+from astropolcal.reduction.frames import (
+    Frame,
+    Masters,
+    _check_header,
+    check_stars,
+    open_cube,
+    reduce_frame,
+)
 from astropolcal.reduction.headers import not_of_instrument, observation_time
 
 LAYOUT = instruments.get("charis").files
@@ -300,3 +307,36 @@ def test_weights_and_errors_that_are_no_numbers_mark_pixels_without_a_value(
         _, good = opened(path, replace(small.files, weights=kind))
         assert not good[0, 0, :4].any(), kind
         assert good.sum() == good.size - 4, kind
+
+
+def test_what_measures_nothing_is_no_light_of_a_star(small, tmp_path):
+    """Cut off below the limit that is stated, in whole numbers too; lost packets and dead areas."""
+    places = pair(small.files)
+    cube = expose(star_image(places, flux=1e6), small.files, n_wavelengths=4)
+    (x, y, _), lost = places[1], cube.copy()
+    lost[0, int(y) - 3 : int(y) + 3, int(x) + 6 : int(x) + 12] = 0.0
+    lost[1, int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = 0.0
+    top = 0.8 * cube.max()
+    # a dark and a flat leave few pixels equal
+    flat = fits.PrimaryHDU(np.random.default_rng(1).normal(1.0, 0.02, (201, 201)))
+    flat.writeto(tmp_path / "flat.fits")
+    masters = Masters(flat=str(tmp_path / "flat.fits"))
+    full, fine = ["saturated"] * 4, [""] * 4
+    for i, (made, options, reasons) in enumerate([
+        (cube, {}, fine),
+        (np.rint(cube), {}, fine),
+        (np.minimum(cube, top), {}, full),
+        (np.rint(np.minimum(cube, top)), {}, full),
+        (np.minimum(cube, top), {"masters": masters}, full),
+        (lost, {}, ["", "aperture masked", "", ""]),
+    ]):  # fmt: skip
+        path = write_cube(tmp_path / f"CRSA{i:08d}.fits", made)
+        found = reduce_frame(path, small.files, source="star", **options).photometry
+        assert found.reasons == reasons, i
+        if reasons != full:
+            np.testing.assert_allclose(found.flux[0, [0, 2, 3]], 1e6, rtol=5e-3, err_msg=i)
+    # nor is a lamp without noise cut off, or one of few electrons
+    lamp = np.random.default_rng(2).poisson(2.0, (4, 201, 201)).astype(float)
+    for i, made in enumerate([np.full((4, 201, 201), 300.0), lamp], start=10):
+        path = write_cube(tmp_path / f"CRSA{i:08d}.fits", made)
+        assert reduce_frame(path, small.files).photometry.reasons == fine, i

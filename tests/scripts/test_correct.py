@@ -3,6 +3,7 @@
 
 import json
 import re
+import shutil
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -104,6 +105,27 @@ def test_cubes_to_product(night, tmp_path, capsys):
     np.testing.assert_allclose(spectrum["q"], content["aperture"]["q"])
     assert capsys.readouterr().out == ""
     assert (tmp_path / "out.png").stat().st_size > 1e4
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::astropolcal.exceptions.AstropolcalWarning")
+def test_pixels_that_measure_nothing_are_left_to_the_other_frames(night, tmp_path):
+    """Zeros of a lost packet, and a cosmic ray, beside the star in one beam of one frame."""
+    files = [shutil.copy(path, tmp_path) for path in sorted((night / "cubes").glob("*.fits"))[:4]]
+    for i, path in enumerate(files):
+        with fits.open(path, mode="update") as hdus:
+            # no pixel of a detector that has noise is an exact zero
+            hdus[1].data += 1e-3
+            if i == 2:
+                hdus[1].data[:, 118:123, 136:141] = 0.0
+                hdus[1].data[3, 121, 125] = 2e4
+    command(
+        *files, "--calibration", night / "charis.asdf", "-o", tmp_path / "out.fits", "--size", 21,
+        "--json", tmp_path / "s.json", "-q", "--rotation", "pupil", "--centre", "69.9,84.7",
+    )  # fmt: skip
+    aperture = json.loads((tmp_path / "s.json").read_text())["aperture"]
+    for key, truth in (("q", Q), ("u", U)):
+        np.testing.assert_allclose(aperture[key], truth, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -446,7 +468,7 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     def frame(file):
         x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
         found = Frame(file, values={"hwp": 0.0})
-        found.photometry = SimpleNamespace(x=x, y=x + 15.0)
+        found.photometry = SimpleNamespace(x=x, y=x + 15.0, fwhm=np.full(x.shape, 4.0))
         return found
 
     monkeypatch.setattr(frame_files, "_survey", lambda files, *_: [frame(file) for file in files])
@@ -473,7 +495,7 @@ def test_raw_frames_are_advised_where_they_may_help(monkeypatch):
 
 
 def test_what_is_odd_about_science_frames_is_told(monkeypatch, tmp_path):
-    """A pixel that the photometry of the star leaves out is in the images that are corrected."""
+    """A pixel that the photometry of the star leaves out is left out of the images, too."""
     frames = half_wave_plate_cycles([0, 22.5] * u.deg, [60] * u.deg)
     frames["parallactic"], frames["altitude"] = [20, 20] * u.deg, [70, 70] * u.deg
     simulate_cubes(
@@ -485,9 +507,12 @@ def test_what_is_odd_about_science_frames_is_told(monkeypatch, tmp_path):
     survey_frames(paths, CHARIS.files)
     with fits.open(paths[1], mode="update") as hdus:
         hdus[1].data[3, 124, 133] += 2e4
-    with pytest.warns(AstropolcalWarning, match="1 file: single pixels .* change q and u") as told:
-        survey_frames(paths, CHARIS.files)
+    with pytest.warns(AstropolcalWarning, match="1 file: single pixels .* were left out") as told:
+        *_, detectors = survey_frames(paths, CHARIS.files)
     assert paths[1].name in str(told[0].message)
+    found = detectors[1][0].spoilt(fits.getdata(paths[1], 1))
+    assert found[3, 124, 133]
+    assert not found[[0, 1, 2], 110:130, 120:140].any()
 
 
 def test_copies_and_other_objects_among_science_frames(monkeypatch):
