@@ -45,8 +45,10 @@ _HARDLY, _STUCK = 1e-6, 1.0
 # a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
 # many more are taken, until the end is known so well, and an error so many times too small grows
 _STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
-# so many other thicknesses to either side are tried; each step changes the data by so much (rms)
-_LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
+# so many other thicknesses to either side are tried; each step changes the data by such a share
+_LAWS, _LAW_STEP, _ROUGH = 4, 0.15, 4
+# steps of a scan in half a turn
+_HALF_TURN = 12
 # a phase with bounds so far apart may go on by half a turn
 _WHOLE_TURN = 1.99 * np.pi
 # starts whose sums of squares differ by less are the same
@@ -455,38 +457,51 @@ def _ends(problem, known, half, row, times):
 
 
 def other_laws(problem, vector, origin):
-    """Return sums of squares and starts with other thicknesses or slopes of laws, best first.
+    """Return sums of squares and starts with other thicknesses or laws of phases, best first.
 
     A phase that is a law, of a thickness or with coefficients, has minima of its own, as one of a
     bin has. Thicknesses are tried around those of ``origin``, beside the other common parameters of
     ``vector``, with each bin roughly in its best valley, and in that of the origin; so are
-    coefficients, with the constant moved so that the data change least.
+    coefficients, with the constant moved so that the data change least, and all the way round.
     """
-    slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
-    low, high = problem.measurement.free.bounds()
-    base, ways = vector.copy(), {}
-    for slot, constant in _law_slots(problem.measurement):
+    laws, base, starts, found = list(_law_slots(problem.measurement)), vector.copy(), {}, []
+    for slot in (slot for both in laws for slot in both if slot):
         base[slot.start] = origin[slot.start]
-        way = np.zeros(vector.size)
+    slopes = problem.jacobian(base)[: problem.measurement.n_data]
+    # an unpolarized source shows little of either
+    step = _LAW_STEP * np.sqrt(np.mean((problem.measurement.observed * problem.weights) ** 2))
+    for slot, constant in laws:
+        way, turn = np.zeros((2, vector.size))
         way[slot.start] = 1.0
         if constant is not None:
-            base[constant.start] = origin[constant.start]
             own, of = slopes[:, slot.start], slopes[:, constant.start]
             way[constant.start] = -(own @ of) / max(of @ of, np.finfo(float).tiny)
-        ways.setdefault(slot.name.partition(".")[0] if constant is None else slot.name, way)
-    for way in ways.values():
+            turn[constant.start] = _SCAN_STEP
         size = np.sqrt(np.mean((slopes @ way) ** 2))
-        for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
-            start = base + k * _LAW_STEP / size * way
-            if np.all((low <= start) & (start <= high)):
-                start[problem.elements] = origin[problem.elements]
-                found.append(problem.polish(start, _ROUGH))
-                for row, *bounds in problem.main_retardances():
-                    start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
-                found.append(problem.polish(start, _ROUGH))
+        if size > 0:
+            name = slot.name.partition(".")[0] if constant is None else slot.name
+            starts.setdefault(name, _law_starts(problem, base, step / size * way, turn))
+    for start in (start for each in starts.values() for start in each):
+        start[problem.elements] = origin[problem.elements]
+        found.append(problem.polish(start, _ROUGH))
+        for row, *bounds in problem.main_retardances():
+            start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
+        found.append(problem.polish(start, _ROUGH))
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def _law_starts(problem, base, way, turn):
+    """Return vectors some steps along a law, of its turned constants those of least costs."""
+    low, high = problem.measurement.free.bounds()
+    turns = range(-_HALF_TURN, _HALF_TURN) if turn.any() else (0,)
+    found = []
+    for k in range(-_LAWS, _LAWS + 1):
+        ways = [base + k * way + times * turn for times in turns]
+        inside = [start for start in ways if np.all((low <= start) & (start <= high))]
+        found += sorted(inside, key=lambda start: problem.costs(start).sum())[:1]
+    return found
 
 
 def _law_slots(measurement):

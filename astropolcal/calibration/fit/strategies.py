@@ -61,7 +61,7 @@ _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
-_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
+_STANDS_OUT, _STARTS, _BETTER = 1.3, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted
 _HOPELESS = 100.0
 # of so many signs not all combinations are tried; sums of squares of the same minimum, over that
