@@ -266,7 +266,8 @@ def follow(chain, name, model, of, *, since=None):
 
     What the model gives is added to the parameter, in each frame. Its coefficients become
     parameters of the optic: ``c1`` of a law of ``theta`` is ``theta_c1``. The one that does the
-    same everywhere is held, as the parameter itself is that constant.
+    same everywhere is held, as the parameter itself is that constant. Of a law of wavelength it is
+    the value at zero: an angle that was bounded to a whole turn or more has no bounds there.
 
     Parameters
     ----------
@@ -316,7 +317,18 @@ def follow(chain, name, model, of, *, since=None):
     new = old.copy()
     law, found = law_of(name, old._declared(key).unit, model, of, since)
     new._follow(key, law, found.values())
+    constant = getattr(new, key)
+    if "wavelength" in law.of and _goes_round(constant):
+        # turns may be counted from any data, not from the wavelength zero
+        constant.bounds = None, None
     return replace_optic(chain, optic, new)
+
+
+def _goes_round(parameter):
+    """Whether the bounds of an angle are a whole turn apart, and so leave no value out."""
+    unit, bounds = parameter.unit, parameter.bounds
+    is_angle = unit is not None and unit.is_equivalent(u.deg) and None not in bounds
+    return bool(is_angle and np.diff(bounds)[0] * unit > 359.9 * u.deg)
 
 
 def stages(chain):

@@ -118,6 +118,18 @@ def test_constant_of_a_law_is_held(still):
         assert names == [f"theta_{name}" for name in held], model
 
 
+def test_the_constant_of_a_law_of_wavelength_may_be_any_turn():
+    """Of -200 deg/um and 180 deg at 1.7 um it is 520 deg, beyond the bounds of a retardance."""
+    still = optics.LinearRetarder(retardance=170 * u.deg, name="plate", bounds={"theta": (-5, 5)})
+    for name, of, expected in (
+        ("retardance", "wavelength", (None, None)),
+        ("retardance", "x", still.retardance.bounds),
+        ("theta", "wavelength", (-5, 5)),
+    ):
+        found = follow(still, f"plate.{name}", models.Polynomial1D(1), of)
+        assert getattr(found, name).bounds == expected, (name, of)
+
+
 def test_law_is_added_where_its_inputs_are(still):
     chain = law_of_time(still, model=models.Polynomial1D(1, c1=0.5))
     for when in ("2026-01-21", Time("2026-01-21", scale="tai"), 61061.0, 61061 * u.day):

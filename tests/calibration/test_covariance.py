@@ -247,9 +247,9 @@ def test_widened_along_a_direction(make):
     before = cal.covariance
     way = np.zeros(len(before))
     way[:2] = 3 * before.stds[0], -before.stds[1]
-    wide = before.widened([(0, way), (0, way / 2)])
+    wide = before.widened([(0, way[0], way), (0, way[0] / 2, way)])
     assert wide.stds[0] == pytest.approx(3 * before.stds[0])
     np.testing.assert_allclose(wide.stds[2:], before.stds[2:])
     np.testing.assert_allclose(np.diag(wide.factor.T @ wide.factor) ** 0.5, wide.stds)
     assert np.linalg.eigvalsh(wide.matrix - before.matrix).min() > -1e-12
-    assert before.widened([(0, way / 9)]) == before
+    assert before.widened([(0, way[0] / 9, way)]) == before

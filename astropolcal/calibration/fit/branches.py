@@ -45,8 +45,10 @@ _HARDLY, _STUCK = 1e-6, 1.0
 # a step of two standard errors raises the root of chi-square by two if it is a parabola; else so
 # many more are taken, until the end is known so well, and an error so many times too small grows
 _STRAIGHT, _STRIDES, _NEAR, _MATTERS = 1.7, 20, 0.9, 1.1
-# so many other thicknesses to either side are tried; each step changes the data by so much (rms)
-_LAWS, _LAW_STEP, _ROUGH = 4, 0.1, 4
+# so many other thicknesses to either side are tried; each step changes the data by such a share
+_LAWS, _LAW_STEP, _ROUGH = 4, 0.15, 4
+# steps of a scan in half a turn
+_HALF_TURN = 12
 # a phase with bounds so far apart may go on by half a turn
 _WHOLE_TURN = 1.99 * np.pi
 # starts whose sums of squares differ by less are the same
@@ -76,24 +78,25 @@ class BinProblem(Problem):
         self.noise = self.noise if weighting.is_known else 0.0
         self.n_bins = 1 if together else len(measurement.wavelength)
         bins = np.zeros_like(measurement.bins) if together else measurement.bins
-        # with a single bin every parameter belongs to it
-        self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
+        # with a single bin every element belongs to it
+        slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
+        self.slots = [s for s in slots for _ in range(s.size if self.n_bins == 1 else 1)]
         # the data of each bin, padded, and which of them are real
         counts = np.bincount(bins, minlength=self.n_bins)
         self._present = np.arange(counts.max()) < counts[:, None]
         self._data = np.zeros(self._present.shape, dtype=int)
         self._data[self._present] = np.argsort(bins, kind="stable")
-        starts = np.array([slot.start for slot in self.slots], dtype=int)
+        starts = [slot.start for slot in slots] if self.n_bins > 1 else range(self._low.size)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
-        self.elements = starts[:, None] + np.arange(self.n_bins)
+        self.elements = np.array(starts, dtype=int)[:, None] + np.arange(self.n_bins)
         self._below, self._above = self._low[self.elements], self._high[self.elements]
         self._own = np.isin(np.arange(self._low.size), self.elements)
-        rows = {slot.name: row for row, slot in enumerate(self.slots)}
         #: Priors that enter the costs of the bins, with the slot of each.
         self.priors = [
-            (rows[slot.name], prior)
+            (row, prior)
             for slot, prior in measurement.free.priors
-            if slot.name in rows and not prior.is_flat
+            for row, own in enumerate(self.slots)
+            if own.name == slot.name and not prior.is_flat
         ]
 
     def of_bins(self, vector):
@@ -192,11 +195,12 @@ class BinProblem(Problem):
             trial[places[walking]] = (here[row] + times * step)[walking]
             trial = np.clip(trial, self._low, self._high)
             trial, new = self.polish(trial, kept=[row])
-            low = np.sqrt(2 * (new - costs).clip(0)) < 2 * unit
+            root = np.sqrt(2 * (new - costs).clip(0)) / unit
+            low = root < 2
             inside[self.elements[:, walking & low]] = trial[self.elements[:, walking & low]]
             at_end = (trial[places] <= self._below[row]) | (trial[places] >= self._above[row])
             reached, beyond = np.where(low, times, reached), np.where(low, beyond, times)
-            walking = walking & ~(low & at_end) & (reached < _NEAR * beyond)
+            walking = walking & ~(low & (at_end | (root > _STRAIGHT))) & (reached < _NEAR * beyond)
             if not walking.any():
                 break
         return inside[self.elements] - here
@@ -391,83 +395,113 @@ def _refitted(problem, vector, costs, trial, new):
 
 
 def bent_valleys(measurement, whitened, stds):
-    """Return how far parameters of a wavelength may go where chi-square is not a parabola.
+    """Return how far parameters may go where chi-square is not a parabola.
 
-    Where none is given per wavelength, these are all parameters, and all wavelengths are one.
+    Of a wavelength with common parameters held and all others of the wavelength refitted, and along
+    each common parameter with everything refitted.
 
-    Each is an element of the flat vector, a direction, (n_free,) in canonical units, and by how
-    much the element may fall and rise. The direction is as long as a standard error: half the way
-    at which chi-square has risen by four, common parameters held and all others of the wavelength
-    refitted, to the side where it is longer. Where scatter makes the stated error, ``stds``, larger
-    than that of white noise, chi-square has to rise by as much more.
+    Each is an element of the flat vector, a direction, (n_free,) in canonical units, what of it is
+    beyond the one that slopes tell, and by how much the element may fall and rise. The direction is
+    as long as a standard error: half the way at which chi-square has risen by four, to the side
+    where it is longer. Where scatter makes the stated error, ``stds``, larger than that of white
+    noise, chi-square has to rise by as much more.
     """
-    together = not any(slot.per_wavelength for slot in measurement.free.slots)
-    problem, vector = BinProblem(measurement, measurement.weighting, together), measurement.vector()
-    level, scale, found = measurement.weighting.level, whitened.scale, []
+    level, scale, null = measurement.weighting.level, whitened.scale, whitened.null()
     with np.errstate(divide="ignore", invalid="ignore"):
         times = stds / (level * np.sqrt(np.diag(whitened.covariance())))
-    known, half = whitened.given_others(np.isin(np.arange(vector.size), problem.elements))
-    errors, costs, null = np.linalg.norm(half, axis=0), problem.costs(vector), whitened.null()
-    for row, places in enumerate(problem.elements):
-        live = known[places] & (times[places] > 0) & (errors[places] > 0)
-        unit = np.where(live, level * times[places], np.inf)
-        size = np.where(live, errors[places], np.inf)
-        # the way of each bin is its own: all are gone at once
-        way = half.T @ (half[:, places] @ np.where(live, level * times[places] / size, 0.0))
-        ends = []
-        for sign in (1, -1):
-            there = np.clip(vector + 2 * sign * way, *measurement.free.bounds())
-            root = np.sqrt(2 * (problem.costs(there) - costs).clip(0)) / unit
-            bent = live & ~((_STRAIGHT < root) & (root < 4 / _STRAIGHT))
-            far = 2 * sign * way[problem.elements]
-            if bent.any():
-                step = sign * np.where(live, level * times[places] * errors[places], 0.0)
-                far = np.where(bent, problem.walk(row, step, bent, unit), far)
-            ends.append(far)
-        for i in np.flatnonzero(live):
-            far = max((end[:, i] for end in ends), key=lambda end: abs(end[row]))
-            if abs(far[row]) > 2 * _MATTERS * stds[places[i]]:
-                direction = np.zeros(vector.size)
-                direction[problem.elements[:, i]] = far / 2
-                # what is open stays open
-                direction -= null.T @ (null @ (direction / scale)) * scale
-                found.append((places[i], direction, sorted(end[row, i] for end in ends)))
+    several = measurement.free.spread([slot.per_wavelength for slot in measurement.free.slots])
+    found = []
+    for together in [*([False] if several.any() else []), True]:
+        problem = BinProblem(measurement, measurement.weighting, together)
+        around = whitened.given_others(problem._own)
+        for row, places in enumerate(problem.elements):
+            if together and several[places[0]]:
+                continue
+            for i, ends, straight in _ends(problem, *around, row, times):
+                own, sides = problem.elements[:, i], np.abs(ends).argmax(axis=0)
+                least = np.maximum(stds[own], np.abs(straight[0]))
+                for k in np.flatnonzero(np.abs(ends).max(axis=0) > 2 * _MATTERS * least):
+                    ways = np.zeros((2, stds.size))
+                    ways[:, own] = ends[sides[k]] / 2, ends[sides[k]] / 2 - straight[sides[k]]
+                    # what is open stays open
+                    ways -= (ways / scale @ null.T) @ null * scale
+                    found.append((own[k], *ways, sorted((0.0, *ends[:, k]))[::2]))
     return found
 
 
+def _ends(problem, known, half, row, times):
+    """Yield bins, and how far their slots get along one of them to either side, (2, n_slots).
+
+    At two standard errors; with them the straight ways of one.
+    """
+    vector, places = problem.solution, problem.elements[row]
+    errors = np.linalg.norm(half[:, places], axis=0)
+    live = known[places] & (times[places] > 0) & (errors > 0)
+    # a standard error of each bin, in units of the root of chi-square and of the parameter
+    rise = np.where(live, problem.weighting.level * times[places], 0.0)
+    unit, step = np.where(live, rise, np.inf), rise * np.where(live, errors, 0.0)
+    # the way of each bin is its own: all are gone at once
+    way = half.T @ (half[:, places] @ (rise / np.where(live, errors, 1.0)))
+    ends, costs = [], problem.costs(vector)
+    straight = np.array([way[problem.elements], -way[problem.elements]])
+    for sign in (1, -1):
+        there = np.clip(vector + 2 * sign * way, problem._low, problem._high)
+        root = np.sqrt(2 * (problem.costs(there) - costs).clip(0)) / unit
+        bent = live & ~((_STRAIGHT < root) & (root < 4 / _STRAIGHT))
+        far = 2 * sign * way[problem.elements]
+        if bent.any():
+            far = np.where(bent, problem.walk(row, sign * step, bent, unit), far)
+        ends.append(far)
+    for i in np.flatnonzero(live):
+        yield i, np.array(ends)[:, :, i], straight[:, :, i]
+
+
 def other_laws(problem, vector, origin):
-    """Return sums of squares and starts with other thicknesses or slopes of laws, best first.
+    """Return sums of squares and starts with other thicknesses or laws of phases, best first.
 
     A phase that is a law, of a thickness or with coefficients, has minima of its own, as one of a
     bin has. Thicknesses are tried around those of ``origin``, beside the other common parameters of
     ``vector``, with each bin roughly in its best valley, and in that of the origin; so are
-    coefficients, with the constant moved so that the data change least.
+    coefficients, with the constant moved so that the data change least, and all the way round.
     """
-    slopes, found = problem.jacobian(origin)[: problem.measurement.n_data], []
-    low, high = problem.measurement.free.bounds()
-    base, ways = vector.copy(), {}
-    for slot, constant in _law_slots(problem.measurement):
+    laws, base, starts, found = list(_law_slots(problem.measurement)), vector.copy(), {}, []
+    for slot in (slot for both in laws for slot in both if slot):
         base[slot.start] = origin[slot.start]
-        way = np.zeros(vector.size)
+    slopes = problem.jacobian(base)[: problem.measurement.n_data]
+    # an unpolarized source shows little of either
+    step = _LAW_STEP * np.sqrt(np.mean((problem.measurement.observed * problem.weights) ** 2))
+    for slot, constant in laws:
+        way, turn = np.zeros((2, vector.size))
         way[slot.start] = 1.0
         if constant is not None:
-            base[constant.start] = origin[constant.start]
             own, of = slopes[:, slot.start], slopes[:, constant.start]
             way[constant.start] = -(own @ of) / max(of @ of, np.finfo(float).tiny)
-        ways.setdefault(slot.name.partition(".")[0] if constant is None else slot.name, way)
-    for way in ways.values():
+            turn[constant.start] = _SCAN_STEP
         size = np.sqrt(np.mean((slopes @ way) ** 2))
-        for k in (k for k in range(-_LAWS, _LAWS + 1) if size > 0):
-            start = base + k * _LAW_STEP / size * way
-            if np.all((low <= start) & (start <= high)):
-                start[problem.elements] = origin[problem.elements]
-                found.append(problem.polish(start, _ROUGH))
-                for row, *bounds in problem.main_retardances():
-                    start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
-                found.append(problem.polish(start, _ROUGH))
+        if size > 0:
+            name = slot.name.partition(".")[0] if constant is None else slot.name
+            starts.setdefault(name, _law_starts(problem, base, step / size * way, turn))
+    for start in (start for each in starts.values() for start in each):
+        start[problem.elements] = origin[problem.elements]
+        found.append(problem.polish(start, _ROUGH))
+        for row, *bounds in problem.main_retardances():
+            start[problem.elements[row]] = problem.valleys(start, row, *bounds)[0]
+        found.append(problem.polish(start, _ROUGH))
     ranked = sorted(((costs.sum(), start) for start, costs in found), key=lambda one: one[0])
     # where the best valley is the nearest one, both are the same
     return [one for k, one in enumerate(ranked) if not k or one[0] > _APART * ranked[k - 1][0]]
+
+
+def _law_starts(problem, base, way, turn):
+    """Return vectors some steps along a law, of its turned constants those of least costs."""
+    low, high = problem.measurement.free.bounds()
+    turns = range(-_HALF_TURN, _HALF_TURN) if turn.any() else (0,)
+    found = []
+    for k in range(-_LAWS, _LAWS + 1):
+        ways = [base + k * way + times * turn for times in turns]
+        inside = [start for start in ways if np.all((low <= start) & (start <= high))]
+        found += sorted(inside, key=lambda start: problem.costs(start).sum())[:1]
+    return found
 
 
 def _law_slots(measurement):

@@ -61,12 +61,12 @@ _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
-_STANDS_OUT, _STARTS, _BETTER = 3.0, 4, 0.9
+_STANDS_OUT, _STARTS, _BETTER = 1.3, 4, 0.9
 # nor is one tried that leaves so many times as much before everything is fitted
 _HOPELESS = 100.0
-# of so many signs not all combinations are tried; sums of squares of the same minimum, and of what
-# may lead to a better one, over that of the best
-_MANY_SIGNS, _SAME_MINIMUM, _MAY_LEAD = 8, 1.001, 2.0
+# of so many signs not all combinations are tried; sums of squares of the same minimum, over that
+# of the best
+_MANY_SIGNS, _SAME_MINIMUM = 8, 1.001
 # more data than these are fitted without astropy's fitter
 _TALL = 20_000
 # below this the sign of the start is as good
@@ -222,7 +222,7 @@ def _behind_mirrors(measurement, best, how):
             start = best_signs(problem, start, phases)
             start = problem.fit(start, evaluations=2 * GLANCE, gain=GAIN)[0]
             left = np.sum(problem.residuals(start) ** 2)
-            if not _SAME_MINIMUM < left / least < _MAY_LEAD:
+            if not _SAME_MINIMUM < left / least < FAR_WORSE:
                 break
         if left < least - worth:
             found, least, starts = start, left, mirrored(start, axes)

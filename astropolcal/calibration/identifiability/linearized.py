@@ -365,8 +365,8 @@ def near_null_directions(free, whitened, level, sky_of):
 def curved_directions(free, vector, valleys, stds, sky_of):
     """Say which errors are far larger than the slopes tell, by parameter.
 
-    ``valleys`` has elements, directions and how far these may fall and rise, ``stds`` the errors
-    from the slopes, in canonical units.
+    ``valleys`` has elements, directions, what of these slopes do not tell, and how far elements may
+    fall and rise, ``stds`` the errors from the slopes, in canonical units.
     """
     found = []
     far = [one for one in valleys if abs(one[1][one[0]]) > _TOLD * stds[one[0]]]
@@ -374,7 +374,7 @@ def curved_directions(free, vector, valleys, stds, sky_of):
         own = [one for one in far if slot.start <= one[0] < slot.start + slot.size]
         if not own:
             continue
-        worst, _, limits = max(own, key=lambda one: one[2][1] - one[2][0])
+        worst, *_, limits = max(own, key=lambda one: one[-1][1] - one[-1][0])
         size, unit = step_of(slot.unit)[1:]
         low, high = (vector[worst] + np.array(limits)) / free.steps[worst] * size
         others = f" (and at {len(own) - 1} more wavelengths)" if len(own) > 1 else ""
@@ -382,7 +382,7 @@ def curved_directions(free, vector, valleys, stds, sky_of):
             f"{free.names[worst]} is anywhere from {low:.3g} to {high:.3g}{unit}{others}: other "
             "parameters make up for it, farther than their slopes tell"
         )
-        change = np.sum([direction for _, direction, _ in own], axis=0)
+        change = np.sum([one[1] for one in own], axis=0)
         entry = {"words": words, "parameters": plain(_moved(free, change / free.steps))}
         sky = sky_of([change])[0]
         found.append(entry if sky is None else entry | {"sky": sky})

@@ -159,14 +159,14 @@ class Covariance:
         return self.matrix / np.outer(stds, stds)
 
     def widened(self, directions):
-        """Return the covariance where elements move farther along directions, one error long.
+        """Return the covariance where elements move farther, along directions.
 
-        ``directions`` has the element and the direction, (n,), of each. What another has widened
-        enough before stays.
+        ``directions`` has the element, its error and the direction, (n,), of each. What another has
+        widened enough before stays.
         """
         variances, rows = np.diag(self.matrix).copy(), []
-        for i, direction in sorted(directions, key=lambda one: -abs(one[1][one[0]])):
-            lacking = direction[i] ** 2 - variances[i]
+        for i, error, direction in sorted(directions, key=lambda one: -abs(one[1])):
+            lacking = error**2 - variances[i]
             if lacking > 0:
                 rows.append(direction * np.sqrt(lacking) / abs(direction[i]))
                 variances += rows[-1] ** 2
