@@ -510,19 +510,18 @@ class Probes:
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
         seen = self.problem.flickering[i], self.problem.fluxes[i]
         # differences see the flicker of the lamp, sums do not
-        by_channel = [self._detected(channel, sweep, fluxes) for fluxes in seen]
+        usual = self.model.context.flux
+        by_channel = [self._detected(channel, sweep, fluxes, usual) for fluxes in seen]
         weights = channel.slopes(sweep)
         for kind in by_channel[0]:
             pairs = zip(weights, (changes[kind] for changes in by_channel), strict=True)
             yield kind, np.stack([a * one + b * other for (a, b), (one, other) in pairs])
 
     @staticmethod
-    def _detected(channel, sweep, fluxes):
-        """Return what each kind adds to the fluxes of both beams."""
+    def _detected(channel, sweep, fluxes, usual):
+        """Return what each kind adds to the fluxes of both beams, for a usual one of all data."""
         right, left = sweep.fluxes
         single = channel.groups is not None
-        # half the usual flux of both beams, whether both have light or one
-        usual = np.median(fluxes[0]) / 2 if single else np.median(fluxes)
         # light that is added counts as much as the source gives in the frame, in these units
         added = (1 + single) * usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")

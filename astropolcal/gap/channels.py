@@ -24,6 +24,9 @@ __all__ = []
 
 _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
+# the mean square of so many degrees beyond that of the drift is larger than that of all by this
+# factor in one of forty lamps whose flicker is white, and in nearly all that wander
+_SLOW, _WANDERS = 8, 2.0
 # a flicker below this is not told to what depends on the flux
 _LARGE_FLICKER = 0.1
 # a single beam of fewer standard deviations than this is no datum
@@ -183,10 +186,15 @@ class _Lamp:
         seen = (weight > 0).any(axis=0)
         self.sequence = 2 * sequence - 1
         self.degree = _best_degree(self.sequence, common, seen, saturating)
-        columns = np.concatenate([self._curve(self.degree), saturating], axis=1)
-        square, rank = _left_over(columns[seen], common[seen])
+        (square, rank), (fast, more) = (
+            _left_over(np.concatenate([self._curve(k), saturating], axis=1)[seen], common[seen])
+            for k in (self.degree, self.degree + _SLOW)
+        )
         freedom = int(seen.sum()) - rank
         scatter = square / freedom if freedom > 0 else 0.0
+        slow = (square - fast) / max(more - rank, 1)
+        # a lamp that wanders is not white: what is slow, as causes are, must not exceed its noise
+        scatter = slow if slow > _WANDERS * scatter else scatter
         #: Standard deviation of the flicker, in the logarithm of the flux.
         self.flicker = float(np.sqrt(max(scatter - np.mean(var[seen]), 0.0)))
         self.color = self._best_color(centred - common, weight)

@@ -568,7 +568,11 @@ def _simple(state, found, fitted, instead):
     named = [one for one in few if one.is_named and one.evidence > _FAR_PROMISE * best]
     few = [one for one in few if one.evidence > _HALF * best]
     few = _distinct(few, _FITTED[1]) + _distinct(named, _FITTED[1])
-    new = _new(state, {one.name: one for one in few}.values(), fitted, instead)
+    # a name also where it was fitted with a freer law, which costs more than two simple ones
+    same = {(one.chosen[0].name, one.chosen[0].rank) for one in fitted}
+    few = {one.name: one for one in few if (one.name, one.rank) not in same}
+    dear = [one for one in fitted[1:] if one.is_dear and one.chosen[0].is_named]
+    new = _new(state, few.values(), [one for one in fitted if one not in dear], instead)
     # what derivatives ask a law for may be in the second order
     constant = found.constant(fitted[0].chosen[0])
     constant = constant and _extended(state, (constant,), instead)

@@ -38,7 +38,7 @@ def spread(probes):
     return cells + [Cell(*key, text) for key in detected for text in probes.dependences_of(*key)]
 
 
-def differences(model, cell):
+def differences(model, cell, dataset=0):
     """Return the slope of both channels to each function of a cell, by central differences."""
     edited = model.edited((CellEffect(cell, 0), None))
     problem, (parameters,) = edited.problem, edited.added.values()
@@ -48,7 +48,7 @@ def differences(model, cell):
         for sign in (1, -1):
             moved = problem.start.copy()
             moved[row] += sign * EPS
-            ends.append(problem.differences(moved)[0])
+            ends.append(problem.differences(moved)[dataset])
         # the gap is the observed less the predicted
         yield (ends[1] - ends[0]) / (2 * EPS)
 
@@ -86,6 +86,18 @@ def test_derivative_of_every_cell_is_that_of_the_chain_with_its_optic(name):
             assert scale == pytest.approx(1, abs=0.1), cell.name
             error = np.linalg.norm(other - scale * one) / max(np.linalg.norm(other), 1.0)
             assert error < (0.01 if detector else 1e-5), cell.name
+
+
+def test_what_a_detector_does_is_the_same_in_runs_of_any_flux():
+    """A background of both has one size, as the optic that is fitted, however bright a lamp is."""
+    model = data.fitted([data.observed(), data.observed(flux=3e6, seed=2, name="bright")])
+    probes = Probes(model)
+    for kind in ("background", "background_of_one_beam", "nonlinearity", "persistence"):
+        (dependence, *_), scales = probes.dependences_of("detector", kind), []
+        for i, slope in probes.slopes["detector", kind].items():
+            (expected,) = differences(model, Cell("detector", kind, dependence), i)
+            scales.append(np.sum(slope * expected) / np.sum(slope**2))
+        assert scales == pytest.approx([1, 1], abs=0.02), kind
 
 
 def test_places_are_met_in_the_order_of_the_light():

@@ -194,6 +194,23 @@ def test_flicker_is_that_of_the_lamp():
         assert found == pytest.approx(true, rel=0.35, abs=2e-4)
 
 
+def test_a_lamp_that_wanders_makes_no_step():
+    """A step of the brightness in a random walk stands out no more than one in white flicker."""
+    sigma, frames, found = np.full((2, W, 96), 5e-4), np.arange(96), []
+    steps = np.zeros((94, 2, W, 96))
+    steps[:, 1] = (frames >= frames[1:-1, None])[:, None]
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        residual = sigma * rng.normal(size=sigma.shape)
+        residual[1] += np.cumsum(rng.normal(0, 0.005, 96))
+        channel = channels_of(*np.full((2, 96, W), 1e6))
+        channel.set_noise(sigma, residual, np.zeros((96, 0)))
+        white, seen = (channel.whiten(one).reshape(-1, sigma.size) for one in (steps, residual))
+        found.append(np.max((white @ seen[0]) ** 2 / np.sum(white**2, axis=1)))
+    # the best of so many steps in white noise
+    assert max(found) < 2 * np.log(len(steps))
+
+
 def test_what_optics_do_to_the_sums_is_no_flicker():
     wave = np.cos(np.linspace(0, 60, F))
     without = lamp_of(0.05 * wave)
