@@ -77,8 +77,7 @@ def _angle_off(name, place, title, dependence, shows):
     return Effect(
         name, f"{title} of the {optic}", place, "orientation", dependence, NUMBER,
         shows=shows.format(optic), reference=_HOLSTEIN, words=f"stage of the {optic}",
-        category="parameter", **_size(0.1, 5, u.deg),
-    )  # fmt: skip
+        category="parameter", **_size(0.1, 5, u.deg))  # fmt: skip
 
 
 _BACKLASH = "backlash", "direction:own", "opposite offsets of the {} after moves to either side"
@@ -90,8 +89,7 @@ def _transmission(name, n, title):
         name, title, _PLATE, (), optics.HarmonicGain(harmonic=n), _WAVES, _size(0.003, 0.1),
         f"harmonic {n} of the plate angle in sums, none in differences",
         "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023", degree=NUMBER,
-        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)),
-    )  # fmt: skip
+        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)))  # fmt: skip
 
 
 _NO_RETARDER = optics.LinearRetarder(retardance=0 * u.deg)
@@ -173,13 +171,9 @@ _DEROTATOR_EFFECTS = [
     _effect("derotator_diattenuation", "diattenuation of the derotator",
         _DEROTATOR, "diattenuation_h", optics.Diattenuator(), "diattenuation", _size(0.005, 0.2),
         "harmonic 2 of the derotator angle, constant with the plate", _HOLSTEIN),
-    *(
-        _encoder(
-            name, n, _DEROTATOR, "van Holstein et al. 2020",
-            "rotation of Q and U with the derotator angle, the same at all wavelengths",
-        )
-        for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)
-    ),
+    *(_encoder(name, n, _DEROTATOR, "van Holstein et al. 2020",
+        "rotation of Q and U with the derotator angle, the same at all wavelengths")
+      for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)),
     _angle_off("derotator_backlash", _DEROTATOR, *_BACKLASH),
     # for internal sources the derotator is static during an exposure: bench data would tie the
     # lag to a rate that they do not have
@@ -322,8 +316,7 @@ def _detected(name, title, kind, size, shows, reference, **more):
     place = _SPLITTER if kind == "background" else _DETECTOR
     return _effect(
         name, title, place, (), optic, free, size, shows, reference,
-        near=(_DETECTOR, (kind,), DETECTED[kind]), **settings, **_AT_DETECTOR, **more,
-    )  # fmt: skip
+        near=(_DETECTOR, (kind,), DETECTED[kind]), **settings, **_AT_DETECTOR, **more)  # fmt: skip
 
 
 _DETECTOR_EFFECTS = [
@@ -349,8 +342,7 @@ _HALF_DEGREE, _TEN_DEGREES = _size(0.5, 5, u.deg), _size(1, 10, u.deg)
 def _held(name, where, kind, size, shows, how="which the model holds fixed"):
     return _effect(
         name, f"orientation of the {where.said}, {how}", where, kind, None, "theta", size, shows,
-        _HOLSTEIN, cls=laws.Held, category="parameter",
-    )  # fmt: skip
+        _HOLSTEIN, cls=laws.Held, category="parameter")  # fmt: skip
 
 
 def _bound(name, what, where, kind, size, free="theta"):
@@ -358,8 +350,7 @@ def _bound(name, what, where, kind, size, free="theta"):
         name, f"{what} of the {where.said} beyond its bound", where, kind, None, free, size,
         "along the derivative to the parameter that is at its bound",
         "residual of a constrained fit; Nocedal & Wright 2006, chapter 12",
-        cls=laws.Held, category="bound",
-    )  # fmt: skip
+        cls=laws.Held, category="bound")  # fmt: skip
 
 
 _HELD_EFFECTS = [
@@ -404,8 +395,7 @@ def _followed(name, title, shows, *factors, needs="parallactic"):
     return _turned(
         name, f"half-wave plate that {title}", "plate", laws.following(*factors),
         f"everywhere on sky: the polarization turns with {shows}", reference=_SIGNS,
-        when=lambda roles: getattr(roles, needs) is not None,
-    )  # fmt: skip
+        when=lambda roles: getattr(roles, needs) is not None)  # fmt: skip
 
 
 _STAGES = {"hwp": _PLATE, "derotator": _DEROTATOR}
@@ -420,22 +410,14 @@ def _misread(name, title, shows, rate, what, *stages):
 
 # a table that is a frame ahead has the angle before the last move, a late one that after the next
 _MISREAD = [
-    *(
-        _misread(
-            f"{name}_{when}", f"angle of the {{}} that stands one frame too {when} in the table",
-            "differences of all frames before and after a move", rate, what, *stages,
-        )
-        for name, stages in {"hwp": ["hwp"], "derotator": ["derotator"], "angles": _STAGES}.items()
-        for when, rate, what in (("early", -1.0, "_move"), ("late", 1.0, "_next"))
-    ),
-    *(
-        _misread(
-            f"{stage}_{name}", f"angle of the {{}} that is {words} in the table",
-            "everywhere: the polarization turns at another rate", rate, "", stage,
-        )
-        for name, words, rate in (("doubled", "twice as large", -0.5), ("halved", "halved", 1.0))
-        for stage in _STAGES
-    ),
+    *(_misread(f"{name}_{when}", f"angle of the {{}} that stands one frame too {when} in the table",
+        "differences of all frames before and after a move", rate, what, *stages)
+      for name, stages in {"hwp": ["hwp"], "derotator": ["derotator"], "angles": _STAGES}.items()
+      for when, rate, what in (("early", -1.0, "_move"), ("late", 1.0, "_next"))),
+    *(_misread(f"{stage}_{name}", f"angle of the {{}} that is {words} in the table",
+        "everywhere: the polarization turns at another rate", rate, "", stage)
+      for name, words, rate in (("doubled", "twice as large", -0.5), ("halved", "halved", 1.0))
+      for stage in _STAGES),
 ]  # fmt: skip
 
 _ALTERNATIVES = [
@@ -483,10 +465,8 @@ LIBRARY = (
 
 #: What may differ between several runs, in each of which it is asked for.
 OF_RUNS = [
-    _angle_off(
-        f"{name}_zero", place, "zero of the angle", OWN_RUN,
-        "all frames of one run, as an offset of the {}",
-    )
+    _angle_off(f"{name}_zero", place, "zero of the angle", OWN_RUN,
+        "all frames of one run, as an offset of the {}")
     for name, place in _STAGES.items()
 ]  # fmt: skip
 # of any axis, which is one optic and two or three cells
