@@ -433,8 +433,7 @@ def accuracies(model, cross_validate=True):
         "targets": [],
     }
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropolcalWarning)
+        with warnings.catch_warnings(action="ignore", category=AstropolcalWarning):
             made = model.calibration
             calibration = (
                 with_causes(model, held=True, cross_validate=cross_validate, instrument=instrument)
