@@ -429,9 +429,8 @@ def _off_the_drift(channel, gap):
     """
     sigma = channel.sigma[1]
     table = np.where(channel.valid & np.isfinite(sigma), gap, np.nan)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         # a frame that is masked at all wavelengths has no median
-        warnings.simplefilter("ignore", RuntimeWarning)
         common = np.nanmedian(table - np.nanmedian(table, axis=1, keepdims=True), axis=0)
         # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared; some
         # frames may be noisier than others

@@ -501,9 +501,8 @@ def nominal_calibration(chains, observations):
     if not measurement.free.size:
         # every parameter is held: the chains as they are
         return SimpleNamespace(converged=True, measurement=measurement, chains=measurement.chains)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=AstropolcalWarning):
         # a model that lacks something is expected to fit badly; the report says how badly
-        warnings.simplefilter("ignore", AstropolcalWarning)
         instrument = next((o.instrument for o in observations if o.instrument), None)
         return fitted(measurement, instrument=instrument)
 

@@ -434,8 +434,7 @@ def accuracies(model, cross_validate=True):
         "targets": [],
     }
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropolcalWarning)
+        with warnings.catch_warnings(action="ignore", category=AstropolcalWarning):
             made = model.calibration or _with_causes_held(model, instrument)
             tables = made.accuracies(cross_validate=cross_validate)
             # what is not known of the causes is not known on sky

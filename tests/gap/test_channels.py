@@ -6,15 +6,13 @@ from types import SimpleNamespace
 import gap_data as data
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.gap.channels import (
     Channels,
     _best_degree,
     _Lamp,
-    _left_over,
-    _mean,
     orthonormal,
 )
 from astropolcal.measurement import Measurement
@@ -273,25 +271,3 @@ def test_brightness_follows_what_is_certain_and_the_drift_elsewhere():
         small.brightness(np.zeros(F), np.full(F, 1e9)) + 0.1 * flicker.mean(),
         atol=1e-6,
     )
-
-
-# ---- small things --------------------------------------------------------------------------
-
-
-def test_weighted_mean():
-    values = np.array([[1.0, 2.0], [3.0, 9.0]])
-    weight = np.array([[1.0, 0.0], [2.0, 0.0]])
-    # weights are one over sigma: 1 and 4 after squaring; nothing is known of the second
-    np.testing.assert_allclose(_mean(values, weight, axis=0), [13 / 5, 0.0])
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 999), st.integers(1, 4))
-def test_squares_that_columns_leave(seed, k):
-    rng = np.random.default_rng(seed)
-    columns, values = rng.normal(size=(12, k)), rng.normal(size=12)
-    basis = np.linalg.qr(columns)[0]
-    expected = values @ values - np.sum((basis.T @ values) ** 2)
-    assert _left_over(columns, values) == (pytest.approx(expected), k)
-    # two equal columns are one
-    assert _left_over(np.repeat(columns, 2, axis=1), values)[1] == k
