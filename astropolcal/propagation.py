@@ -230,7 +230,7 @@ class Sweep:
 
         ``wanted`` are pairs, index of the optic and of its parameter, the keys of what is
         returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns),
-        or several in front of these axes. A dictionary ``crossings`` receives what the method of
+        or several along a first axis. A dictionary ``crossings`` receives what the method of
         that name returns.
         """
         result, by_optic, rates = {}, {}, self._rates()

@@ -182,14 +182,14 @@ def _flux(problem):
 
 def _sequence(data, terms, null):
     """Take in patterns while they are significant; return one row a pattern, and the null's."""
-    # normal equations once: taking a term in is then a sweep of a small matrix, no fit
-    gram, target, slices = _normal_equations(data, [*terms, null])
-    total, freedom, own = data.total, data.n_freedom, slices.pop()
+    # normal equations once: taking a term in is then a sweep of small matrices, no fit
+    equations = _Equations(data, [*terms, null])
+    total, freedom = data.total, data.n_freedom
     # the null channel holds other patterns and is no rival to them
-    whole = _test(gram, target, own, total, freedom)
+    whole = equations.test(-1, total, freedom)
     taken, left = [], list(range(len(terms)))
     while left:
-        tested = {i: _test(gram, target, slices[i], total, freedom) for i in left}
+        tested = {i: equations.test(i, total, freedom) for i in left}
         best = _simplest(terms, tested, max(left, key=lambda i: tested[i].evidence))
         rates = false_discovery([np.exp(tested[i].log_p) for i in left])
         small = tested[best].excess < _LEAST_SHARE * data.scale
@@ -197,10 +197,7 @@ def _sequence(data, terms, null):
             break
         one = tested[best]
         taken.append((terms[best], one))
-        # the normal equations of the others beside it
-        along = gram[:, slices[best]] @ one.inverse_root
-        target = target - along @ (one.inverse_root.T @ target[slices[best]])
-        gram = gram - along @ along.T
+        equations.take(best, one.inverse_root)
         total, freedom = total - one.statistic, freedom - one.rank
         left.remove(best)
     # what a few patterns explain is a better measure of a small gap than the sum of squares
@@ -235,31 +232,65 @@ def _simplest(terms, tested, best):
     )
 
 
-def _normal_equations(data, terms):
-    """Return Gram matrix and right side of the columns of all terms, less the tangent space.
+class _Equations:
+    """Normal equations of the columns of terms, less the tangent space, and less terms taken in.
 
-    Whitening mixes neither datasets nor channels, so that the matrix is made
-    block by block and the columns are never all there at once.
+    The Gram matrix of all of them is never made: each term has that of its own columns, and what
+    two have in common is worked out where one of them is taken in. Whitening mixes neither datasets
+    nor channels, so that the columns are never all there at once either.
     """
-    edges = np.cumsum([0] + [sum(len(p) for p in term.parts) for term in terms])
-    gram, target = np.zeros((edges[-1],) * 2), np.zeros(edges[-1])
-    seen = np.zeros((data.tangent.shape[1], edges[-1]))
-    for i, (rows, channel) in enumerate(zip(data.segments, data.problem.channels, strict=True)):
-        for c in range(2):
-            here, where = [], []
-            for term, start in zip(terms, edges, strict=False):
-                if term.channel == c and len(term.parts[i]):
-                    start += sum(len(p) for p in term.parts[:i])
-                    where.append(np.arange(start, start + len(term.parts[i])))
-                    here.append(_unit(channel, c, term.parts[i]))
-            if not here:
-                continue
-            columns, where = np.concatenate(here), np.concatenate(where)
-            own = np.arange(rows.start, rows.stop).reshape(channel.shape)[c].ravel()
-            gram[np.ix_(where, where)] = columns @ columns.T
-            target[where] = columns @ data.residual[own]
-            seen[:, where] = data.tangent[own].T @ columns.T
-    return gram - seen.T @ seen, target, [slice(*pair) for pair in pairwise(edges)]
+
+    def __init__(self, data, terms):
+        self.data, self.terms, self._along = data, terms, []
+        edges = np.cumsum([0] + [sum(len(p) for p in term.parts) for term in terms])
+        self.slices = [slice(*pair) for pair in pairwise(edges)]
+        self.target = np.zeros(edges[-1])
+        self._seen = np.zeros((data.tangent.shape[1], edges[-1]))
+        self.own = [np.zeros((n, n)) for n in np.diff(edges)]
+        for k, _, where, rows, columns in self._columns():
+            start = self.slices[k].start
+            inside = slice(where.start - start, where.stop - start)
+            self.own[k][inside, inside] = columns @ columns.T
+            self.target[where] = columns @ data.residual[rows]
+            self._seen[:, where] = data.tangent[rows].T @ columns.T
+        self._less(self._seen.T)
+
+    def _columns(self, like=None):
+        """Yield number, dataset, place, rows and columns of each part of a term, as of one term."""
+        places = zip(self.data.segments, self.data.problem.channels, strict=True)
+        for i, (rows, channel) in enumerate(places):
+            size = channel.shape[1] * channel.shape[2]
+            for k, term in enumerate(self.terms):
+                c, n = term.channel, len(term.parts[i])
+                if n and (like is None or c == like.channel):
+                    start = self.slices[k].start + sum(len(part) for part in term.parts[:i])
+                    own = slice(rows.start + c * size, rows.start + (c + 1) * size)
+                    yield k, i, slice(start, start + n), own, _unit(channel, c, term.parts[i])
+
+    def _less(self, along):
+        """Take directions, (n_columns, n), out of the Gram matrix of each term."""
+        for gram, where in zip(self.own, self.slices, strict=True):
+            gram -= along[where] @ along[where].T
+
+    def test(self, k, total, freedom):
+        """Return the test of a term."""
+        return _test(self.own[k], self.target[self.slices[k]], total, freedom)
+
+    def take(self, k, root):
+        """Take a term in: the equations of the others beside it; ``root`` whitens its columns."""
+        term, own = self.terms[k], self.slices[k]
+        pairs = enumerate(zip(term.parts, self.data.problem.channels, strict=True))
+        mine = {i: _unit(c, term.channel, part) for i, (part, c) in pairs if len(part)}
+        along = np.zeros((len(self.target), own.stop - own.start))
+        edges = np.cumsum([0] + [len(part) for part in term.parts])
+        for _, i, where, _, columns in self._columns(term):
+            if i in mine:
+                along[where, edges[i] : edges[i + 1]] = columns @ mine[i].T
+        for before in (self._seen.T, *self._along):
+            along -= before @ before[own].T
+        self._along.append(along @ root)
+        self.target = self.target - self._along[-1] @ (root.T @ self.target[own])
+        self._less(self._along[-1])
 
 
 def _unit(channel, c, part):
@@ -285,13 +316,13 @@ class _Tested:
         return self.statistic - self.rank
 
 
-def _test(gram, target, where, total, freedom):
+def _test(gram, target, total, freedom):
     # columns had unit length before model and lamp were taken out: an eigenvalue is what is left
     # of it
-    values, vectors = np.linalg.eigh(gram[where, where])
+    values, vectors = np.linalg.eigh(gram)
     keep = values > _ABSORBED
     root = vectors[:, keep] / np.sqrt(values[keep])
-    statistic, rank = float(np.sum((root.T @ target[where]) ** 2)), int(keep.sum())
+    statistic, rank = float(np.sum((root.T @ target) ** 2)), int(keep.sum())
     if not rank or freedom <= rank:
         return _Tested(0.0, 0, root, 0.0, -np.inf)
     # what the others leave is no noise either where a gap is large

@@ -75,7 +75,7 @@ class FrozenNormal:
         return 1.0 * self.args[1]
 
     def support(self):
-        """Return where the density is not zero, NaN where this is no distribution."""
+        """Return where the density is not zero, NaN for a standard deviation that cannot be."""
         end = np.where(self.std() > 0, np.inf, np.nan)
         return self.mean() - end, self.mean() + end
 

@@ -19,10 +19,14 @@ from gap_data import (
 from scipy import stats
 
 from astropolcal import optics
+from astropolcal.calibration.identifiability.linearized import orthonormal
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.residuals import (
+    _Equations,
     _simplest,
+    _terms,
+    _Whitened,
     badly_separated,
     frame_blocks,
     frame_patterns,
@@ -83,11 +87,30 @@ def test_corrected_values_are_never_below_single_ones(noise):
 
 def test_expected_squares_of_labels_add_up():
     model = clean_model()
-    from astropolcal.gap.residuals import _Whitened
-
     data = _Whitened(model)
     label = np.arange(model.problem.n_rows) % 3
     assert data.freedom(label, 3).sum() == pytest.approx(data.n_freedom, rel=1e-9)
+
+
+def test_what_a_pattern_that_is_taken_in_explains_no_other_does():
+    """Against the columns of all patterns at once, which are never made, in two datasets."""
+    model = fitted([observed(seed=1), observed(seed=2, name="again")])
+    data, terms = _Whitened(model), [*_terms(model)[0][::7], _terms(model)[1]]
+    equations, basis = _Equations(data, terms), data.tangent
+    table = np.zeros((len(data.residual), equations.slices[-1].stop))
+    for _, _, where, rows, columns in equations._columns():
+        table[rows, where] = columns.T
+    for taken in (None, 4, 0):
+        if taken is not None:
+            left = table - basis @ (basis.T @ table)
+            own = left[:, equations.slices[taken]]
+            equations.take(taken, equations.test(taken, 1e4, 100).inverse_root)
+            basis = np.concatenate([basis, orthonormal(own)], axis=1)
+        left = table - basis @ (basis.T @ table)
+        for gram, own in zip(equations.own, equations.slices, strict=True):
+            np.testing.assert_allclose(gram, left[:, own].T @ left[:, own], atol=1e-9)
+            pull = left[:, own].T @ data.residual
+            np.testing.assert_allclose(equations.target[own], pull, atol=1e-6)
 
 
 # ---- planted gaps --------------------------------------------------------------------------

@@ -152,7 +152,7 @@ def _known_and_free(calibration):
 def _reasons(calibration, known, free, on_sky=((), ())):
     """Return why a calibration is not usable, and whether something must be wrong.
 
-    ``on_sky`` is what is said of the sky, before and after what orientations hang on.
+    ``on_sky`` are the reasons on sky, those before and those after the orientations at a bound.
     """
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [_nothing(calibration), _angles(calibration, free)]

@@ -106,12 +106,11 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
     if not np.isfinite(problem.noise):
         # as many data as parameters tell no noise, against which a prior could weigh
         problem.noise = 0.0
-    without, begin = _without(problem) if len(members) > _MANY else None, _begin(problem)
+    fits = len(members) <= _MANY
+    beside = (_begin if fits else _without)(problem)
     for out in steps(members, "groups left out"):
-        if without is not None:
-            predicted, blind = without(out)
-        else:
-            start, blind = begin(out)
+        # where a fit of the others starts, or what a step without one predicts
+        found, blind = beside(out)
         if groups is not None and blind.any():
             share = np.abs(_undetermined(problem, out)[0] / measurement.free.steps)
             slots = measurement.free.slots
@@ -120,13 +119,12 @@ def cross_validated_residuals(measurement, weights=None, groups=None):
                 f"cross-validation: without group {labels[out[0]]} ({out.size} data) the others do "
                 f"not determine {listed(moved, most=_MOST_NAMES)}; group by something else"
             )
-        if without is None:
+        if fits:
             counts = np.ones(measurement.n_data)
             counts[out] = 0.0
-            fitted, _, _ = problem.fit(start, counts)
-            predicted = measurement.residuals(fitted)[out]
+            found = measurement.residuals(problem.fit(found, counts)[0])[out]
         # along what the others leave open the fit still stands where all data have put it
-        held_out[out] = np.where(blind, np.nan, predicted)
+        held_out[out] = np.where(blind, np.nan, found)
     return held_out
 
 
@@ -158,7 +156,7 @@ def _without(problem):
 
 
 def _begin(problem):
-    """Return what says where a fit without a group starts, and which of its data others leave open.
+    """Return what says where a fit without a group starts, and which data only the group tells of.
 
     It starts a step of linear algebra from the fit of all data, where that leads down.
     """
@@ -174,7 +172,7 @@ def _begin(problem):
     def begin(out):
         own = root[out]
         values, axes = np.linalg.eigh(own.T @ own)
-        if values[-1] > _MOSTLY:
+        if values.max(initial=0.0) > _MOSTLY:
             # the others may determine nothing
             return solution, _undetermined(problem, out)[1]
         # normal equations in coordinates in which those of all data are the unit matrix
