@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from astropolcal.correction.frames import DEROTATOR_LIMIT, ScienceFrames
-from astropolcal.correction.result import Corrected
+from astropolcal.correction.result import Corrected, impossible
 from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
 from astropolcal.correction.systematic import check_choices, linear_systematic, sampled_systematic
@@ -164,7 +164,7 @@ def correct(
         one wavelength from others; they disagree by more than all errors allow for; variances as
         weights follow the measured fluxes; combinations
         of Stokes parameters are poorly determined at some wavelengths; the calibration does not
-        determine how they change; or it is old.
+        determine how they change; it is old; or a spectrum is polarized by more than 100 %.
 
     Examples
     --------
@@ -214,7 +214,7 @@ def correct(
     n = len(components)
     known = {key: getattr(solution, key) for key in _OF_SOLUTION}
     known |= {key: getattr(frames, key) for key in _OF_FRAMES}
-    return Corrected(
+    result = Corrected(
         stokes=found[:n],
         covariance=found[n:] if len(found) > n else None,
         systematic=systematic,
@@ -224,6 +224,10 @@ def correct(
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
+    # of images single pixels are noise
+    if found.ndim == 2 and (words := impossible(result.polarization())):
+        warn(f"{words}: too little of I, as of a background that was subtracted twice, or angles")
+    return result
 
 
 def _of_errors(systematic, by_variance, source):

@@ -232,6 +232,19 @@ def test_frames_that_disagree_beyond_all_errors_are_told(calibration, star, char
                 assert all(odd in one for one in found), (odd, found)
 
 
+def test_a_spectrum_polarized_by_more_than_all_of_it_is_told(star, sky, charis, seen, track):
+    positions = track(1)[1]
+    for degree, odd in ((0.99, False), (1.2, True)):
+        light = star.stokes[:1] * [[1], [degree], [0]]
+        fluxes = seen(sky, positions, charis.wavelength, light)
+        frames = ScienceFrames.from_arrays(*fluxes, charis.wavelength, positions)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            correct(sky, frames)
+        found = [str(one.message) for one in told]
+        assert any("polarized by 120 %" in one for one in found) == odd, (degree, found)
+
+
 def test_offsets_only_leaves_the_crosstalk(disk_frames, sky, charis):
     stokes = disk_frames[0]
     whole = correct(sky, frames_of(disk_frames, charis))
