@@ -487,7 +487,11 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     def frame(file):
         x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
         found = Frame(file, values={"hwp": 0.0})
-        found.photometry = SimpleNamespace(x=x, y=x + 15.0, fwhm=np.full(x.shape, 4.0))
+        found.photometry = SimpleNamespace(x=x, y=x + 15.0, fwhm=x, failed=np.zeros(3, dtype=bool))
+        # what most slices do not show stands at zero
+        if "2_cube" in file:
+            found.photometry.x[:, :2] = found.photometry.y[:, :2] = 0.0
+            found.photometry.failed[:2] = True
         return found
 
     monkeypatch.setattr(frame_files, "_survey", lambda files, *_: [frame(file) for file in files])
