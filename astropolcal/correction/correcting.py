@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from astropolcal.correction.frames import DEROTATOR_LIMIT, ScienceFrames
-from astropolcal.correction.result import Corrected
+from astropolcal.correction.result import Corrected, impossible
 from astropolcal.correction.rows import RowModel, ideal_chain, sky_chain
 from astropolcal.correction.solve import CHANNELS, Channels, covariance_index, estimator
 from astropolcal.correction.systematic import check_choices, linear_systematic, sampled_systematic
@@ -31,6 +31,8 @@ MODES = ("stokes", "ip")
 _LEAKS = 0.3
 # by how much, and how many times its scatter, a frame is brighter at one wavelength than at others
 _UNEVEN, _BEYOND = 0.05, 10.0
+# times the stated errors, from which on an error that the scatter of the frames shows is told
+_BEYOND_ERRORS = 3.0
 # what a result keeps of the solution and of the frames
 _OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
 _OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
@@ -159,9 +161,10 @@ def correct(
     AstropolcalWarning
         If the calibration is not usable, as its verdict says; the frames have no pairs, or some
         have none, where pairs are to be fitted; their brightness cannot be measured, or differs at
-        one wavelength from others; variances as weights follow the measured fluxes; combinations
+        one wavelength from others; they disagree by more than all errors allow for; variances as
+        weights follow the measured fluxes; combinations
         of Stokes parameters are poorly determined at some wavelengths; the calibration does not
-        determine how they change; or it is old.
+        determine how they change; it is old; or a spectrum is polarized by more than 100 %.
 
     Examples
     --------
@@ -198,8 +201,11 @@ def correct(
         "max_condition": max_condition,
         "labels": frames.names,
     }
+    given = frames
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
+    # of an ideal instrument frames are off for that alone
+    unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
     unmeasured += _of_errors(systematic, by_variance, frames.source)
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
@@ -208,7 +214,7 @@ def correct(
     n = len(components)
     known = {key: getattr(solution, key) for key in _OF_SOLUTION}
     known |= {key: getattr(frames, key) for key in _OF_FRAMES}
-    return Corrected(
+    result = Corrected(
         stokes=found[:n],
         covariance=found[n:] if len(found) > n else None,
         systematic=systematic,
@@ -218,6 +224,10 @@ def correct(
         provenance=_provenance(calibration, frames, systematic, provenance),
         **known,
     )
+    # of images single pixels are noise
+    if found.ndim == 2 and (words := impossible(result.polarization())):
+        warn(f"{words}: too little of I, as of a background that was subtracted twice, or angles")
+    return result
 
 
 def _of_errors(systematic, by_variance, source):
@@ -360,6 +370,54 @@ def _uneven(frames):
         f"{100 * apart[w, f]:+.2g} %, which changes q and u of all pixels there; mask cosmic rays "
         "and bad pixels (NaN)"
     ]
+
+
+def _disagreement(solution, frames, systematic):
+    """Say that the light of the frames is off the solution by more than the errors allow for."""
+    light, noise = map(np.nan_to_num, frames._light)
+    stokes, channels = np.nan_to_num(solution.apply(light)), solution.channels
+    off = light - np.einsum("bwfs,sw->bfw", solution.rows[..., : len(stokes)], stokes)
+    # of the difference of the beams: the brightness of a frame takes up their sum
+    shares = CHANNELS["single" if channels.observable == "intensity" else channels.observable][0]
+    off = np.einsum("bk,buk...->u...", shares, off[:, channels.units])
+    spread = np.einsum("bk,buk...->u...", shares**2, noise[:, channels.units])
+    used = solution.weights[0].T > 0
+    free = used.sum(axis=0) - (len(stokes) - 1)
+    free -= 0 if frames.groups is None else len(np.unique(frames.groups))
+    # a wavelength at which a frame has no light, or no error, tells nothing
+    seen = (noise > 0).all(axis=0)[channels.units].all(axis=1)
+    good = (free > 0) & (stokes[0] > 0) & (seen | ~used).all(axis=0)
+    good &= solution.determined[:, :3].all(axis=1)
+    if not good.any():
+        return []
+    bright, used, n = stokes[0, good], used[:, good], good.sum()
+    share = np.where(used, off[:, good] / bright, 0.0)
+    spread = np.where(used, spread[:, good] / bright**2, 1.0)
+    # of q and u: what noise does, and the calibration, the same at all wavelengths
+    own = np.einsum("wkbf,bfw->kw", solution.gain[:, 1:3] ** 2, noise)[:, good] / bright**2
+    known = 0.0
+    if systematic is not None:
+        known = [systematic.covariance(stokes[:, w], w) for w in np.flatnonzero(good)]
+        known = np.diagonal(known, axis1=1, axis2=2)[:, 1:3].T / bright**2
+        known = np.nan_to_num(known, posinf=0.0).mean()
+    means = (each.mean(axis=1, keepdims=True) for each in (share, spread / n))
+    for off, noise, least, number, of in (
+        (share, spread, own.mean(), free[good].sum(), ""),
+        (*means, own.mean() / n, free[good].min(), ", in the mean of the wavelengths"),
+    ):
+        square = (off**2 / noise).sum(axis=1)
+        # what the scatter beyond chance makes of the error by noise
+        found = max(square.sum() - 4 * np.sqrt(2 * number), 0.0) / number * least
+        if found > _BEYOND_ERRORS**2 * (least + known):
+            worst = [str(frames.names[i]) for i in channels.units[np.argmax(square)]]
+            return [
+                "the frames disagree: differences of their beams are "
+                f"{100 * np.sqrt((off**2).sum() / number):.2g} % of I off the solution, "
+                f"{np.sqrt(square.sum() / number):.2g} times their noise{of}, most those of "
+                f"{' and '.join(worst)}; q and u may be wrong by {100 * np.sqrt(found):.2g} %, "
+                f"and their errors, {100 * np.sqrt(least + known):.2g} %, are too small"
+            ]
+    return []
 
 
 def _rows(model, rows, frames, mode):

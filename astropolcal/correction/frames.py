@@ -3,6 +3,7 @@
 
 import warnings
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import astropy.units as u
 import numpy as np
@@ -156,10 +157,16 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
+        fluxes = self._light[0]
+        return replace(self, scale=frame_brightness(rows, fluxes, self.groups, **settings))
+
+    @cached_property
+    def _light(self):
+        """The light of both beams in the whole image and its variance, (2, n_frames, n_waves)."""
         shape = (2, self.source.n_frames, self.source.n_wavelengths)
-        fluxes, inside = np.empty(shape), _circle(self.source.image_shape)
+        (light, noise), inside = np.empty((2, *shape)), _circle(self.source.image_shape)
         for w in range(shape[2]):
-            fluxes[:, :, w], missing = self._totals(w, inside)
+            light[:, :, w], noise[:, :, w], missing = self._totals(w, inside)
             if missing is None:
                 continue
             # what one frame lacks is left out of all, or they would seem to differ
@@ -167,13 +174,14 @@ class ScienceFrames:
                 common = inside.copy()
                 common[inside] = ~missing.any(axis=0)
                 if common.any():
-                    fluxes[:, :, w] = self._totals(w, common)[0]
-        return replace(self, scale=frame_brightness(rows, fluxes, self.groups, **settings))
+                    light[:, :, w], noise[:, :, w], _ = self._totals(w, common)
+        # of turned images the variances are those without what neighbours have in common
+        return light, noise / getattr(self.source, "resampling", 1.0)
 
     def _totals(self, w, pixels):
-        """Return the light of both beams in some pixels, NaN for none; and which lack, or None."""
+        """Return the light of both beams in some pixels, NaN for none, its variance, which lack."""
         totals, weights = np.empty((2, self.source.n_frames)), pixels.astype(float)
-        missing = None
+        noise, missing = np.full(totals.shape, np.nan), None
         for frames in self.source.batches():
             for beam in (0, 1):
                 found = self.source.fluxes(beam, frames, slice(w, w + 1))
@@ -181,6 +189,8 @@ class ScienceFrames:
                     # a bad pixel that says so must not count as light
                     known = self.source.variances(beam, frames, slice(w, w + 1))
                     found = np.where(np.isfinite(known), found, np.nan)
+                    known = np.where(np.isfinite(found), known, 0.0)
+                    noise[beam, frames] = known.reshape(len(found), -1) @ weights
                 found = found.reshape(len(found), -1)
                 with np.errstate(invalid="ignore"):
                     sums = found @ weights
@@ -192,7 +202,7 @@ class ScienceFrames:
                     sums = np.where(lacks, 0.0, found).sum(axis=1)
                     sums[lacks.all(axis=1)] = np.nan
                 totals[beam, frames] = sums
-        return totals, None if missing is None else missing.reshape(-1, missing.shape[2])
+        return totals, noise, None if missing is None else missing.reshape(-1, missing.shape[2])
 
     @classmethod
     def from_arrays(

@@ -479,6 +479,13 @@ def polarization(q, u, errors):
     return result
 
 
+def impossible(known):
+    """Return in words that a `polarization` is above 100 % beyond its errors, else ""."""
+    errors = np.hypot(*(np.nan_to_num(known[f"s_p_{kind}"], posinf=np.inf) for kind in _KINDS))
+    beyond = known["dolp"][known["dolp"] - 3 * errors > 1]
+    return f"polarized by {100 * beyond.max():.3g} %, which no light is" if beyond.size else ""
+
+
 def _errors(q, u, dolp, error):
     """Return the errors along and across the direction of polarization."""
     s_q, s_u = error["q"], error["u"]

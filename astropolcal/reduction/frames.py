@@ -481,13 +481,18 @@ def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=N
     _warn_of_doubts(files, found)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
-        centre = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
+        centre = [_place(f.photometry) for f in found]
         seen = np.isfinite(np.asarray(centre)).all(axis=(1, 2))
         if not seen.all():
             bad = files[int(np.argmin(seen))]
             raise ObservationError(f"{bad}: the star was not found{ways['centre']}")
     detectors = [_detectors(*both, layout) for both in zip(files, found, strict=True)]
     return _angles(found), centre, _brightness(files, found, detectors), detectors
+
+
+def _place(photometry):
+    """Return the place of the star in each beam, (n_beams, 2), of the slices that show it."""
+    return np.median(np.stack([photometry.x, photometry.y])[:, :, ~photometry.failed], axis=2).T
 
 
 def _detectors(file, frame, layout):

@@ -114,8 +114,9 @@ class Detector:
         # without noise of the read-out zero is what no light gives
         if not (self.read_noise > 0 and zero.any()):
             return np.zeros_like(zero)
-        # a single one may be chance, in whole numbers
-        return ndimage.binary_opening(zero, np.ones((*[1] * (zero.ndim - 2), 3, 3)))
+        # in whole numbers few may be chance, but not nine together, in a block or a line
+        shapes = ((*[1] * (zero.ndim - 2), *shape) for shape in ((3, 3), (1, 9), (9, 1)))
+        return np.any([ndimage.binary_opening(zero, np.ones(one)) for one in shapes], axis=0)
 
     def counts_in(self, unit):
         """Return whether another BUNIT is that of the data, or does not say."""

@@ -471,6 +471,8 @@ def _summary(result, star, arguments, n_frames):
 
 def _words(summary, systematic, arguments):
     """Return what was done, the star within the aperture, and how well both are determined."""
+    from astropolcal.correction.result import impossible
+
     # not finite where nothing was determined
     condition = summary["condition"][np.isfinite(summary["condition"])]
     lines = [
@@ -508,6 +510,9 @@ def _words(summary, systematic, arguments):
     elif lost:
         verdict = f"NOT USABLE AS IT IS: the calibration does not determine {' and '.join(lost)}"
         advice = "calibrate with a polarized standard star, or --open-directions SIGMA"
+    elif wrong := impossible(star):
+        verdict = f"NOT USABLE AS IT IS: the star is {wrong}"
+        advice = "whether a background was subtracted twice, and the angles, in the cubes"
     elif faults := summary.get("calibration_faults"):
         verdict = f"NOT USABLE AS IT IS: the calibration is not: {faults[0]}"
         advice = common.following("info", summary["calibration"])

@@ -3,6 +3,8 @@
 
 import copy
 import dataclasses
+import re
+import warnings
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -169,12 +171,11 @@ def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
 
 
 @pytest.mark.slow
-def test_errors_stay_apart(calibration, star, charis, track):
+def test_errors_stay_apart(calibration, star, charis, seen, track):
     hwp, positions = track()
     variance = np.full(star.right.shape, 100.0)
     frames = ScienceFrames.from_arrays(
-        star.right,
-        star.left,
+        *seen(calibration, positions, charis.wavelength, star.stokes),
         charis.wavelength,
         positions,
         hwp=hwp,
@@ -193,6 +194,55 @@ def test_errors_stay_apart(calibration, star, charis, track):
         assert (table[name] > 0).all()
     assert (table["dolp_debiased"] < table["dolp"]).all()
     assert table["s_chi_systematic"].unit == u.deg
+
+
+def test_frames_that_disagree_beyond_all_errors_are_told(calibration, star, charis, seen, track):
+    """One of another target, angles that are wrong, a gain; not noise, clouds or a lost slice."""
+    hwp, positions = track(2)
+    positions = positions | {"derotator": np.repeat([55, 62, 70, 77], 2) * u.deg}
+    known = calibration, positions, charis.wavelength
+    clean = seen(*known, star.stokes)
+    other, gain, faint = clean.copy(), clean.copy(), clean.copy()
+    other[:, 2] = seen(*known, star.stokes * [[1], [-3], [6]])[:, 2]
+    gain[0, 5] *= 1.02
+    faint *= np.linspace(0.3, 1, 8)[:, None]
+    faint[:, 3, 7] = np.nan
+    turned = positions | {"derotator": positions["derotator"] + np.repeat([0, 30], 4) * u.deg}
+    rng, words = np.random.default_rng(3), "the frames disagree: .* q and u may be wrong by"
+    for fluxes, where, odd in (
+        (clean, positions, ""),
+        (faint, positions, ""),
+        (other, positions, "frame 2"),
+        (gain, positions, "frame 5"),
+        (clean, turned, "frame"),
+    ):
+        noisy = fluxes + np.sqrt(np.nan_to_num(fluxes)) * rng.standard_normal(fluxes.shape)
+        right, left = noisy
+        variances = dict(zip(("variance_right", "variance_left"), fluxes, strict=True))
+        frames = ScienceFrames.from_arrays(
+            right, left, charis.wavelength, where, hwp=hwp, **variances
+        )
+        for observable in ("single", "double"):
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                correct(calibration, frames, observable=observable)
+            found = [str(one.message) for one in told if re.search(words, str(one.message))]
+            assert len(found) == bool(odd), (odd, observable, found)
+            if observable == "single":
+                assert all(odd in one for one in found), (odd, found)
+
+
+def test_a_spectrum_polarized_by_more_than_all_of_it_is_told(star, sky, charis, seen, track):
+    positions = track(1)[1]
+    for degree, odd in ((0.99, False), (1.2, True)):
+        light = star.stokes[:1] * [[1], [degree], [0]]
+        fluxes = seen(sky, positions, charis.wavelength, light)
+        frames = ScienceFrames.from_arrays(*fluxes, charis.wavelength, positions)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            correct(sky, frames)
+        found = [str(one.message) for one in told]
+        assert any("polarized by 120 %" in one for one in found) == odd, (degree, found)
 
 
 def test_offsets_only_leaves_the_crosstalk(disk_frames, sky, charis):

@@ -316,6 +316,8 @@ def test_what_measures_nothing_is_no_light_of_a_star(small, tmp_path):
     (x, y, _), lost = places[1], cube.copy()
     lost[0, int(y) - 3 : int(y) + 3, int(x) + 6 : int(x) + 12] = 0.0
     lost[1, int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = 0.0
+    lost[2, :, int(x) + 1] = 0.0
+    lost[3, int(y) + 9] = 0.0
     top = 0.8 * cube.max()
     # a dark and a flat leave few pixels equal
     flat = fits.PrimaryHDU(np.random.default_rng(1).normal(1.0, 0.02, (201, 201)))
@@ -328,13 +330,13 @@ def test_what_measures_nothing_is_no_light_of_a_star(small, tmp_path):
         (np.minimum(cube, top), {}, full),
         (np.rint(np.minimum(cube, top)), {}, full),
         (np.minimum(cube, top), {"masters": masters}, full),
-        (lost, {}, ["", "aperture masked", "", ""]),
+        (lost, {}, ["", "aperture masked", "aperture masked", ""]),
     ]):  # fmt: skip
         path = write_cube(tmp_path / f"CRSA{i:08d}.fits", made)
         found = reduce_frame(path, small.files, source="star", **options).photometry
         assert found.reasons == reasons, i
         if reasons != full:
-            np.testing.assert_allclose(found.flux[0, [0, 2, 3]], 1e6, rtol=5e-3, err_msg=i)
+            np.testing.assert_allclose(found.flux[0, [0, 3]], 1e6, rtol=5e-3, err_msg=i)
     # nor is a lamp without noise cut off, or one of few electrons
     lamp = np.random.default_rng(2).poisson(2.0, (4, 201, 201)).astype(float)
     for i, made in enumerate([np.full((4, 201, 201), 300.0), lamp], start=10):

@@ -15,10 +15,10 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from astropolcal import Calibration, calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.converters.calibration import content_hash
-from astropolcal.correction import Corrected
+from astropolcal.correction import Corrected, ScienceFrames, correct, measurement_rows
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.pipeline import tasks
 from astropolcal.pipeline.library import Library
@@ -143,6 +143,25 @@ def test_a_product_is_not_usable_where_its_calibration_is_not(night, tmp_path, c
     # what it leaves open is in the errors, of which the user may know better
     command(*words, night / "charis.asdf", "--open-directions", "ignore")
     assert "\nUsable" in capsys.readouterr().out
+
+
+def test_light_polarized_by_more_than_all_of_it_is_not_usable():
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    chain = chain | optics.WollastonPrism(name="wollaston")
+    positions = {"hwp": [0, 45, 22.5, 67.5] * u.deg}
+    told = {"calibration": "a.asdf", "calibration_hash": "", "calibration_faults": []}
+    arguments = SimpleNamespace(output="out.fits", spectrum=None, plot=None, json=None, full=False)
+    arguments.radius, arguments.size = 2.0, 5
+    for degree, verdict in (
+        (0.99, "Usable"),
+        (1.8, "NOT USABLE AS IT IS: the star is polarized by 180 %, which no light is"),
+    ):
+        beams = measurement_rows(chain, positions, [1.6] * u.um) @ [1e3, 1e3 * degree, 0, 0]
+        images = np.moveaxis(beams, 1, 2)[..., None, None] * np.ones((5, 5))
+        frames = ScienceFrames.from_arrays(*images, [1.6] * u.um, positions)
+        result = correct(chain, frames, provenance=told)
+        summary = _correct._summary(result, result.aperture(2.0), arguments, 4)
+        assert any(verdict in line for line in _correct._words(summary, None, arguments)), degree
 
 
 @pytest.mark.slow
@@ -468,7 +487,11 @@ def test_star_that_is_not_found_names_the_file(monkeypatch):
     def frame(file):
         x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
         found = Frame(file, values={"hwp": 0.0})
-        found.photometry = SimpleNamespace(x=x, y=x + 15.0, fwhm=np.full(x.shape, 4.0))
+        found.photometry = SimpleNamespace(x=x, y=x + 15.0, fwhm=x, failed=np.zeros(3, dtype=bool))
+        # what most slices do not show stands at zero
+        if "2_cube" in file:
+            found.photometry.x[:, :2] = found.photometry.y[:, :2] = 0.0
+            found.photometry.failed[:2] = True
         return found
 
     monkeypatch.setattr(frame_files, "_survey", lambda files, *_: [frame(file) for file in files])
