@@ -164,7 +164,7 @@ def test_health_says_what_needs_care(folder):
     for options in ({"goal": -1}, {"max_age": 3 * u.m}, {"goal": "high"}):
         with pytest.raises(
             ParameterError,
-            match="one positive number, of %|not convertible to d|not a number|needs a unit",
+            match=r"one positive number, of %|not convertible to d|not a number|needs a unit",
         ):
             health(folder, **options)
     for events, words in ((["soon"], "is not a date"), (["2022-03-01"] * 2, "two of one date")):

@@ -948,7 +948,7 @@ def test_unknown_and_positional_arguments_are_refused(label):
         cls(thetta=1 * u.deg)
     with pytest.raises(ParameterError, match=r"by keyword: \('theta'"):
         cls(1 * u.deg)
-    with pytest.raises(ParameterError, match="parameter of .* = 'retardence'"):
+    with pytest.raises(ParameterError, match=r"parameter of .* = 'retardence'"):
         cls().with_parameters(retardence=1 * u.deg)
 
 

@@ -91,12 +91,12 @@ class BinProblem(Problem):
         self.elements = np.array(starts, dtype=int)[:, None] + np.arange(self.n_bins)
         self._below, self._above = self._low[self.elements], self._high[self.elements]
         self._own = np.isin(np.arange(self._low.size), self.elements)
-        #: Priors that enter the costs of the bins, with the slot of each.
+        rows = {s.name: [k for k, own in enumerate(self.slots) if own is s] for s in slots}
+        #: Priors that enter the costs of the bins, with the rows of each.
         self.priors = [
-            (row, prior)
+            (rows[slot.name], prior)
             for slot, prior in measurement.free.priors
-            for row, own in enumerate(self.slots)
-            if own.name == slot.name and not prior.is_flat
+            if slot.name in rows and not prior.is_flat
         ]
 
     def of_bins(self, vector):
@@ -111,8 +111,10 @@ class BinProblem(Problem):
     def costs(self, vector):
         """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
         costs = 0.5 * np.sum(self.of_bins(vector) ** 2, axis=1)
-        for row, prior in self.priors:
-            costs += 0.5 * (self.noise * prior.residual(vector[self.elements[row]])) ** 2
+        for rows, prior in self.priors:
+            # one row of all bins, or the rows of the only bin
+            residual = self.noise * prior.residual(vector[self.elements[rows]].ravel())
+            costs += 0.5 * np.sum(residual.reshape(len(rows), -1) ** 2, axis=0)
         return costs
 
     # where no light passes there is no slope, and the step is taken back
@@ -129,11 +131,12 @@ class BinProblem(Problem):
         residual = self.of_bins(vector)
         normal = blocks @ np.swapaxes(blocks, 1, 2)
         gradient = np.einsum("bsd,bd->bs", blocks, residual)
-        for row, prior in self.priors:
-            value = vector[self.elements[row]]
+        for rows, prior in self.priors:
+            value = vector[self.elements[rows]].ravel()
             slope = self.noise * prior.slope(value)
-            normal[:, row, row] += slope**2
-            gradient[:, row] += slope * self.noise * prior.residual(value)
+            along = slope * self.noise * prior.residual(value)
+            normal[:, rows, rows] += (slope**2).reshape(len(rows), -1).T
+            gradient[:, rows] += along.reshape(len(rows), -1).T
         here = vector[self.elements]
         held = (
             ((here <= self._below) & (gradient.T > 0)) | ((here >= self._above) & (gradient.T < 0))
@@ -225,7 +228,7 @@ class BinProblem(Problem):
         """
         keys = [slot.name.split(".")[1] for slot in self.slots]
         rows = [row for row, key in enumerate(keys) if key in (_LINEAR, *_ELLIPTICAL[:2])]
-        known = [row for row, _ in self.priors]
+        known = [row for own, _ in self.priors for row in own]
         turns = [keys[row] == _LINEAR and row not in known for row in rows]
         return self.elements[rows], np.array(turns, dtype=bool)
 
@@ -631,7 +634,8 @@ def least_bent(problem, branches, ratio, origin):
     """
     places, turns = problem.phases()
     # what priors hold near a centre may have either sign beside each other
-    loose = ~np.isin(places[:, 0], [problem.elements[row, 0] for row, _ in problem.priors])
+    known = [row for own, _ in problem.priors for row in own]
+    loose = ~np.isin(places[:, 0], problem.elements[known, 0])
     if loose.any():
         places, turns = places[loose], turns[loose]
     # (n_bins, n_branches, n_phases)
