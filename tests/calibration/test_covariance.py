@@ -241,15 +241,16 @@ def test_a_prior_tells_no_more_than_its_width(make):
         assert float(known[key]) == pytest.approx(std, rel=0.05), law.name
 
 
-def test_widened_along_a_direction(make):
-    """The element is as long as its direction; one that is shorter adds nothing."""
-    cal = calibrate(make.chain(fixed=True), make.observe(make.truth(make.chain())))
-    before = cal.covariance
-    way = np.zeros(len(before))
-    way[:2] = 3 * before.stds[0], -before.stds[1]
-    wide = before.widened([(0, way[0], way), (0, way[0] / 2, way)])
-    assert wide.stds[0] == pytest.approx(3 * before.stds[0])
-    np.testing.assert_allclose(wide.stds[2:], before.stds[2:])
+def test_widened_along_a_direction():
+    """Of two that turn together the sum is as long as its way, and the difference stays known."""
+    # a third that is known well, and moves where the way bends
+    rows = np.array([[3, 3, 0], [0, 0.01, 0], [0, 0, 0.1]])
+    before = Covariance(list("abc"), [u.deg] * 3, rows.T @ rows, factor=rows)
+    way = np.array([1.0, 1.0, 0.5])
+    wide = before.widened([(0, 4.0, way), (0, 2.0, way), (1, -3.0, -way)])
+    assert wide.stds[0] == pytest.approx(4)
+    assert wide.propagate([1, -1, 0]) ** 0.5 == pytest.approx(0.01, rel=0.1)
+    assert wide.stds[2] == pytest.approx(np.hypot(0.1, 0.5))
     np.testing.assert_allclose(np.diag(wide.factor.T @ wide.factor) ** 0.5, wide.stds)
     assert np.linalg.eigvalsh(wide.matrix - before.matrix).min() > -1e-12
-    assert before.widened([(0, way[0] / 9, way)]) == before
+    assert before.widened([(0, 2.9, way)]) == before

@@ -159,21 +159,23 @@ class Covariance:
         return self.matrix / np.outer(stds, stds)
 
     def widened(self, directions):
-        """Return the covariance where elements move farther, along directions.
+        """Return the covariance where elements move farther, along ways that bend.
 
-        ``directions`` has the element, its error and the direction, (n,), of each. What another has
-        widened enough before stays.
+        ``directions`` has the element, its error and by how much its way is beyond the straight
+        one, (n,), of each. What another has widened enough before stays.
         """
-        variances, rows = np.diag(self.matrix).copy(), []
-        for i, error, direction in sorted(directions, key=lambda one: -abs(one[1])):
-            lacking = error**2 - variances[i]
-            if lacking > 0:
-                rows.append(direction * np.sqrt(lacking) / abs(direction[i]))
-                variances += rows[-1] ** 2
-        if not rows:
-            return self
+        variances = np.diag(self.matrix).copy()
         steps = np.array([declared_step(unit) for unit in self.units])
-        rows = np.vstack([self.factor, *rows]) / steps
+        rows, count = self.factor / steps, len(self.factor)
+        for i, error, beyond in sorted(directions, key=lambda one: -abs(one[1])):
+            lacking = error**2 - variances[i]
+            # an element that is known exactly has no straight way
+            if lacking > 0 and variances[i] > 0:
+                more = _beyond(rows, i, abs(error) / steps[i], beyond / steps)
+                rows = np.vstack([rows, *more])
+                variances += np.square(more * steps).sum(axis=0)
+        if len(rows) == count:
+            return self
         _, sizes, right = np.linalg.svd(rows, full_matrices=False)
         factor, matrix = sizes[:, None] * right * steps, np.full(self.matrix.shape, np.nan)
         known = np.ix_(*(np.flatnonzero(np.isfinite(variances)),) * 2)
@@ -250,6 +252,18 @@ class Covariance:
         sigmas = np.linalg.norm(factor, axis=1)
         known = factor / np.where(sigmas > 0, sigmas, 1.0)[:, None]
         return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
+
+
+def _beyond(rows, i, error, beyond):
+    """Return the two rows with which an element has an error, and others that of a way that bends.
+
+    What moves with the element moves as much farther. What else the way does, as it bends, is
+    no more to one side than to the other.
+    """
+    straight = rows.T @ rows[:, i] / np.linalg.norm(rows[:, i])
+    longer = straight / straight[i]
+    bent = straight + beyond * (error - straight[i]) / beyond[i] - error * longer
+    return [np.sqrt(error**2 - straight[i] ** 2) * longer, bent]
 
 
 def same_content(a, b):
