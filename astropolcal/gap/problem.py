@@ -18,6 +18,7 @@ from astropolcal.chain import Train, leaves
 from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
+from astropolcal.measurement.parameters import bind_prior
 from astropolcal.optics import StarSource
 from astropolcal.optics.positions import FLUXES
 
@@ -59,9 +60,10 @@ def _mounted(chains):
     """Return mean and standard deviation, radian, of the angles of what is mounted with care."""
     found = {}
     for leaf in (leaf for chain in chains for leaf in chain):
-        prior = leaf.theta.prior
-        if prior is not None and leaf.mount is None and not leaf.theta.fixed:
-            found[f"{leaf.name}.theta"] = np.deg2rad(prior.mean()), np.deg2rad(prior.std())
+        angle, name = leaf.theta, f"{leaf.name}.theta"
+        if angle.prior is not None and leaf.mount is None and not angle.fixed:
+            prior = bind_prior(angle.prior, name, angle.unit, angle.bounds)
+            found[name] = prior.mode * prior.factor, prior.width
     return found
 
 

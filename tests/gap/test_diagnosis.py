@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from gap_setups import SETUPS
+from scipy.stats import norm
 from sky_data import held
 from star_data import WAVELENGTH, observe_star, star_chain
 
-from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal import Calibration, Normal, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
@@ -88,6 +89,23 @@ def test_clean_data_have_no_gap(make):
     assert found.held_out == []
     assert found.gap_before_percent == found.gap_after_percent
     assert found.gap_before_percent == pytest.approx(found.noise_floor_percent, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_prior_with_units_is_that_of_scipy():
+    """Of the angle of what is mounted, free or held at another value."""
+    window = optics.LinearRetarder(retardance=3 * u.deg, theta=10 * u.deg, name="window")
+    truth = insert_optic(data.chain(), window, after="hwp")
+    observed, found = data.observed(truth), []
+    for prior in (Normal(10 * u.deg, 0.5 * u.deg), norm(10, 0.5)):
+        for fixed, angle in ((False, 10), (True, 5)):
+            nominal = truth.copy()
+            theta = nominal["window"].theta
+            theta.value, theta.fixed, theta.prior = angle, fixed, prior
+            made = diagnose(nominal, observed, effects=["static_retarder"], **QUICK)
+            found.append([(one.name, one.probability) for one in made.causes])
+    assert found[0] == found[2] == []
+    assert found[1] == found[3] != []
 
 
 @pytest.mark.slow

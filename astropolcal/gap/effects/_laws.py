@@ -11,6 +11,7 @@ from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
 from astropolcal.gap.effects.effect import NUMBER, Edit, Effect, EffectParameter
 from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
+from astropolcal.measurement.parameters import bind_prior
 from astropolcal.observations.pointings import TRACKING
 from astropolcal.units import to_unit
 
@@ -344,13 +345,14 @@ class Held(Effect):
         for key in keys:
             parameter = getattr(fresh, key)
             # where it was held is where the effect is absent
-            known = parameter.prior
-            value = parameter.value if known is None else known.mean()
+            known, name = parameter.prior, f"{optic.name}.{key}"
+            value = parameter.value
+            if known is not None:
+                value = bind_prior(known, name, parameter.unit, parameter.bounds).mode
             value = u.Quantity(value, parameter.unit or u.one)
             possible = getattr(type(optic), key).bounds if self.is_bounded else (None, None)
             parameter.bounds = around(parameter, self.limit, possible)
             parameter.fixed, parameter.prior = False, None
-            name = f"{optic.name}.{key}"
             found.append(EffectParameter(name, self.scale, self.limit, law, value))
         return fresh, found
 
