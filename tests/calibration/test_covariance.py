@@ -254,3 +254,10 @@ def test_widened_along_a_direction():
     np.testing.assert_allclose(np.diag(wide.factor.T @ wide.factor) ** 0.5, wide.stds)
     assert np.linalg.eigvalsh(wide.matrix - before.matrix).min() > -1e-12
     assert before.widened([(0, 2.9, way)]) == before
+    # two ways of one length, up to rounding
+    rng = np.random.default_rng(0)
+    for rows in rng.normal(size=(300, 40, 3)):
+        many = Covariance(list("abc"), [u.mm] * 3, rows.T @ rows, factor=rows)
+        error = many.stds[0] * rng.uniform(1.1, 2)
+        twice = many.widened([(0, error, way), (0, -error, -way)])
+        assert twice.stds[0] == pytest.approx(error)

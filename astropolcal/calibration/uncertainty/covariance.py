@@ -24,8 +24,8 @@ from astropolcal.measurement.parameters import declared_step, step_of
 
 __all__ = ["Covariance"]
 
-# share of both standard errors by which a covariance may differ from its transpose: far above
-# rounding, and too little to change anything
+# share of the squares of standard errors by which a covariance may differ from its transpose, or
+# an error from another: far above rounding, and too little to change anything
 _ASYMMETRY = 1e-6
 # directions that no residual pulls keep this share of the largest error, so that they stay known
 _LEAST = 1e-6
@@ -168,9 +168,8 @@ class Covariance:
         steps = np.array([declared_step(unit) for unit in self.units])
         rows, count = self.factor / steps, len(self.factor)
         for i, error, beyond in sorted(directions, key=lambda one: -abs(one[1])):
-            lacking = error**2 - variances[i]
-            # an element that is known exactly has no straight way
-            if lacking > 0 and variances[i] > 0:
+            # an element that is known exactly has no straight way, and rounding is no widening
+            if error**2 > variances[i] * (1 + _ASYMMETRY) > 0:
                 more = _beyond(rows, i, abs(error) / steps[i], beyond / steps)
                 rows = np.vstack([rows, *more])
                 variances += np.square(more * steps).sum(axis=0)
