@@ -469,8 +469,8 @@ class LoadedCalibration:
             )
         if hwp is None and "hwp" not in beams[0].positions:
             raise ParameterError(
-                "hwp = None: no half-wave plate is among the stages, and Q and U of a cube are those "
-                f"of its angles; there are {', '.join(beams[0].positions) or 'none'}"
+                "hwp = None: no half-wave plate, whose angles tell Q from U of a cube, is among "
+                f"the stages; there are {', '.join(beams[0].positions) or 'none'}"
             )
         hwp = beams[0].positions["hwp"] if hwp is None else hwp
         size = len(beams[0].wavelength)
