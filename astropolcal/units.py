@@ -82,10 +82,11 @@ def to_unit(value, unit, name="value", kind=float):
         try:
             return _known(np.asarray(u.Quantity(value).to_value(unit), dtype=kind), value)
         except u.UnitConversionError:
-            raise ParameterError(
-                f"{name} has unit {value.unit}, which is not convertible to "
-                f"{unit if unit.to_string() else 'a plain number'}"
-            ) from None
+            wanted = unit.to_string() or "a plain number"
+            has = f"unit {value.unit}, which is not convertible to {wanted}"
+            if not str(value.unit or ""):
+                has = f"no unit and needs one such as {unit}"
+            raise ParameterError(f"{name} has {has}") from None
     if unit != u.dimensionless_unscaled:
         raise ParameterError(f"{name} = {value!r} needs a unit such as {unit}")
     try:

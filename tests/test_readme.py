@@ -6,7 +6,7 @@ import shlex
 
 import pytest
 
-from astropolcal.scripts.main import build_parser
+from astropolcal.scripts.main import build_parser, main
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,21 @@ def test_one_marked_command_installs_and_tests(readme):
     assert len(marked) == 1
     assert len(marked[0].strip().splitlines()) == 1
     assert 'pip install -q -e ".[test]"' in marked[0]
+
+
+@pytest.mark.slow
+def test_the_first_command_says_what_the_page_says(readme, capsys):
+    command = next(line for line in readme.split("&& ") if line.startswith("astropolcal calibrate"))
+    words = shlex.split(command.splitlines()[0])[1:]
+    words = words[: words.index("--plots")]
+    for options, first in (
+        (words, "NOT USABLE AS IT IS"),
+        ([*words, "--fix", "hwp.theta"], "Usable"),
+    ):
+        assert f"`{first}`" in readme
+        assert main(options) == 0
+        assert f"\n{first}" in capsys.readouterr().out
+    assert "`--fix hwp.theta`" in readme
 
 
 def test_numbers_are_those_of_the_page_on_charis(readme, repository):

@@ -144,6 +144,8 @@ def test_what_is_refused_is_named():
         (lambda: angle_to_rad([1, 2], "theta"), r"theta = \[1, 2\] needs a unit such as rad"),
         (lambda: length_to_um(1.6), r"^wavelength = 1.6 needs a unit such as um$"),
         (lambda: angle_to_rad(1 * u.um, "hwp"), "hwp has unit um, which is not convertible to rad"),
+        (lambda: angle_to_rad([1] * u.one, "hwp"), "^hwp has no unit and needs one such as rad$"),
+        (lambda: angle_to_rad(Column([1]), "hwp"), "^hwp has no unit and needs one such as rad$"),
         (lambda: length_to_um(2 * u.Hz), "wavelength has unit Hz, which is not convertible to um"),
         (lambda: to_unit(1 * u.deg, None, "q"), "q has unit deg, .* convertible to a plain number"),
         (lambda: to_unit("east", None, "q"), "q = 'east' is not a number"),

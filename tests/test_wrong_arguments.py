@@ -19,6 +19,7 @@ from astropolcal.efficiency import best_modulation, polarimetric_efficiency
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.gap.challenge import make_challenge
 from astropolcal.measurement import Measurement
+from astropolcal.observations import Observations
 from astropolcal.reduction import simulate_cubes
 from astropolcal.simulation import half_wave_plate_cycles
 from astropolcal.testing import check_instrument
@@ -48,6 +49,8 @@ def test_arguments_of_the_wrong_type_are_named(run):
             lambda: correct(chain, data),
             lambda: correct(data, chain),
         ],
+        "calibration": [lambda: diagnose("cal.asdf", data), lambda: diagnose([3], data)],
+        "path": [lambda: Observations.read(data.to_table())],
         "the source of calibrations": [lambda: load(3), lambda: Library(None)],
     }
     for name, calls in mistakes.items():

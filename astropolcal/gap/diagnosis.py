@@ -314,6 +314,7 @@ def diagnose(
     observations = as_tables(observations)
     library = _library(effects)
     check_instruments(calibration, observations)
+    chains_of(calibration, observations)
     if changes and not cells:
         raise GapError("what changed between runs is found by cells; ask for them, too")
     observations = distinct(observations, changes)

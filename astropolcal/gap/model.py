@@ -27,6 +27,7 @@ from astropolcal.gap.effects import Context, adapted
 from astropolcal.gap.effects._laws import Misread
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.datasets import check_chains
 from astropolcal.mueller import is_physical
 from astropolcal.observations.pointings import frame_names
 from astropolcal.observations.reading import bins_on_grid, common_wavelengths, nearest_bins
@@ -537,6 +538,7 @@ def chains_of(calibration, observations):
     """Return the chain of each dataset, of a calibration, one for all, or given."""
     chains = calibration.chains if isinstance(calibration, Calibration) else calibration
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    check_chains("calibration", chains, "a calibration, such as Calibration.read(file) gives, or ")
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
     return chains

@@ -35,6 +35,13 @@ def as_tables(observations):
     return tables
 
 
+def check_chains(what, chains, also=""):
+    """Refuse what is not a chain; ``also`` says what else is allowed in its place."""
+    wanted = f"{also}chains of optics are needed, such as instruments.get(name).chain() gives"
+    for one in chains:
+        check_type(what, one, (Model, Train), wanted, ChainError)
+
+
 def refuse_repeated(tables):
     """Refuse tables of the same content: data that count twice would make all errors too small."""
     first = {}
@@ -50,9 +57,7 @@ def refuse_repeated(tables):
 def as_pairs(chain, observations, positions):
     """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
     observations = as_tables(observations)
-    wanted = "chains of optics are needed, such as instruments.get(name).chain() gives"
-    for one in chain if isinstance(chain, (list, tuple)) else [chain]:
-        check_type("chain", one, (Model, Train), wanted, ChainError)
+    check_chains("chain", chain if isinstance(chain, (list, tuple)) else [chain])
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
     positions = [None] * len(observations) if positions is None else list(positions)
     if not observations or len(chains) != len(observations) or len(positions) != len(observations):

@@ -219,9 +219,13 @@ def sky_angles(observations, location=None):
         }
         lacking = [words for words, thing in needed.items() if thing is None]
         if lacking:
+            # angles of a header go by their keywords there
+            called = getattr(observations, "keywords", {})
+            absent = [called.get(n, n) for n, known in zip(names, stated, strict=True) if not known]
             raise ObservationError(
                 f"{observations.name}: a star needs its pointing: columns altitude and "
-                f"parallactic, or all of {', '.join(needed)}; missing: {', '.join(lacking)}"
+                f"parallactic (there is no {' and no '.join(absent)}), or all of "
+                f"{', '.join(needed)}; missing: {', '.join(lacking)}"
             )
         angles = [angle.to_value(u.rad) for angle in pointing(target, time, location)]
     # the stage of that name need not stand at the parallactic angle: what is stated counts

@@ -9,6 +9,7 @@ and columns of Python objects are refused.
 """
 
 import io
+import os
 import re
 import textwrap
 import warnings
@@ -24,6 +25,7 @@ from astropy.table import QTable, Table
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
 from astropolcal.units import iso_date, plain_number, wavelengths_of
+from astropolcal.words import check_type
 
 __all__ = []
 
@@ -36,13 +38,16 @@ _SINGLE = ("single_difference", "single_sum")
 
 def read_ecsv(path):
     """Read an ECSV file into a table without trusting it."""
+    wanted = "it cannot be read; the name of a file is needed, and from_table takes a table"
+    check_type("path", path, (str, os.PathLike), wanted, ObservationError)
     with understood(path, ObservationError, "cannot be read: not a text file of ECSV"):
         # read once: what is checked is what is loaded, even if the file changes meanwhile
         text = Path(path).read_bytes().decode("utf-8")
     # astropy would guess another format, and make one column of it
     if not text.startswith("# %ECSV"):
         raise ObservationError(
-            f"{path}: not an ECSV table; its first line must start with '# %ECSV'"
+            f"{path}: not an ECSV table; its first line must start with '# %ECSV'; "
+            "astropy writes such a file of a QTable with units, by table.write('NAME.ecsv')"
         )
     with understood(path, ObservationError, "not a readable ECSV table"):
         _check_header(path, text)

@@ -131,7 +131,7 @@ class FrameAngles:
             raise ObservationError("no header: at least one frame is needed")
         self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
         self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
-        self._layout = layout
+        self._layout, self.keywords = layout, layout.keywords
         self.n_frames, headers = len(headers), [layout.from_header(header) for header in headers]
         table = QTable({"frame": np.arange(self.n_frames)})
         for column in (c for c in layout.keywords if c not in _OTHERS):

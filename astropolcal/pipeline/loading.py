@@ -467,6 +467,11 @@ class LoadedCalibration:
                 "hwp = None: the position of the half-wave plate is its true angle, which follows "
                 "the sky; the commanded angles are needed, by which the cube was made"
             )
+        if hwp is None and "hwp" not in beams[0].positions:
+            raise ParameterError(
+                "hwp = None: no half-wave plate, whose angles tell Q from U of a cube, is among "
+                f"the stages; there are {', '.join(beams[0].positions) or 'none'}"
+            )
         hwp = beams[0].positions["hwp"] if hwp is None else hwp
         size = len(beams[0].wavelength)
         if given.ndim < 2 or given.shape[0] not in (3, 4) or given.shape[1] != size:

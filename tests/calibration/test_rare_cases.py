@@ -120,6 +120,24 @@ def test_null_of_a_modulator_has_a_level_of_each_state():
 # --- robust fits ----------------------------------------------------------------------------------
 
 
+def test_a_datum_at_odds_at_one_wavelength_is_told_with_it(chain, data):
+    """A cosmic ray in one beam at one wavelength moves the parameters that all share."""
+    table, options = data.to_table(), {"search": False, "cross_validate": False}
+    for row, factor in ((0, 1.0), (7, 2.0), (40, 0.5)):
+        spoiled = table.copy()
+        spoiled["flux_right"][row] *= factor
+        found = calibrate(chain, Observations.from_table(spoiled, name="night"), **options)
+        told = [row for row in outlying_data(found) if np.isfinite(row["wavelength"])]
+        assert len(told) == (factor != 1.0), (row, factor)
+        for one in told:
+            assert str(spoiled["frame"][row]) in one["frames"].split(", ")
+            assert abs(one["wavelength"] - spoiled["wavelength"][row]) < 0.01 * u.nm
+            nm = f"at {one['wavelength'].to_value(u.nm):.5g} nm"
+            for words in (found.summary(), found.summary(full=True)):
+                assert nm in " ".join(words.split()), words
+            assert "at odds" in found.verdict().advice, found.verdict()
+
+
 def test_a_frame_at_odds_is_told_with_its_brightness(chain, data):
     spoiled = _changed(data, 5, 1.3)
     found = calibrate(chain, spoiled, search=False, cross_validate=False, loss="bisquare")

@@ -702,6 +702,16 @@ def test_declarations_that_are_refused():
         Effect.insert(optics.Diattenuator(name="x"))
 
 
+def test_the_degree_of_an_effect_is_checked_when_it_is_declared():
+    for degree in ("x", -1, 1.5, [1]):
+        with pytest.raises(GapError, match=r"effect a: degree = .*; allowed are whole numbers"):
+            Effect("a", "a", "after:hwp", "diattenuation", degree=degree)
+    # of a file, a text that is equal to "number" and not the same object
+    chains, data = clean("beam_gain")
+    written = Effect("a", "a", "after:hwp", "diattenuation", degree="".join(["num", "ber"]))
+    check_effect(written, chains, data)
+
+
 def test_effects_of_ones_own():
     """Declared ones at every sort of place, with every sort of dependence, and inserted ones."""
     chains, data = clean("beam_gain")

@@ -27,6 +27,8 @@ __all__ = ["outlying_data"]
 
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
+# a datum of one wavelength is beyond so many times as many, unless more of the data are fitted away
+_ALONE, _MOST_FITTED = 1.5, 0.5
 # so many times as many data as parameters are fitted by their triangular factor
 _TALL = 10
 # smallest weight, so that no datum is lost altogether
@@ -80,7 +82,8 @@ def outlying_data(calibration, limit=_FAR):
     The residuals of a pair, in units of the robust noise of its wavelength, are reduced to
     their median over the wavelengths, which is what a cloud, a satellite or a wrong angle
     changes. A pair is at odds if this departs by more than ``limit`` robust standard deviations
-    of all pairs of its dataset.
+    of all pairs of its dataset. It is at odds at one wavelength, as a cosmic ray does it, if its
+    datum there departs by more than one and a half times as many.
 
     Parameters
     ----------
@@ -92,9 +95,10 @@ def outlying_data(calibration, limit=_FAR):
     Returns
     -------
     `~astropy.table.QTable`
-        Largest first: ``dataset``, ``frames`` (numbers as text), ``residual`` (median over the
-        wavelengths, percent), ``sigma`` (in robust standard deviations) and ``brightness`` (of
-        the fainter frame, relative to the median frame). Empty if there is none.
+        Largest first: ``dataset``, ``frames`` (numbers as text), ``wavelength`` (NaN of those at
+        odds at all), ``residual`` (there, or median over the wavelengths, percent), ``sigma`` (in
+        robust standard deviations) and ``brightness`` (of the fainter frame, relative to the
+        median frame). Empty if there is none.
 
     Raises
     ------
@@ -120,27 +124,38 @@ def outlying_data(calibration, limit=_FAR):
         raise ParameterError(f"limit = {limit}; allowed are numbers above 0")
     live, rows = calibration.live_measurement(), []
     residuals = live.residuals()
-    scaled = residuals / _scales(live, residuals)
+    scales = _scales(live, residuals)
+    scaled, tells = residuals / scales, live.free.size <= _MOST_FITTED * live.n_data
     for part, where in zip(live.datasets, live.segments, strict=True):
         groups = np.unique(part.group_of_datum)
         members = [where.start + np.flatnonzero(part.group_of_datum == g) for g in groups]
-        # one number a pair of frames, the median over its wavelengths
-        common = np.array([np.median(scaled[own]) for own in members])
-        off = common - np.median(common)
-        # what noise alone gives a median of so many wavelengths
-        least = np.array([1.25 / np.sqrt(own.size) for own in members])
-        spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off)), least)
         bright = brightness(part.observations)
-        for i in np.flatnonzero(np.abs(off) > limit * spread):
-            frames = part.frames[groups[i]]
-            numbers = ", ".join(np.array(frame_names(part.observations.frames))[frames])
-            percent, times = 100 * np.median(residuals[members[i]]), np.abs(off[i]) / spread[i]
-            found = map(float, (percent, times, bright[frames].min()))
-            rows.append((part.observations.name, numbers, *found))
-    rows.sort(key=lambda row: -row[3])
-    names = ("dataset", "frames", "residual", "sigma", "brightness")
-    kinds = (str, str, float, float, float)
-    return QTable(rows=rows or None, names=names, dtype=kinds, units={"residual": u.percent})
+        # few data of a wavelength may have a small scatter by chance
+        floor = np.maximum(scales, np.median(scales[where]))
+        for i, whole in enumerate(_departures(scaled, members)):
+            alone = members[i][np.argmax(np.abs(residuals / floor)[members[i]])]
+            times = abs(residuals[alone]) / floor[alone] * tells
+            if max(whole, times / _ALONE) > limit:
+                own, nm = members[i], np.nan
+                if not whole > limit:
+                    own, nm, whole = alone, 1e3 * live.wavelength[live.bins[alone]], times
+                frames = part.frames[groups[i]]
+                numbers = ", ".join(np.array(frame_names(part.observations.frames))[frames])
+                told = (nm, 100 * np.median(residuals[own]), whole, bright[frames].min())
+                rows.append((part.observations.name, numbers, *map(float, told)))
+    rows.sort(key=lambda row: -row[4])
+    names = ("dataset", "frames", "wavelength", "residual", "sigma", "brightness")
+    units = {"wavelength": u.nm, "residual": u.percent}
+    return QTable(rows=rows or None, names=names, dtype=(str, str, *[float] * 4), units=units)
+
+
+def _departures(scaled, members):
+    """Return by how many robust standard deviations each pair departs at all its wavelengths."""
+    common = np.array([np.median(scaled[own]) for own in members])
+    off = np.abs(common - np.median(common))
+    # what noise alone gives a median of so many wavelengths
+    least = np.array([1.25 / np.sqrt(own.size) for own in members])
+    return off / np.maximum(MAD_TO_SIGMA * np.median(off), least)
 
 
 # ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----

@@ -12,6 +12,7 @@ from astropolcal.calibration.noise.scatter import what_is_left_out
 from astropolcal.calibration.result.verdict import (
     HEIGHT,
     HINT,
+    at_wavelength,
     compact_lines,
     inward_words,
     parameter_lines,
@@ -307,9 +308,9 @@ def _goodness_lines(calibration):
     outliers = calibration.fit.get("outliers") or []
     lines = [f"  - {test['words']}" for test in calibration.fit.get("lack_of_fit") or []]
     lines += [
-        f"  - frames {one['frames']} of {one['dataset']} are at odds with the fit, by "
-        f"{one['residual_percent']:+.2g} % ({one['sigma']:.0f} robust sigma, brightness "
-        f"{one['brightness']:.2f}); they are not left out"
+        f"  - frames {one['frames']} of {one['dataset']} are at odds with the fit"
+        f"{at_wavelength(one)}, by {one['residual_percent']:+.2g} % ({one['sigma']:.0f} "
+        f"robust sigma, brightness {one['brightness']:.2f}); they are not left out"
         for one in outliers[:_MOST_OUTLIERS]
     ]
     more = len(outliers) - _MOST_OUTLIERS

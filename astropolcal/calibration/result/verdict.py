@@ -288,10 +288,10 @@ def _misfit(calibration):
 
 def _suspected(calibration):
     """Ask about the mistake of a table that residuals of more than a percent look like."""
-    if not _worst(calibration, "s_res") > _MAYBE.value:
-        return "why"
     if calibration.fit.get("outliers"):
         return "wrong frames?"
+    if not _worst(calibration, "s_res") > _MAYBE.value:
+        return "why"
     return "why" if calibration.settings.get("observable") == "intensity" else "beams exchanged?"
 
 
@@ -448,6 +448,12 @@ def _next(calibration, free, wrong, sky):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, _more_angles(turning)),
+        (
+            _excess(calibration) > _CLEARLY
+            and calibration.fit.get("outliers")
+            and calibration.settings.get("loss", "linear") == "linear",
+            "the frames at odds: mask them (mask_reason), or --loss bisquare",
+        ),
         ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
         (
@@ -520,7 +526,8 @@ def _fit(calibration):
     for one in outliers[:1]:
         what = "frames" if "," in one["frames"] else "frame"
         more = f"; {len(outliers) - 1} more" if len(outliers) > 1 else ""
-        told = f"{what} {one['frames']} of {one['dataset']}, by {one['sigma']:.0f} robust sigma"
+        told = f"{what} {one['frames']} of {one['dataset']}{at_wavelength(one)}"
+        told += f", by {one['sigma']:.0f} robust sigma"
         yield f"At odds     {told}{more}"
     s_res, s_cv = (_worst(calibration, key) for key in ("s_res", "s_cv"))
     left_out = f", s_cv {s_cv:.2g} %" if np.isfinite(s_cv) else ""
@@ -539,6 +546,12 @@ def _fit(calibration):
         yield f"Predicted   {entry['name']}: {entry['words']}"
     for entry in fit.get("stars", []):
         yield f"Catalogue   {entry['words']}"
+
+
+def at_wavelength(outlier):
+    """Return where frames are at odds with the fit, empty if they are at all wavelengths."""
+    nm = outlier.get("wavelength_nm", np.nan)
+    return f" at {nm:.5g} nm" if np.isfinite(nm) else ""
 
 
 def _worst(calibration, key):

@@ -24,7 +24,7 @@ from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import check_choice, did_you_mean
+from astropolcal.words import check_choice, did_you_mean, is_whole
 
 __all__ = []
 
@@ -304,9 +304,15 @@ class Effect:
         self, name=None, title=None, place=None, kind=None, dependence=None, degree=2, **settings
     ):
         given = {"name": name, "title": title, "where": place, "dependence": dependence}
-        # None is a degree, too
+        whole = is_whole(degree) and degree >= 0
+        if not (whole or degree is None or degree == NUMBER or callable(degree)):
+            raise GapError(
+                f"effect {name}: degree = {degree!r}; allowed are whole numbers from 0 up, "
+                f"{NUMBER!r} and None"
+            )
+        # None is a degree, too; a text from a file is equal to it, not the same
         if degree != 2:
-            self.degree = degree
+            self.degree = NUMBER if degree == NUMBER else degree
         for key, value in (given | settings).items():
             if key not in _SETTINGS:
                 raise GapError(f"effect {name}: no setting {key!r}{did_you_mean(key, _SETTINGS)}")
