@@ -350,9 +350,10 @@ def sharpest(square):
 def outliers(cut, known, weights, detector, factor=_FACTOR):
     """Return the single pixels far off their neighbours, with more than ``factor`` their light."""
     # one pixel in so many tells the level of a rectangle
-    sample = (slice(None), *(index[::5] for index in np.nonzero(weights)))
-    level = _median(cut[sample], known[sample])
-    spread = MAD_TO_SIGMA * _median(np.abs(cut[sample] - level[:, None]), known[sample])
+    sample = np.flatnonzero(weights > 0)[::5]
+    some, seen = (pixels.reshape(len(cut), -1)[:, sample] for pixels in (cut, known))
+    level = _median(some, seen)
+    spread = MAD_TO_SIGMA * _median(np.abs(some - level[:, None]), seen)
 
     def limits(level, spread):
         """Return between which values pixels are like those around them."""
@@ -365,15 +366,23 @@ def outliers(cut, known, weights, detector, factor=_FACTOR):
     kind = np.result_type(cut, np.float32)
     low, high = (limit[:, None, None].astype(kind) for limit in limits(level, spread))
     found = ((cut > high) | (cut < low)) & (weights > 0) & known
-    k, rows, columns = places = np.nonzero(found)
+    # of one axis they are found faster
+    k, rows, columns = np.unravel_index(np.flatnonzero(found), found.shape)
     if k.size:
-        values = np.where(known, cut, np.nan).astype(float)
-        padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+        padded = np.full((len(cut), *np.add(cut.shape[1:], 2)), np.nan)
+        np.copyto(padded[:, 1:-1, 1:-1], cut, where=known)
         steps = [step for step in np.ndindex(3, 3) if step != (1, 1)]
-        around = np.stack([padded[k, rows + y, columns + x] for y, x in steps], axis=1)
+        around = np.stack([padded[k, rows + y, columns + x] for y, x in steps])
+        values = padded[k, rows + 1, columns + 1]
+        # half of the neighbours are at most their median; in most of a star they are too bright
+        dim = (factor * around <= values).sum(axis=0)
+        maybe = (2 * dim >= (~np.isnan(around)).sum(axis=0)) | (values < 0)
+        found[k, rows, columns] = False
+        k, rows, columns, values = k[maybe], rows[maybe], columns[maybe], values[maybe]
+        around = around[:, maybe].T
         low, high = limits(_median(around, ~np.isnan(around)), spread[k])
         # false where no neighbour has a value
-        found[places] = (values[places] > high) | (values[places] < low)
+        found[k, rows, columns] = (values > high) | (values < low)
     return found
 
 
