@@ -342,7 +342,10 @@ def _diagnosed(calibration, observations, library, say, how):
     wrong = suspect_frames(base)
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
-    smooth = _continuous(library, base)
+    runs = [o.name for o in base.observations] if count_runs(base.problem) > 1 else ()
+    smooth = [e for e in adapted(library, base.chains, runs) if e.kind != "discrete"]
+    # and so many wavelengths tell it
+    smooth = [e for e in smooth if e.is_told(len(base.problem.wavelength))]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=how["cells"]):
         wrong = []
 
@@ -382,13 +385,6 @@ def _diagnosed(calibration, observations, library, say, how):
     if how["nested"] and how["cross_validate"]:
         found.nested = _nested(base, smooth, say, how["cells"])
     return found
-
-
-def _continuous(library, base):
-    """Return the effects that a model may lack, and which so many wavelengths can tell."""
-    runs = [o.name for o in base.observations] if count_runs(base.problem) > 1 else ()
-    found = (e for e in adapted(library, base.chains, runs) if e.kind != "discrete")
-    return [e for e in found if e.is_told(len(base.problem.wavelength))]
 
 
 def _without(nominal, base, faults, say):
