@@ -8,14 +8,13 @@ says what stays unexplained.
 """
 
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import expit
 
-from astropolcal import instruments
-from astropolcal.exceptions import GapError, InstrumentError
+from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import ENOUGH, Candidate
 from astropolcal.gap.cells import count_runs
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
@@ -502,14 +501,8 @@ def _library(effects):
 def check_instruments(calibration, observations):
     """Raise GapError if a calibration, or chains, and datasets are not of one instrument."""
     stated = {getattr(one, "instrument", None) for one in (calibration, *observations)} - {None}
-    if len({_called(name) for name in stated}) > 1:
+    if len({getattr(known_instrument(name), "name", name).lower() for name in stated}) > 1:
         raise GapError(f"model or datasets are of different instruments: {listed(sorted(stated))}")
-
-
-def _called(name):
-    with suppress(InstrumentError):
-        name = instruments.get(name).name
-    return name.lower()
 
 
 # ---- conclusion --------------------------------------------------------------------------------
