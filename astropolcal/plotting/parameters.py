@@ -2,6 +2,7 @@
 """Calibrated parameters against wavelength and date, with what is known of their errors."""
 
 import textwrap
+from contextlib import suppress
 from datetime import timedelta
 from itertools import pairwise
 
@@ -10,10 +11,10 @@ import numpy as np
 from astropy.modeling import Parameter
 from astropy.time import Time
 
-from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal import instruments
 from astropolcal.calibration.uncertainty import derived
 from astropolcal.chain import leaves
-from astropolcal.exceptions import ChainError, FitError, ParameterError
+from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
 from astropolcal.pipeline.history import named_by_date, parameter_history, significance
 from astropolcal.plotting import _style as st
 from astropolcal.words import check_choice, counted
@@ -422,8 +423,9 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     tables = [derived.mirror_values(calibration, name) for name in names]
     # an empty dict is a wish to see none
     if reference is None:
-        instrument = known_instrument(calibration.instrument)
-        reference = {} if instrument is None else instrument.published_mirrors()
+        reference = {}
+        with suppress(InstrumentError):
+            reference = instruments.get(calibration.instrument).published_mirrors()
     retards = any("retardance" in table.colnames for table in tables)
     rows = ["diattenuation", "retardance"][: 1 + retards]
     with st.canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows)) as figure:

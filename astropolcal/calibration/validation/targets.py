@@ -14,7 +14,6 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import settings_of, view_of_calibration, weights_of
 from astropolcal.calibration.noise.estimates import mean_of_known, rms
-from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.calibration.validation.cross_validation import (
@@ -413,14 +412,17 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
 
 def _kind(source, chain):
     """Return which of the three calibrations a dataset belongs to, or None."""
-    kind, words = kind_of_source(source), (source or "").lower()
-    if kind == "star":
+    words = (source or "").lower()
+    if "star" in words or "sky" in words:
         # a polarized star does not tell s_sky, as its own
         # polarization is fitted or from a catalogue
         return "on_sky" if "unpolarized" in words else None
-    # a table need not say it: a polarizer in front does
-    is_clear = chain is not None and isinstance(leaves(chain)[0], LinearPolarizer)
-    return kind if is_clear or "polarized" in words else None
+    if "polarized" in words:
+        return "unpolarized" if "unpolarized" in words else "polarized"
+    if chain is None:
+        return None
+    # a table that does not say it; a polarizer in front does
+    return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
 
 
 def _tables_of_kinds(calibration, column):
