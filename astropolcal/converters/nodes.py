@@ -415,12 +415,10 @@ def _restore(optic, key, entry):
         parameter.wavelength = np.array(entry["wavelength"]) * u.um
     if "prior" in entry:
         parameter.prior = prior_from_node(entry["prior"], f"{optic.name}.{key}")
-    if "law" in entry:
-        _restore_law(optic, key, entry["law"])
-
-
-def _restore_law(optic, key, node):
-    label, own = f"{optic.name}.{key}", node["coefficients"]
+    if "law" not in entry:
+        return
+    node, label = entry["law"], f"{optic.name}.{key}"
+    own = node["coefficients"]
     try:
         unit = optic._declared(key).unit
         law, found = law_of(label, unit, node["model"], node["of"], node.get("since"))

@@ -206,7 +206,9 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     # of an ideal instrument frames are off for that alone
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
-    unmeasured += _of_errors(systematic, by_variance, frames.source)
+    unmeasured += [_OPEN] * (systematic is not None and systematic.is_open)
+    # weights by variances that follow the fluxes
+    unmeasured += [_BIASED] * (by_variance and getattr(frames.source, "estimated", False))
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -228,12 +230,6 @@ def correct(
     if found.ndim == 2 and (words := impossible(result.polarization())):
         warn(f"{words}: too little of I, as of a background that was subtracted twice, or angles")
     return result
-
-
-def _of_errors(systematic, by_variance, source):
-    """Say where errors are open, and what weights by variances that follow the fluxes do."""
-    is_open = systematic is not None and systematic.is_open
-    return [_OPEN] * is_open + [_BIASED] * (by_variance and getattr(source, "estimated", False))
 
 
 def _check(frames, mode, weights, *choices):

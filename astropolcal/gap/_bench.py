@@ -147,7 +147,12 @@ class Bench:
         self.law = legvander(x, min(_DEGREE, len(wavelength) - 1))
         self.chains = setup.chains()
         self._free = FreeParameters(self.chains, len(wavelength))
-        self._start = _varied(self._free, self.law, rng)
+        self._start, cut = self._free.start(), {}
+        known = {slot.name for slot, _ in self._free.priors}
+        # a mounting that is known within its error is where it should be
+        for slot in (slot for slot in self._free.slots if slot.name not in known):
+            value = self._start[slot.slice]
+            self._start[slot.slice] = _vary(slot, value, self.law, rng, cut)
         self._free.put_back(self._start)
         self.shuffled = bool(rng.random() < 0.5)
         order = rng.permutation(setup.n_derotator) if self.shuffled else None
@@ -506,17 +511,8 @@ def _channels(flux, bright):
     return np.stack([(flux[0] - flux[1]) / total, np.log(total * bright)])
 
 
-def _varied(free, law, rng):
-    """Return other values of all free parameters, the same in all chains."""
-    vector, cut = free.start(), {}
-    known = {slot.name for slot, _ in free.priors}
-    # a mounting that is known within its error is where it should be
-    for slot in (slot for slot in free.slots if slot.name not in known):
-        vector[slot.slice] = _vary(slot, vector[slot.slice], law, rng, cut)
-    return vector
-
-
 def _vary(slot, value, law, rng, cut):
+    """Return other values of a free parameter, the same in all chains."""
     angle = slot.unit is not None
     if angle and slot.unit.is_equivalent(u.m):
         # two layers that compensate each other are cut together

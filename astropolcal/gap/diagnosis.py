@@ -8,14 +8,13 @@ says what stays unexplained.
 """
 
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import expit
 
-from astropolcal import instruments
-from astropolcal.exceptions import GapError, InstrumentError
+from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import ENOUGH, Candidate
 from astropolcal.gap.cells import count_runs
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
@@ -343,7 +342,10 @@ def _diagnosed(calibration, observations, library, say, how):
     wrong = suspect_frames(base)
     # what has a place depends on the alternative that was taken; the discrete ones were tried.
     # What depends on the last move of a stage shows in a few frames too, and is one cause
-    smooth = _continuous(library, base)
+    runs = [o.name for o in base.observations] if count_runs(base.problem) > 1 else ()
+    smooth = [e for e in adapted(library, base.chains, runs) if e.kind != "discrete"]
+    # and so many wavelengths tell it
+    smooth = [e for e in smooth if e.is_told(len(base.problem.wavelength))]
     if len(wrong) > 1 and explained_by_one(base, smooth, cells=how["cells"]):
         wrong = []
 
@@ -383,13 +385,6 @@ def _diagnosed(calibration, observations, library, say, how):
     if how["nested"] and how["cross_validate"]:
         found.nested = _nested(base, smooth, say, how["cells"])
     return found
-
-
-def _continuous(library, base):
-    """Return the effects that a model may lack, and which so many wavelengths can tell."""
-    runs = [o.name for o in base.observations] if count_runs(base.problem) > 1 else ()
-    found = (e for e in adapted(library, base.chains, runs) if e.kind != "discrete")
-    return [e for e in found if e.is_told(len(base.problem.wavelength))]
 
 
 def _without(nominal, base, faults, say):
@@ -507,14 +502,8 @@ def _library(effects):
 def check_instruments(calibration, observations):
     """Raise GapError if a calibration, or chains, and datasets are not of one instrument."""
     stated = {getattr(one, "instrument", None) for one in (calibration, *observations)} - {None}
-    if len({_called(name) for name in stated}) > 1:
+    if len({getattr(known_instrument(name), "name", name).lower() for name in stated}) > 1:
         raise GapError(f"model or datasets are of different instruments: {listed(sorted(stated))}")
-
-
-def _called(name):
-    with suppress(InstrumentError):
-        name = instruments.get(name).name
-    return name.lower()
 
 
 # ---- conclusion --------------------------------------------------------------------------------

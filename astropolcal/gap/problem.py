@@ -255,7 +255,16 @@ class GapProblem:
         out = np.zeros((self.size, self.n_rows))
         for i, (channel, rows) in enumerate(zip(self.channels, self.segments, strict=True)):
             table = out[:, rows].reshape(self.size, *channel.shape)
-            self._add_slopes(table, channel, i, vector)
+            dataset, flickering = self.datasets[i], self._flickering[i]
+            keys = [key for key, *_ in dataset._live]
+            sums, own = dataset.forward(vector), [slice(None)]
+            sweeps = [sums]
+            if flickering is not None:
+                sweeps, own = [flickering.forward(vector), sums], [slice(0, 1), slice(1, 2)]
+            for some, sweep in zip(own, sweeps, strict=True):
+                slopes = sweep.derivatives(keys, np.swapaxes(channel.slopes(sweep)[some], 0, 1))
+                for key, where, factor, _ in dataset._live:
+                    self._add(table[:, some], where, factor * slopes[key])
             if whitened:
                 channel.whiten(table, out=table)
             else:
@@ -269,20 +278,6 @@ class GapProblem:
         parts = zip(masks, self.channels, strict=True)
         kept = [np.broadcast_to(mask, channel.shape).ravel() for mask, channel in parts]
         return np.concatenate([*kept, np.ones(len(self.known), dtype=bool)])
-
-    def _add_slopes(self, out, channel, number, vector):
-        """Add the derivative of a dataset's channels to a table, (n_coefficients, 2, W, F)."""
-        dataset, flickering = self.datasets[number], self._flickering[number]
-        keys = [key for key, *_ in dataset._live]
-        sums, own = dataset.forward(vector), [slice(None)]
-        sweeps = [sums]
-        if flickering is not None:
-            sweeps, own = [flickering.forward(vector), sums], [slice(0, 1), slice(1, 2)]
-        for channels, sweep in zip(own, sweeps, strict=True):
-            weights = np.swapaxes(channel.slopes(sweep)[channels], 0, 1)
-            slopes = sweep.derivatives(keys, weights)
-            for key, where, factor, _ in dataset._live:
-                self._add(out[:, channels], where, factor * slopes[key])
 
     def _add(self, out, where, slope):
         """Add the derivative to a free value, (channels, W, F), to those to its coefficients."""

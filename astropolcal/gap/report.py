@@ -660,9 +660,7 @@ def _about_frames(diagnosis):
 
 def _prepared(observations):
     """Return a dataset with the masks with which calibrate would take it."""
-    if observations.instrument is None:
-        return observations
-    # of an unknown instrument, or if nothing would be left: calibrate refuses such a table
+    # of no or an unknown instrument, or if nothing would be left: calibrate refuses such a table
     with warnings.catch_warnings(), suppress(AstropolcalError):
         # what is masked is said in our own words
         warnings.simplefilter("ignore", AstropolcalWarning)

@@ -550,6 +550,10 @@ class Instrument(ABC):
         behind = found[start:]
         return join([*self.telescope_optics(behind, **options), *behind])
 
+    def _from_sky(self, chain, **known):
+        """Return the same of what is known of a chain, as far as ``sky_options`` ask for it."""
+        return self.on_sky(chain, **{key: known[key] for key in self.sky_options})
+
     def particulars(self, observations):
         """
         Return options of `chain` that differ between datasets, such as the name of a star.

@@ -156,21 +156,15 @@ def star_source(source, wavelength, name="star", target=None):
             f"{key}{suffix}": (0.0, error * w) for key in "qu" for suffix, w in _smooth(wavelength)
         }
         return _with_priors(name, _middle(wavelength), values)
-    if known:
-        return _polarized_star(known.interstellar(), wavelength, name)
-    zero = np.zeros(wavelength.size)
-    return optics.PolarizedSource(q=zero, u=zero, name=name)
-
-
-def _polarized_star(known, wavelength, name):
-    """Return a star with the interstellar polarization of the catalogue."""
-    middle = _middle(wavelength)
+    if not known:
+        zero = np.zeros(wavelength.size)
+        return optics.PolarizedSource(q=zero, u=zero, name=name)
+    known, middle = known.interstellar(), _middle(wavelength)
     law, errors = known.law, known.errors
-    longest = law.lambda_max.quantity
     departure = _DEPARTURE * law(middle).to_value(u.one)
     values = {
         "p_max": (law.p_max.value, errors["p_max"]),
-        "lambda_max": (longest, errors["lambda_max"]),
+        "lambda_max": (law.lambda_max.quantity, errors["lambda_max"]),
         "K": (law.K.value, errors["K"]),
         "theta": (law.theta.quantity, errors["theta"]),
         "rotation": _rotation(known, wavelength),

@@ -85,14 +85,15 @@ def build_grid(table, label):
     there = set(getattr(table, "colnames", ()))
     single = "flux" in there and not there & {*BEAMS}
     table = check_table(table, label, (*REQUIRED, "flux") if single else (*REQUIRED, *BEAMS))
-    frame = _integers(table, "frame", label)
-    bins = _integers(table, "bin", label)
+    frame, bins = (_integers(table, name, label) for name in ("frame", "bin"))
     wavelength, angles = _positions(table, label)
 
     # first: row in which a frame appears first, for its own columns and for messages
-    _, first, frame_index = np.unique(
-        _each_beam(table, frame) if single else frame, return_index=True, return_inverse=True
-    )
+    number = frame
+    if single and "beam" in table.colnames:
+        beams, beam = np.unique(np.asarray(table["beam"], dtype=str), return_inverse=True)
+        number = frame * len(beams) + beam
+    _, first, frame_index = np.unique(number, return_index=True, return_inverse=True)
     bin_numbers, bin_index = np.unique(bins, return_inverse=True)
     shape = (len(first), len(bin_numbers))
     _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
@@ -100,9 +101,7 @@ def build_grid(table, label):
     by_bin, order = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
     # the columns that belong to frames, after checking that they do
     frames = QTable({"frame": frame[first]})
-    for name in table.colnames:
-        if name == "frame" or name in CELL_COLUMNS:
-            continue
+    for name in (name for name in table.colnames if name not in ("frame", *CELL_COLUMNS)):
         column = angles.get(name, table[name])
         _check_constant(column, name, first[frame_index], frame, label)
         frames[name] = column[first]
@@ -138,14 +137,6 @@ def build_grid(table, label):
         reasons=tuple(reasons),
         single=single,
     )
-
-
-def _each_beam(table, frame):
-    """Return a number for each beam of each frame, in the order of the frames."""
-    if "beam" not in table.colnames:
-        return frame
-    beams, number = np.unique(np.asarray(table["beam"], dtype=str), return_inverse=True)
-    return frame * len(beams) + number
 
 
 def warn_of_copies(grid, label):

@@ -251,19 +251,14 @@ def deep_copied(optic, memo):
     new = optic.__class__.__new__(optic.__class__)
     memo[id(optic)] = new
     for key, value in optic.__dict__.items():
-        if isinstance(value, Parameter):
-            new.__dict__[key] = memo[id(value)] = _copied_parameter(value, new, memo)
-        else:
+        if not isinstance(value, Parameter):
             new.__dict__[key] = _copied(value, memo)
-    return new
-
-
-def _copied_parameter(parameter, model, memo):
-    new = parameter.__class__.__new__(parameter.__class__)
-    for key, value in parameter.__dict__.items():
-        # a frozen distribution of scipy does not change, and its copy takes longer than all else
-        kept = key == "_prior" and hasattr(value, "dist")
-        new.__dict__[key] = model if key == "_model" else value if kept else _copied(value, memo)
+            continue
+        own = new.__dict__[key] = memo[id(value)] = value.__class__.__new__(value.__class__)
+        for name, one in value.__dict__.items():
+            # a frozen distribution of scipy does not change, and its copy takes longer than all
+            kept = name == "_prior" and hasattr(one, "dist")
+            own.__dict__[name] = new if name == "_model" else one if kept else _copied(one, memo)
     return new
 
 

@@ -80,18 +80,10 @@ def _text(header, column, layout):
     return None if value is None else str(value).strip()
 
 
-def _loaded():
-    """Yield all instruments but those of packages that cannot be imported."""
-    for name in instruments.names():
-        with suppress(InstrumentError):
-            found = instruments.get(name)
-            yield found
-
-
 def recognized(header, known=None):
     """Return the instrument, of those that are ``known``, whose identity a header bears."""
     seen = []
-    known = _loaded() if known is None else known
+    known = filter(None, map(known_instrument, instruments.names())) if known is None else known
     # each instrument looks under its own keyword, so that all of them are asked
     for instrument in known:
         layout = instrument.files or instrument.headers

@@ -30,6 +30,7 @@ import numpy as np
 from astropy.table import Table
 
 from astropolcal import instruments
+from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.result.calibration import (
     Validity,
     _moment,
@@ -42,7 +43,7 @@ from astropolcal.calibration.result.calibration import (
 )
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
-from astropolcal.exceptions import CalibrationFileError, InstrumentError, warn
+from astropolcal.exceptions import CalibrationFileError, warn
 from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
@@ -586,10 +587,8 @@ def _of_instrument(entries, instrument):
     if instrument is None:
         return entries
     names = {entry.validity.instrument for entry in entries} - {None}
-    try:
-        same = {name for name in names if instruments.get(instrument).answers_to(name)}
-    except InstrumentError:
-        same = {name for name in names if name.lower() == str(instrument).lower()}
+    known, own = known_instrument(instrument), str(instrument).lower()
+    same = {name for name in names if (known.answers_to(name) if known else name.lower() == own)}
     return [entry for entry in entries if entry.validity.instrument in same]
 
 

@@ -462,7 +462,8 @@ class LoadedCalibration:
         beams = [self.system_mueller(beam=b, **options) for b in ("right", "left")]
         if hwp is None and headers:
             hwp = FrameAngles(headers, self.instrument).position("hwp") * u.rad
-        if hwp is None and options.get("light", "sky") == "sky" and self._plate_follows():
+        follows = self.instrument is None or any(map(any, self.instrument.sky_law.plate.values()))
+        if hwp is None and options.get("light", "sky") == "sky" and follows:
             raise ParameterError(
                 "hwp = None: the position of the half-wave plate is its true angle, which follows "
                 "the sky; the commanded angles are needed, by which the cube was made"
@@ -504,11 +505,6 @@ class LoadedCalibration:
         systematic = np.zeros_like(flat)
         systematic[:3] = np.where(is_open, np.inf, spread)
         return flat.reshape(given.shape), systematic.reshape(given.shape)
-
-    def _plate_follows(self):
-        """Return whether the half-wave plate follows the sky, as far as is known."""
-        instrument = self.instrument
-        return instrument is None or any(any(law) for law in instrument.sky_law.plate.values())
 
     def _check(self, frames, light):
         """Refuse frames for which the calibration does not hold."""
@@ -561,8 +557,7 @@ class LoadedCalibration:
                 "light='internal' leaves it out"
             )
         told = {"wavelength": self.wavelength, "date": dates or None}
-        options = {key: told[key] for key in self.instrument.sky_options}
-        chain = self.instrument.on_sky(join(inner), **options)
+        chain = self.instrument._from_sky(join(inner), **told)
         known = {leaf.name for leaf in inner}
         # axes of the telescope are optics, too, but there is nothing to calibrate in them
         assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)

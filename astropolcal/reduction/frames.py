@@ -478,7 +478,13 @@ def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=N
             way = ways["raw"] if raw is None and raw_may_tell(frame.errors, layout) else ""
             raise ObservationError(f"{file}: {'; '.join(frame.errors)}{way}")
     _check_one_target(files, found)
-    _warn_of_doubts(files, found)
+    odd = {}
+    for file, frame in zip(files, found, strict=True):
+        for words in frame.doubts:
+            odd.setdefault(words, []).append(file)
+    for words, of in odd.items():
+        # their images are used as they are
+        warn(f"{counted(len(of), 'file')}: {words}; the first is {of[0]}", stacklevel=3)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
         centre = [_place(f.photometry) for f in found]
@@ -521,16 +527,6 @@ def _brightness(files, frames, detectors):
     number = np.array([frame.values.get("exposures", 1.0) for frame in frames])
     scale = exposure * number / [right.gain for right, _ in detectors]
     return scale / np.median(scale) if np.ptp(scale) > 1e-6 * scale.max() else None
-
-
-def _warn_of_doubts(files, frames):
-    """Warn of what is odd about frames whose images are used as they are."""
-    odd = {}
-    for file, frame in zip(files, frames, strict=True):
-        for words in frame.doubts:
-            odd.setdefault(words, []).append(file)
-    for words, of in odd.items():
-        warn(f"{counted(len(of), 'file')}: {words}; the first is {of[0]}", stacklevel=4)
 
 
 def _check_one_target(files, frames):

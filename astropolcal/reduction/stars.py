@@ -409,6 +409,7 @@ def find_star(image, good, places, *, fwhm=4.0, companion=0.1):
         return Found(nothing, 0.0, "no star")
     # an odd box, about a full width: one peak a star
     table = find_peaks(smooth, threshold, box_size=2 * int(np.ceil(fwhm / 2)) + 1)
+    # beside an edge it finds no peak below zero
     if table is None:
         return Found(nothing, 0.0, "no star")
     table.sort("peak_value", reverse=True)

@@ -148,10 +148,9 @@ def _on_sky(instrument, chain, grid, arguments):
     """Return the chain downstream of the telescope; as it is where no telescope is known."""
     if not instrument.has_telescope or "parallactic" in stages(chain):
         return chain
-    known = {"wavelength": grid, "date": arguments.date}
     if arguments.date is not None and "date" not in instrument.sky_options:
         raise ParameterError(f"--date: the telescope of {instrument.name} is that of any date")
-    return instrument.on_sky(chain, **{key: known[key] for key in instrument.sky_options})
+    return instrument._from_sky(chain, wavelength=grid, date=arguments.date)
 
 
 def _table(arguments, instrument, chain, grid):

@@ -68,7 +68,11 @@ def run(arguments):
         named = f"{path}: " if path else ""
         raise AstropolcalError(f"{named}--frame and --context need a folder of calibrations")
     if path is None:
-        lines, content = _installation()
+        known = {"instruments": instruments.names(), "optics": sorted(OPTICS)}
+        known["observables"] = sorted(OBSERVABLES)
+        lines = [f"  {key + ':':<13}{', '.join(names)}" for key, names in known.items()]
+        lines.insert(0, f"astropolcal {version}")
+        lines, content = _wrapped(lines, {"astropolcal": version} | known, 15)
     elif Path(path).is_dir():
         lines, content = _library(path, arguments.context, arguments.frame)
     elif Path(path).suffix.lower() == ".asdf":
@@ -83,13 +87,6 @@ def run(arguments):
 
 def _wrapped(lines, content, indent=4):
     return [common.wrapped(line, indent) for line in lines], content
-
-
-def _installation():
-    known = {"instruments": instruments.names(), "optics": sorted(OPTICS)}
-    known["observables"] = sorted(OBSERVABLES)
-    lines = [f"  {key + ':':<13}{', '.join(names)}" for key, names in known.items()]
-    return _wrapped([f"astropolcal {version}", *lines], {"astropolcal": version} | known, 15)
 
 
 def _calibration(path, arguments):

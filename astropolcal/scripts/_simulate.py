@@ -183,7 +183,6 @@ def _truth(arguments):
             raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
         # its first optic is the source, behind which the telescope is as published
         star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
-        known = {"wavelength": wavelength, "date": meta.get("date")}
-        told = {key: known[key] for key in instrument.sky_options}
-        chain = join([star, *leaves(instrument.on_sky(chain, **told))])
+        told = {"wavelength": wavelength, "date": meta.get("date")}
+        chain = join([star, *leaves(instrument._from_sky(chain, **told))])
     return instrument, chain, wavelength, meta | {"source": "star"}

@@ -52,6 +52,14 @@ def test_reason():
         assert found(image(*places)).reason == reason, (places, reason)
 
 
+# photutils says so, too
+@pytest.mark.filterwarnings("ignore:No local peaks")
+def test_light_below_zero_in_a_corner_is_no_star():
+    array = image() - 1e3
+    array[:4, :4] += 100.0
+    assert found(array).reason == "no star"
+
+
 def test_how_bright_a_companion_may_be():
     for companion, reason in [(0.3, "two stars"), (0.7, "")]:
         array = image(*both(), *both(35.0, 35.0, 0.5))

@@ -61,9 +61,7 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
     if seen is not None:
         return from_first_stage(without_nuisance(seen), ("parallactic",)), FITTED
     if instrument is not None and instrument.has_telescope:
-        known = {"wavelength": wavelength, "date": date}
-        options = {key: known[key] for key in instrument.sky_options}
-        return instrument.on_sky(chains[0], **options), PUBLISHED
+        return instrument._from_sky(chains[0], wavelength=wavelength, date=date), PUBLISHED
     trains = [leaves(without_nuisance(chain)) for chain in chains]
     # what is upstream of all that every dataset has belongs to the lamp, too
     shared = set.intersection(*({(type(o), o.mount) for o in train} for train in trains))
