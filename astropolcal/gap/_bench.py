@@ -539,8 +539,8 @@ class Fault:
     def __init__(self, bench, told):
         self.bench, self.told = bench, dict(told)
         self.amplitude, self.largest, self.snr = 1e-3, _LARGEST, 0.0
-        # the stage whose angle is wrong
-        self._turned = None
+        # the stage whose angle is wrong, and whether it changes sharply with wavelength
+        self._turned, self._is_sharp = None, False
         getattr(self, f"_draw_{self.told['type']}")(bench.rng)
 
     def _choose(self, key, among):
@@ -632,6 +632,7 @@ class Fault:
             turn, law = rng.choice((1, 2)), 1 + 0.3 * self._smooth(rng)
             self._shapes = [(1 + np.cos(turn * angle + phase)) * law / 2 for angle in angles]
         elif what == "fringes":
+            self._is_sharp = True
             self.told["place"] = str(rng.choice(self.bench.places[2:]))
             self.told["kind"] = str(rng.choice(("retardance_h", "diattenuation_h")))
             phase = 2 * np.pi * rng.uniform(2, 5) * np.linspace(0, 1, len(self.bench.micron))
@@ -683,7 +684,9 @@ class Fault:
         self._edit = lambda chains: effect.edit([chain.copy() for chain in chains], context)
         edit = self._edit(bench.chains)
         free = FreeParameters(edit.chains, len(bench.micron), edit.ties)
-        self._laws = [(p, _law(p, free.by_name[p.name].size, rng)) for p in edit.parameters]
+        each = [(p, free.by_name[p.name].size) for p in edit.parameters]
+        self._laws = [(p, _law(p, n, rng)) for p, n in each]
+        self._is_sharp = any(_may_be_sharp(p, n) for p, n in each)
         sizes = [p.canonical_limit / np.abs(law).max() for p, law in self._laws]
         self.largest = 0.9 * min(sizes, default=1 / 0.9)
 
@@ -691,7 +694,7 @@ class Fault:
         """Return the share of its signal that each cell carries; its own is all of it."""
         own = [self.told.get(key) for key in ("place", "kind", "dependence")]
         step = own[2] if own[2] and own[2].startswith("step:") else None
-        found = self.bench.shares(residual, fit, step, self.told.get("what") == "fringes")
+        found = self.bench.shares(residual, fit, step, self._is_sharp)
         if not all(own):
             return found
         own = "/".join(own)
@@ -753,18 +756,22 @@ class Fault:
         return flux
 
 
+def _may_be_sharp(parameter, n):
+    """Return whether n values of a parameter, of more than a few, are free at each wavelength."""
+    return n > 3 and (parameter.basis is None or parameter.basis.shape[1] == n)
+
+
 def _law(parameter, n, rng):
     """Return a random law of n values, canonical and of the parameter's usual size."""
     scale = parameter.canonical_scale
     if n == 1:
         return scale * rng.normal()
-    basis = np.eye(n) if parameter.basis is None else parameter.basis
-    k = basis.shape[1]
-    # an effect that is free at each wavelength is tried where it is sharp
-    if n == k and k > 3:
-        # a resonance anywhere
+    if _may_be_sharp(parameter, n):
+        # an effect that is free at each wavelength is tried where it is sharp: a resonance anywhere
         at, width = rng.uniform(0, n), rng.uniform(0.5, 0.3 * n)
         return scale * rng.normal() / (1 + ((np.arange(n) - at) / width) ** 2)
+    basis = np.eye(n) if parameter.basis is None else parameter.basis
+    k = basis.shape[1]
     law = basis @ (rng.normal(0, 1, k) / (1 + np.arange(k)))
     if parameter.is_retained:
         # no optic gives more polarization than there is

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import norm, t
 
 from astropolcal.calibration.identifiability.linearized import inverse_root
 from astropolcal.calibration.validation.cross_validation import chi2_above
@@ -39,6 +40,9 @@ _UNKNOWN = 1e12
 _ANY = 0.3
 # of fewer wavelengths one is as good as all
 _FEW = 3
+# noise may have the tails of Student's t of these degrees of freedom, if the likelihood of all data
+# is better by so much (its logarithm)
+_TAILS, _CLEARLY = (2.0, 3.0, 4.0, 6.0, 10.0), 10.0
 #: Evidence that is the same to so many digits is not ordered by what rounding leaves.
 DIGITS = 6
 _TINY = 1e-6
@@ -161,6 +165,17 @@ class Look:
             for _, c, rows in self._datasets
         ]
 
+    @cached_property
+    def tails(self):
+        """Degrees of freedom and width of the noise of frames that take part; see `tails_of`."""
+        off = []
+        for i, channel, _ in self._datasets:
+            residual, taken = self._told(i)
+            seen = 1 - np.einsum("faa->fa", taken)
+            there = (channel.valid & self.kept(i)).T & (seen > _SEEN)
+            off.append(residual[there] / np.sqrt(seen[there]))
+        return tails_of(np.concatenate(off))
+
     # ---- small errors, all frames at once -----------------------------------------------------
 
     @cached_property
@@ -255,6 +270,25 @@ class Look:
         single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
         whiten = channel.whiten_frames(single)[:, 1, :, f].T
         return residual[1, :, f], np.eye(n) - lamp @ lamp.T, whiten
+
+
+def tails_of(off):
+    """Return the degrees of freedom of Student's t whose tails noise has, and its width.
+
+    The width is where the median of the sizes, one for a normal distribution, puts it; infinite
+    degrees of freedom are of a normal distribution.
+    """
+    if not off.any():
+        return np.inf, 1.0
+    off = off * norm.ppf(0.75) / np.median(np.abs(off))
+    found = {}
+    for freedom in (np.inf, *_TAILS):
+        width = float(norm.ppf(0.75) / t.ppf(0.75, freedom))
+        # what is farther out than all of these was left out
+        inside = 1 - 2 * t.sf(np.abs(off).max() / width, freedom)
+        likelihood = t.logpdf(off, freedom, scale=width).sum() - off.size * np.log(inside)
+        found[freedom, width] = likelihood + _CLEARLY * np.isinf(freedom)
+    return max(found, key=found.get)
 
 
 def _fall(values, along):
@@ -356,7 +390,19 @@ class Frame:
 
     def as_told(self):
         """Return the trial in which nothing is wrong."""
-        return Trial("none", float(self.with_positions_of(self.frames)[0]), 0.0)
+        return Trial("none", float(self.with_positions_of(self.frames)[0]), self._of_tails())
+
+    def _of_tails(self):
+        """Return by how much less than their squares data cost that the tails of the noise hold."""
+        freedom, width = self.look.tails
+        if np.isinf(freedom) or len(self.frames) > 1:
+            return 0.0
+        left = self._root @ ((self.observed - self._plain + self._offset) * self.weight)
+        # what is off in one beam is off in its difference and in its sum
+        off = np.array([left, self._sums[0] * (not self.single)])[: 2 - self.single]
+        square = np.sum(off**2, axis=0)
+        cost = (freedom + len(off)) * np.log1p(square / (freedom * width**2))
+        return float(np.minimum(cost - square, 0.0).sum())
 
     def trials(self):
         """Return all trials that need no other frame."""

@@ -9,7 +9,7 @@ import numpy as np
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when, alike
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.words import listed, p_words
+from astropolcal.words import counted, listed, p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
 _DETERMINED = 0.1
@@ -318,10 +318,14 @@ def sentences(content, several=False):
 
     Frames are named with their datasets where there are several.
     """
-    faults = _faults(content["frames"], several)
+    noise = [fault for fault in content["frames"] if fault["what"] == "noise"]
+    faults = _faults([fault for fault in content["frames"] if fault not in noise], several)
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
+    if noise:
+        frames = counted(len({(fault["dataset"], fault["frame"]) for fault in noise}), "frame")
+        first += f" Data of {frames} that are far off are left out: the noise has wide tails."
     rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
-    return [words for words in (first, *rest) if words]
+    return [words for words in (first.strip(), *rest) if words]
 
 
 def _faults(frames, several):

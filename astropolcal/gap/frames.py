@@ -11,13 +11,23 @@ must be down to the noise, or have lost nearly all of its excess.
 """
 
 import warnings
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.special import gammaincinv, ndtr
+from scipy.stats import t
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
-from astropolcal.gap._frame_looks import DIGITS, NOISE, Frame, Group, Look, Trial, angle_stages
+from astropolcal.gap._frame_looks import (
+    DIGITS,
+    NOISE,
+    Frame,
+    Group,
+    Look,
+    Trial,
+    angle_stages,
+    tails_of,
+)
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.observations.grid import MAD_TO_SIGMA, robust_curve
@@ -75,8 +85,9 @@ class FrameFault:
     frame: int
     #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"brightness"``
     #: of a single beam, ``"one wavelength"`` where the others are right, ``"unknown"`` where none
-    #: of these, or more than one, describes it, or ``"lamp"`` where only the brightness is off its
-    #: drift, which does not harm the differences.
+    #: of these, or more than one, describes it, ``"noise"`` where the noise of the others has such
+    #: wide tails that this may be it, or ``"lamp"`` where only the brightness is off its drift,
+    #: which does not harm the differences.
     what: str
     #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
     value: float | None = None
@@ -138,9 +149,10 @@ def single_data(model, known=()):
             for part in (model.residual, linear.tangent)
         )
         weight = (channel.valid / channel.sigma[channel.told]).T
-        off = _single(residual[..., 0], tangent, weight, _ALSO if known else _OFF)
+        off, tail = _single(residual[..., 0], tangent, weight, _ALSO if known else _OFF)
         for f, k in zip(*np.nonzero(off), strict=True):
-            trial = Trial("one wavelength", 0.0, 0.0, bin=int(k))
+            what = "one wavelength" if off[f, k] > tail else "noise"
+            trial = Trial(what, 0.0, 0.0, bin=int(k))
             chance = float(1 - 2 * off.size * ndtr(-off[f, k]))
             found.append(_fault(problem, (i, int(f)), trial, float(off[f, k] ** 2), chance))
     few = max(_LEAST_MOST, _MOST * sum(c.valid.any(axis=0).sum() for c in problem.channels))
@@ -153,6 +165,7 @@ def single_data(model, known=()):
 def _single(residual, tangent, weight, least):
     """Return by how many standard deviations data are off, (F, W), 0 where it is less than so many.
 
+    And how far the tails of the noise reach.
     Each is left out in turn: of a frame, beside a smooth law in wavelength of its own, and of what
     the nominal model absorbs, ``tangent`` (F, W, p). ``weight`` (F, W) whitens.
     """
@@ -176,13 +189,15 @@ def _single(residual, tangent, weight, least):
         if not frames.size:
             break
         if np.count_nonzero(found) > 2 * _MOST * found.size:
-            return 0.0 * found
+            return 0.0 * found, np.inf
         worst = off.argmax(axis=1)[frames]
         found[frames, worst] = off[frames, worst]
     # what is in many frames is there, too, where it is weaker
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
-    return np.where(found > least * spread, found / spread, 0.0)
+    freedom, width = tails_of(off[kept])
+    tail = width * t.isf(_ALPHA / (2 * found.size), freedom)
+    return np.where(found > least * spread, found / spread, 0.0), tail
 
 
 def not_off(model, observations, faults):
@@ -264,7 +279,11 @@ def _verdict(look, place, trials, n_frames):
     weight = np.exp(log - max(log))
     weight /= weight.sum()
     if weight[0] > 1 - _CERTAIN:
-        return None
+        # without the tails of the noise it may be guilty
+        normal = [replace(none, cost=0.0), *rest]
+        fault = _verdict(look, place, normal, n_frames) if none.cost else None
+        noise = Trial("noise", 0.0, 0.0, bin=fault and fault.bin)
+        return fault and _fault(look.problem, place, noise, fault.evidence, fault.probability)
     by_kind, weights = {}, weight[1:].tolist()
     for trial, w in zip(rest, weights, strict=True):
         by_kind[trial.what] = by_kind.get(trial.what, 0.0) + w
@@ -367,6 +386,7 @@ def _words(fault, told, beam, others, nm, names):
             "one beam": f"{f'the {beam}' if beam else 'one'} beam is off by {off}",
             "brightness": f"its brightness is off that of its group by {off}",
             "one wavelength": f"its data at {nm or 0:.0f} nm do not fit those at others",
+            "noise": "it is far off, as some data are in noise of such wide tails",
             "lamp": f"the lamp is off its drift by {off}",
             "unknown": "its differences fit no angle of a stage and no factor of a beam",
         }[fault.what]

@@ -108,6 +108,14 @@ def test_the_cells_of_the_key_are_what_a_finite_fault_does():
     assert linear.get("in:derotator/retardance_h/time2", 0) < 0.9
 
 
+def test_the_key_has_the_cell_of_a_fault_that_no_smooth_law_describes():
+    setup = Setup(n_wavelengths=6, n_derotator=3)
+    for seed in (1, 3):
+        fault = {"effect": "hwp_retardance_free"}
+        case = make_challenge(seed, kind="listed", snr=10, setup=setup, fault=fault)[2]
+        assert case["faults"][0]["cells"]["in:hwp/retardance_h/constant"] > 0.99
+
+
 def test_generators_give_matrices_of_their_kind():
     for kind, action in ACTIONS.items():
         matrix = expm(0.1 * action)

@@ -13,6 +13,7 @@ from gap_setups import SETUPS
 
 from astropolcal import instruments, optics
 from astropolcal.chain import join
+from astropolcal.gap._bench import Bench
 from astropolcal.gap.challenge import Setup, make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.frames import lamp_faults, single_data, suspect_frames, without_frames
@@ -175,6 +176,23 @@ def test_of_two_single_data_of_a_frame_neither_is_said_to_be_the_only_one():
     words = [fault.words for fault in found if fault.frame == 30]
     assert len(words) == 2
     assert not any("others are not" in one for one in words)
+
+
+@pytest.mark.slow
+def test_data_in_the_tails_of_noise_accuse_no_frame():
+    for seed, freedom in ((0, 3), (10, 3), (2, 4)):
+        bench, rng = Bench(Setup(), np.random.default_rng(seed)), np.random.default_rng([seed, 7])
+        tables = []
+        for one, bright, ideal in zip(bench.clean, bench.bright, bench.expose(), strict=True):
+            seen = one.to_table()
+            for beam, flux in zip(("right", "left"), ideal * bright, strict=True):
+                error = np.sqrt(flux.ravel() + bench.setup.read_noise**2)
+                drawn = rng.standard_t(freedom, error.shape) / np.sqrt(freedom / (freedom - 2))
+                seen[f"flux_{beam}"] = (flux.ravel() + error * drawn) * u.adu
+                seen[f"flux_{beam}_err"] = error * u.adu
+            tables.append(Observations.from_table(seen, name=one.name))
+        found = suspect_frames(nominal_model(bench.setup.chains(), tables))
+        assert {fault.what for fault in found} == {"noise"}, (seed, freedom)
 
 
 def test_noise_of_one_wavelength_is_no_single_datum():
