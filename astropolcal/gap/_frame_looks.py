@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import gammaln, ndtri, stdtr, stdtrit
 
 from astropolcal.calibration.identifiability.linearized import inverse_root
 from astropolcal.calibration.validation.cross_validation import chi2_above
@@ -41,8 +41,8 @@ _ANY = 0.3
 # of fewer wavelengths one is as good as all
 _FEW = 3
 # noise may have the tails of Student's t of these degrees of freedom, if the likelihood of all data
-# is better by so much (its logarithm)
-_TAILS, _CLEARLY = (2.0, 3.0, 4.0, 6.0, 10.0), 10.0
+# is better by so much (its logarithm); with so many degrees of freedom it is a normal distribution
+_TAILS, _CLEARLY, _NORMAL = (2.0, 3.0, 4.0, 6.0, 10.0), 10.0, 1e6
 #: Evidence that is the same to so many digits is not ordered by what rounding leaves.
 DIGITS = 6
 _TINY = 1e-6
@@ -275,19 +275,20 @@ class Look:
 def tails_of(off):
     """Return the degrees of freedom of Student's t whose tails noise has, and its width.
 
-    The width is where the median of the sizes, one for a normal distribution, puts it; infinite
-    degrees of freedom are of a normal distribution.
+    The width is where the median of the sizes, one for a normal distribution, puts it.
     """
     if not off.any():
-        return np.inf, 1.0
-    off = off * norm.ppf(0.75) / np.median(np.abs(off))
-    found = {}
-    for freedom in (np.inf, *_TAILS):
-        width = float(norm.ppf(0.75) / t.ppf(0.75, freedom))
+        return _NORMAL, 1.0
+    middle, found = ndtri(0.75), {}
+    off = np.abs(off) * middle / np.median(np.abs(off))
+    for freedom in (_NORMAL, *_TAILS):
+        width = float(middle / stdtrit(freedom, 0.75))
         # what is farther out than all of these was left out
-        inside = 1 - 2 * t.sf(np.abs(off).max() / width, freedom)
-        likelihood = t.logpdf(off, freedom, scale=width).sum() - off.size * np.log(inside)
-        found[freedom, width] = likelihood + _CLEARLY * np.isinf(freedom)
+        inside = 1 - 2 * stdtr(freedom, -off.max() / width)
+        height = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - np.log(freedom) / 2
+        fall = np.log1p(np.square(off / width) / freedom).sum() * (freedom + 1) / 2
+        likelihood = off.size * (height - np.log(width * inside)) - fall
+        found[freedom, width] = likelihood + _CLEARLY * (freedom == _NORMAL)
     return max(found, key=found.get)
 
 
@@ -395,7 +396,7 @@ class Frame:
     def _of_tails(self):
         """Return by how much less than their squares data cost that the tails of the noise hold."""
         freedom, width = self.look.tails
-        if np.isinf(freedom) or len(self.frames) > 1:
+        if freedom == _NORMAL or len(self.frames) > 1:
             return 0.0
         left = self._root @ ((self.observed - self._plain + self._offset) * self.weight)
         # what is off in one beam is off in its difference and in its sum

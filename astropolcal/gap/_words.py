@@ -318,14 +318,16 @@ def sentences(content, several=False):
 
     Frames are named with their datasets where there are several.
     """
-    noise = [fault for fault in content["frames"] if fault["what"] == "noise"]
-    faults = _faults([fault for fault in content["frames"] if fault not in noise], several)
+    faults = _faults(content["frames"], several)
     first = f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
-    if noise:
-        frames = counted(len({(fault["dataset"], fault["frame"]) for fault in noise}), "frame")
-        first += f" Data of {frames} that are far off are left out: the noise has wide tails."
-    rest = (part(content) for part in (_what, _instead, _how_large, _what_is_left, _on_sky))
-    return [words for words in (first.strip(), *rest) if words]
+    tails = {(fault["dataset"], fault["frame"]) for fault in content["in_tails"]}
+    noise = f"Data of {counted(len(tails), 'frame')} that are far off are left out: the noise has "
+    noise = f"{noise}wide tails." if tails else ""
+    rest = (
+        part(content)
+        for part in (_what, _against_prior, _instead, _how_large, _what_is_left, _on_sky)
+    )
+    return [words for words in (first, noise, *rest) if words]
 
 
 def _faults(frames, several):
@@ -386,6 +388,17 @@ def _what(content):
     where = content["where_left"] or content["where"]
     of = "what is left" if content["where_left"] else "the gap"
     return f"{text} {where_words(where[0], of)}." if where and not _courses(content) else text
+
+
+def _against_prior(content):
+    """Return which parameter has a value that what was known of it excludes."""
+    entry = content["accuracy_after"]["against_prior"]
+    if not entry:
+        return ""
+    return (
+        f"What was known of {entry['parameter']} disagrees: it is {entry['sigma']:.0f} standard "
+        "deviations from its prior, and may stand for something that the model lacks."
+    )
 
 
 def _courses(content):

@@ -14,8 +14,7 @@ import warnings
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from scipy.special import gammaincinv, ndtr
-from scipy.stats import t
+from scipy.special import gammaincinv, ndtr, stdtrit
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap._frame_looks import (
@@ -196,7 +195,7 @@ def _single(residual, tangent, weight, least):
     found[np.sum(found > 0, axis=1) > _OF_FRAME * n] = 0.0
     found[:, np.mean(found > 0, axis=0) > _OF_WAVELENGTH] = 0.0
     freedom, width = tails_of(off[kept])
-    tail = width * t.isf(_ALPHA / (2 * found.size), freedom)
+    tail = -width * stdtrit(freedom, _ALPHA / (2 * found.size))
     return np.where(found > least * spread, found / spread, 0.0), tail
 
 

@@ -21,6 +21,7 @@ from astropolcal import instruments, progress
 from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.result.verdict import disagrees_with_priors
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
 from astropolcal.files import plain
@@ -54,6 +55,8 @@ _OF_EFFECT = ("place", "kind", "shows", "reference")
 ACCURACIES = ("s_res", "s_mean", "s_cv")
 # parameters correlated more than this with what is uncertain are named
 _STRONG, _MOST_TRADES = 0.5, 3
+# a fit is at odds with a prior that is so many of its standard deviations away
+_FAR = 4.0
 # perturbations that are angles
 ANGLES = ("retardance", "rotation")
 # directions below this share of the largest take nothing up
@@ -136,7 +139,7 @@ def _worked_out(diagnosis):
         "misread": misread,
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
-        "frames": [fault.to_dict() for fault in diagnosis.frames],
+        **_frames(diagnosis),
         "where": _where(diagnosis),
         "where_left": [] if same or noisy else [o for part in _located(improved) for o in part],
         "left_share": 0.0 if noisy else left,
@@ -161,6 +164,13 @@ def _worked_out(diagnosis):
     if diagnosis.settings.get("fails") and diagnosis.verdict == "unexplained":
         words.insert(0, _words.fails(diagnosis.settings["fails"]))
     return plain(content | {"sentences": words})
+
+
+def _frames(diagnosis):
+    """Return the frames that are not what their table says, and what is left out as noise."""
+    told = [fault.to_dict() for fault in diagnosis.frames]
+    in_tails = [fault for fault in told if fault["what"] == "noise"]
+    return {"frames": [fault for fault in told if fault not in in_tails], "in_tails": in_tails}
 
 
 def _nominal(model):
@@ -432,6 +442,7 @@ def accuracies(model, cross_validate=True):
         "rms_percent": None,
         "datasets": [],
         "targets": [],
+        "against_prior": None,
     }
     try:
         with warnings.catch_warnings(action="ignore", category=AstropolcalWarning):
@@ -451,6 +462,7 @@ def accuracies(model, cross_validate=True):
     rms = np.sqrt(np.average(gap[known] ** 2, weights=count[known])) if known.any() else None
     return found | {
         "rms_percent": rms,
+        "against_prior": _against_prior(seen),
         "datasets": [
             {"name": one.name, "source": one.source}
             | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}
@@ -504,6 +516,20 @@ def with_causes(model, instrument=None):
             mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
             own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
     return calibrate(chains, model.observations, **how, cross_validate=False)
+
+
+def _against_prior(calibration):
+    """Return the parameter farthest from its prior, where data and priors disagree."""
+    if not disagrees_with_priors(calibration):
+        return None
+    free, vector = calibration.measurement.free, calibration.measurement.vector()
+    off = {
+        slot.name: float(np.abs(prior.residual(vector[slot.slice])).max())
+        for slot, prior in free.priors
+        if not prior.is_flat
+    }
+    worst = max(off, key=off.get)
+    return {"parameter": worst, "sigma": off[worst]} if off[worst] > _FAR else None
 
 
 def _median(values):

@@ -15,7 +15,7 @@ from astropy.modeling.fitting import TRFLSQFitter
 from gap_data import WAVELENGTH, chain, frames, observed, with_effect
 from matplotlib.figure import Figure
 
-from astropolcal import Observations, calibrate, instruments
+from astropolcal import Normal, Observations, calibrate, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import diagnose, get_effect
 from astropolcal.gap.attribution import Candidate
@@ -421,3 +421,17 @@ def test_frames_of_an_unstable_lamp_are_said_to_be_used():
     lit[:, 1:] = False
     told, *_ = about(data.with_mask(lit, "not as the table says"))
     assert told.startswith("Left out in whole or in part: 2 of ")
+
+
+def test_what_takes_a_parameter_off_its_prior_may_be_what_the_model_lacks():
+    """Crosstalk of the beams fits as a lower efficiency, which is known not to be so low."""
+    seen = data()
+    for known, sigma in ((0.97, None), (0.705, 28)):
+        model = chain()
+        model["wollaston"].efficiency.prior = Normal(known, 0.01)
+        told = to_dict(diagnose(model, seen, **ASKED))
+        assert told["verdict"] == "none"
+        against = told["accuracy_after"]["against_prior"]
+        assert (against and round(against["sigma"])) == sigma
+        says = "it is 28 standard deviations from its prior, and may stand for something"
+        assert (says in " ".join(told["sentences"])) == bool(sigma)

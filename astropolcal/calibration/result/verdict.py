@@ -110,7 +110,7 @@ def verdict(calibration, targets=TARGETS):
     held = calibration.settings.get("restarted", {}).get("open")
     cautions = []
     if not reasons:
-        excess, tests = _excess(calibration), calibration.fit.get("lack_of_fit") or []
+        excess = _excess(calibration)
         at_bound = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
         if excess > _CLEARLY:
             why = f"astropolcal diagnose: {_suspected(calibration)}"
@@ -127,7 +127,7 @@ def verdict(calibration, targets=TARGETS):
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
-        if any("disagree with the priors" in test["words"] for test in tests):
+        if disagrees_with_priors(calibration):
             cautions.append("data and priors disagree")
     advice = _next(calibration, free, wrong, sky)
     words = [
@@ -546,6 +546,12 @@ def _fit(calibration):
         yield f"Predicted   {entry['name']}: {entry['words']}"
     for entry in fit.get("stars", []):
         yield f"Catalogue   {entry['words']}"
+
+
+def disagrees_with_priors(calibration):
+    """Return whether a fit is farther from its priors than chance makes probable."""
+    tests = calibration.fit.get("lack_of_fit") or []
+    return any("disagree with the priors" in test["words"] for test in tests)
 
 
 def at_wavelength(outlier):
