@@ -265,11 +265,18 @@ def option(entry, types):
         elif word == "...":
             several = {"action": "append", "default": []}
             settings |= {"action": "extend"} if "nargs" in settings else several
+        elif word in known:
+            settings["type"] = known[word]
         else:
-            settings |= {"type": known[word]} if word in known else {"metavar": word}
+            settings |= {"metavar": word} | ({"type": _pair} if "=" in word else {})
     if flags[0].startswith("-") and len(settings) == 1:
         settings["action"] = "store_true"
     return flags, settings
+
+
+def _pair(text):
+    """Return a name and its value without the spaces around them."""
+    return "=".join(part.strip() for part in text.split("=", 1))
 
 
 #: Options of an instrument's chains; only what was typed, as not every instrument knows all.

@@ -92,7 +92,7 @@ def test_quiet_prints_nothing(small, capsys):
 
 def test_fix_free_and_without_edit_the_model(small, tmp_path):
     out = tmp_path / "out.json"
-    arguments = ["--fix", "hwp.theta=0.1deg", "--fix", "derotator.circular", "--free",
+    arguments = ["--fix", " hwp.theta = 0.1 deg", "--fix", "derotator.circular", "--free",
                  "wollaston.theta", "--without", "nbs"]  # fmt: skip
     assert main(["calibrate", str(small), "-q", "--json", str(out), *arguments]) == 0
     parameters = json.loads(out.read_text())["parameters"]
