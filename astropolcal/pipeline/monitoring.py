@@ -185,7 +185,7 @@ def _next(newest, n_dated, late, moment, limit):
     if not n_dated:
         if late:
             return f"Calibrate: no calibration is of {moment.isot[:10]} or before."
-        return "Give the calibrations dates: with_validity(valid_from=) states one."
+        return "Give the tables times, or state dates in Python: with_validity(valid_from=)."
     due = moment_of(days_of(newest.calibration)[-1], "date") + limit * u.day
     words = "is due" if due < moment else f"is due by {due.isot[:10]}"
     more = f"; {counted(3 - n_dated, 'more run')} will show what changes" if n_dated < 3 else ""

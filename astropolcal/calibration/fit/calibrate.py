@@ -371,6 +371,8 @@ _LONGEST = 2.0
 _SPOILT = 1e-3
 # what changes the data by less than this (for a degree, micrometre, percent) changes none
 _SILENT = 1e-12
+# a datum whose fit leaves less than this of what it departs says nothing but of itself
+_ALONE = 1e-6
 
 
 def _at_gauge(measurement, weighting, origin, gauge):
@@ -522,10 +524,13 @@ def _result(fitted, covariance=None):
     fit["masked"] = [dict(each.mask_reasons) for each in observations]
     fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
-    if covariance is None:
-        fit["off_minimum"] = _off_minimum(measurement, whitened, own)
     # the pairs of frames at odds with the fit, for summary, JSON and file
-    outliers = columns(outlying_data(calibration))
+    outlying = outlying_data(calibration)
+    if covariance is None:
+        fit["off_minimum"] = _moved(measurement, whitened, own)
+        if len(outlying) and settings["loss"] == "linear":
+            fit["outliers_move"] = _moved(measurement, whitened, own, outlying.meta["data"])
+    outliers = columns(outlying)
     rows = zip(*outliers.values(), strict=True)
     fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
     fit["model_error"] = lacking
@@ -544,13 +549,21 @@ def _along_valleys(measurement, whitened, covariance, view):
     return wide, curved_directions(free, measurement.vector(), found, stds, sky_of)
 
 
-def _off_minimum(measurement, whitened, covariance):
-    """Return which parameter is farthest from the minimum nearby, and by how many errors."""
+def _moved(measurement, whitened, covariance, data=None):
+    """Return which parameter residuals move most, by how many errors; at the minimum none does.
+
+    Of some data: by how much it would move without them (Cook 1977, Technometrics 19, 15).
+    """
     problem, free = Problem(measurement, measurement.weighting), measurement.free
     vector, factor = measurement.vector(), whitened.factor()
+    rows, pull = problem.jacobian(vector) * whitened.scale, problem.residuals(vector)
+    if data is not None:
+        rows, pull = rows[data], pull[data]
+        # how far each of them draws the fit to itself
+        drawn = rows @ factor.T
+        pull = np.linalg.lstsq(np.eye(len(data)) - drawn @ drawn.T, pull, rcond=_ALONE)[0]
     # a step of Newton's; of data without noise residuals are rounding
-    pull = problem.jacobian(vector).T @ problem.residuals(vector) * whitened.scale
-    step = np.abs(factor.T @ (factor @ pull)) * whitened.scale / free.factors()
+    step = np.abs(factor.T @ (factor @ (rows.T @ pull))) * whitened.scale / free.factors()
     known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED)
     times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
     worst = int(np.argmax(times))

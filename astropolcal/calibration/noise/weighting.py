@@ -98,7 +98,7 @@ def outlying_data(calibration, limit=_FAR):
         Largest first: ``dataset``, ``frames`` (numbers as text), ``wavelength`` (NaN of those at
         odds at all), ``residual`` (there, or median over the wavelengths, percent), ``sigma`` (in
         robust standard deviations) and ``brightness`` (of the fainter frame, relative to the
-        median frame). Empty if there is none.
+        median frame). Empty if there is none. ``meta["data"]`` has the numbers of all their data.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def outlying_data(calibration, limit=_FAR):
     """
     if not limit > 0:
         raise ParameterError(f"limit = {limit}; allowed are numbers above 0")
-    live, rows = calibration.live_measurement(), []
+    live, rows, data = calibration.live_measurement(), [], []
     residuals = live.residuals()
     scales = _scales(live, residuals)
     scaled, tells = residuals / scales, live.free.size <= _MOST_FITTED * live.n_data
@@ -143,10 +143,12 @@ def outlying_data(calibration, limit=_FAR):
                 numbers = ", ".join(np.array(frame_names(part.observations.frames))[frames])
                 told = (nm, 100 * np.median(residuals[own]), whole, bright[frames].min())
                 rows.append((part.observations.name, numbers, *map(float, told)))
+                data += np.atleast_1d(own).tolist()
     rows.sort(key=lambda row: -row[4])
     names = ("dataset", "frames", "wavelength", "residual", "sigma", "brightness")
     units = {"wavelength": u.nm, "residual": u.percent}
-    return QTable(rows=rows or None, names=names, dtype=(str, str, *[float] * 4), units=units)
+    kinds, meta = (str, str, *[float] * 4), {"data": data}
+    return QTable(rows=rows or None, names=names, dtype=kinds, units=units, meta=meta)
 
 
 def _departures(scaled, members):

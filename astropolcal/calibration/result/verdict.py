@@ -39,6 +39,8 @@ _SHOWS = 0.005
 _CLEARLY = 2
 # values farther from the minimum, in units of the errors there, have larger errors
 _OFF = 0.5
+# data at odds with the fit that move a parameter by more of its errors spoil it
+_MOVED = 2
 # errors that rest on fewer numbers are themselves known to a third or worse
 _FEW_FREEDOM, _FEW_SETTINGS = 5, 6
 
@@ -156,7 +158,7 @@ def _reasons(calibration, known, free, on_sky=((), ())):
     """
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [_nothing(calibration), _angles(calibration, free)]
-    wrong += [*_mirrors(calibration, known), _misfit(calibration)]
+    wrong += [*_mirrors(calibration, known), _misfit(calibration), _carried_off(calibration)]
     unknown = [*_absurd(_without_laws(calibration, free)), *on_sky[0], _hanging(free)]
     held = calibration.settings.get("restarted", {}).get("open")
     unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
@@ -189,6 +191,14 @@ def _nothing(calibration):
         return "no free parameter changes any datum"
     n_data = calibration.fit.get("n_data", np.inf)
     return "no datum is left over to tell the noise" if n_data <= finding.rank else ""
+
+
+def _carried_off(calibration):
+    """Name the parameter that the data at odds with the fit move by more than it is known."""
+    moved = calibration.fit.get("outliers_move") or {"errors": 0.0}
+    if not moved["errors"] > _MOVED:
+        return ""
+    return f"frames at odds move {moved['parameter']} by {moved['errors']:.2g} of its errors"
 
 
 def _stuck(free):
@@ -438,7 +448,10 @@ def _next(calibration, free, wrong, sky):
     published = instrument and instrument.has_telescope
     telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
+    at_odds = calibration.fit.get("outliers") and calibration.settings.get("loss") == "linear"
+    mask = "the frames at odds: mask them (mask_reason), or --loss bisquare"
     advice = (
+        (_carried_off(calibration), mask),
         (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
         (wrong, "check mounts, beams, angles, source; or run astropolcal diagnose"),
         (
@@ -448,12 +461,7 @@ def _next(calibration, free, wrong, sky):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, _more_angles(turning)),
-        (
-            _excess(calibration) > _CLEARLY
-            and calibration.fit.get("outliers")
-            and calibration.settings.get("loss", "linear") == "linear",
-            "the frames at odds: mask them (mask_reason), or --loss bisquare",
-        ),
+        (_excess(calibration) > _CLEARLY and at_odds, mask),
         ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
         (
