@@ -241,15 +241,17 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
         panels = figure.subplots(3, 1, sharex=True)
         handles = _draw_parts(panels[0], parts[0]) if parts else []
         lines = _draw_targets(panels[1], tables, "s_p")
-        # the lines of the angle look as those of the degree, and need no entries of their own
-        _draw_targets(panels[2], tables, "s_chi")
+        # the lines of the angle look as those of the degree, and need no entries of their own;
+        # what is open in both panels has no line
+        both = zip(lines, _draw_targets(panels[2], tables, "s_chi"), strict=True)
+        known = [a for a, b in both if np.isfinite([a.get_ydata(), b.get_ydata()]).any()]
         for axes, label in zip(panels, ("accuracy (%)", "s_p (%)", "s_chi (°)"), strict=True):
             axes.set_ylabel(label)
         panels[1].set_title("Degree of polarization of a target")
         panels[2].set_title("Angle of polarization of a target")
         st.wavelength_label(panels[2])
         st.heading(figure, calibration, "Accuracy for targets")
-        st.legend_outside(figure, [*handles, *lines])
+        st.legend_outside(figure, [*handles, *known])
     return figure
 
 

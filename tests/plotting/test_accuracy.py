@@ -2,11 +2,14 @@
 """Accuracies of a calibration, for targets, and of a standard star."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
 
+import astropolcal
+from astropolcal import Observations, calibrate, instruments
 from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.validation import paper_accuracies
 from astropolcal.chain import join, leaves
@@ -226,10 +229,20 @@ def test_a_target_at_an_angle(several):
 
 def test_what_no_data_determine_is_said_in_the_panel(undetermined):
     # a lamp alone leaves the angles open
-    *known, angle = plot_target_accuracy(undetermined).axes
+    figure = plot_target_accuracy(undetermined)
+    *known, angle = figure.axes
+    # the degree is drawn, so that each target has its entry
+    assert sum(text.startswith("target of") for text in legend(figure)) == len(known[1].lines) == 3
     assert not any(axes.texts for axes in known)
     assert [text.get_text()[:5] for text in angle.texts] == ["open:"]
     assert not len(angle.get_yticks())
+    # with its telescope the packaged run leaves both open
+    seen = Observations.read(Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv")
+    chain = instruments.get("charis").chain(wavelength=seen.wavelength)
+    nothing = plot_target_accuracy(
+        calibrate(chain, seen, cross_validate=False, instrument="charis")
+    )
+    assert not any(text.startswith("target of") for text in legend(nothing))
 
 
 def test_impossible_and_unknown_targets_are_refused(several):
