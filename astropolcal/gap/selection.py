@@ -549,7 +549,7 @@ def _simple(state, found, fitted, instead):
     # names, which are few, may each explain less: such as fringes of two periods
     named = [one for one in few if one.is_named and one.evidence > _FAR_PROMISE * best]
     few = [one for one in few if one.evidence > _HALF * best]
-    few = _distinct(few, _FITTED[0]) + _distinct(named, _FITTED[0])
+    few = _distinct(few, _FITTED[1]) + _distinct(named, _FITTED[1])
     # a name also where it was fitted with a freer law, which costs more than two simple ones
     same = {(one.chosen[0].name, one.chosen[0].rank) for one in fitted}
     few = {one.name: one for one in few if (one.name, one.rank) not in same}
