@@ -553,7 +553,7 @@ def _simple(state, found, fitted, instead):
     # a name also where it was fitted with a freer law, which costs more than two simple ones
     same = {(one.chosen[0].name, one.chosen[0].rank) for one in fitted}
     few = {one.name: one for one in few if (one.name, one.rank) not in same}
-    dear = [one for one in fitted[1:] if one.chosen[0].rank >= _FREE and one.chosen[0].is_named]
+    dear = [one for one in fitted[1:] if one.is_dear and one.chosen[0].is_named]
     new = _new(state, few.values(), [one for one in fitted if one not in dear], instead)
     # what derivatives ask a law for may be in the second order
     constant = found.constant(fitted[0].chosen[0])
