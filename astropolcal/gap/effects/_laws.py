@@ -151,27 +151,38 @@ class Elliptical(Effect):
 
     def put(self, chain, roles, context, label):
         """Return the chain with an elliptical derotator; see `Effect.put`."""
-        old, retarder = self.where.anchor(roles), optics.EllipticalRetarder
-        if not isinstance(old, (optics.LinearRetarder, retarder)):
-            # what is more than a retarder stays, and the new one turns with it
-            return super().put(chain, roles, context, label)
+        old, is_new, ties = self.where.anchor(roles), False, {}
         # a component that the old one lacks is zero in it
-        known, size = old if isinstance(old, retarder) else retarder(), len(context.wavelength)
+        known = old if isinstance(old, optics.EllipticalRetarder) else optics.EllipticalRetarder()
+        size = len(context.wavelength)
         values = {k: np.broadcast_to(getattr(known, k).value, size) * u.deg for k in self.free}
         if known is old:
             new = old.with_parameters(**values)
         else:
-            values |= {"theta": old.theta.value * u.deg, "horizontal": old.retardance.value * u.deg}
-            new = retarder(mount=old.mount, name=old.name, **values)
+            # what is more than a retarder stays, and the new one turns with it
+            is_new = not isinstance(old, optics.LinearRetarder)
+            new = optics.EllipticalRetarder(
+                theta=old.theta.value * u.deg,
+                horizontal=(0.0 if is_new else old.retardance.value) * u.deg,
+                mount=old.mount,
+                name=label if is_new else old.name,
+                **values,
+            )
             for key in new.param_names:
                 getattr(new, key).fixed = True
             # what was free stays free, so that the nominal parameters keep their meaning
-            for ours, theirs in (("theta", "theta"), ("horizontal", "retardance")):
+            pairs = () if is_new else (("theta", "theta"), ("horizontal", "retardance"))
+            for ours, theirs in pairs:
                 was, now = getattr(old, theirs), getattr(new, ours)
                 now.fixed, now.bounds = was.fixed, was.bounds
         for key in self.free:
             getattr(new, key).fixed = False
-        return replace_optic(chain, old.name, new), [new], {}
+        if not is_new:
+            return replace_optic(chain, old.name, new), [new], ties
+        new.theta.bounds = (None, None)
+        if not old.theta.fixed:
+            ties[f"{label}.theta"] = Tie(f"{old.name}.theta")
+        return insert_optic(chain, new, after=old.name), [new], ties
 
 
 class BandAverage(Effect):

@@ -147,8 +147,8 @@ def _elliptical(name, title, shows, kinds, *components):
     # with the horizontal component the diagonal one turns the axis: by half the arctangent of
     # their ratio
     return _effect(
-        name, title, _DEROTATOR, kinds, optics.EllipticalRetarder(), components,
-        _size(2, 60, u.deg), shows, _MCINTOSH, cls=laws.Elliptical, category="parameter",
+        name, title, _DEROTATOR, kinds, None, components, _size(2, 60, u.deg), shows, _MCINTOSH,
+        cls=laws.Elliptical, category="parameter",
     )  # fmt: skip
 
 
