@@ -153,9 +153,12 @@ class _State:
         return self.evidence(temper) - ENOUGH * len(self.chosen)
 
     @property
-    def names(self):
-        """Names of the causes in their alphabetical order."""
-        return sorted(one.name for one in self.chosen)
+    def outline(self):
+        return frozenset(one.name for one in self.chosen)
+
+    @property
+    def name(self):
+        return sorted(self.outline)
 
 
 @dataclass
@@ -167,6 +170,7 @@ class _Task:
     cells: bool
     groups: tuple | None
     say: object
+    has_runs: bool = False
 
     def fitted(self, chosen, like, **how):
         """Return the base with causes, fitted in full."""
@@ -185,7 +189,7 @@ def _temper(*states):
 def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST):
     """Choose the causes that a model lacks, of one run no more than ``most``."""
     first, runs = _scanned(base, library, cells), count_runs(base.problem)
-    task = _Task(base, library, cells, groups, say)
+    task = _Task(base, library, cells, groups, say, has_runs=runs > 1)
     most = min(most, _MOST) if runs < 2 or not cells else _MOST // 2
     best = _search(task, _State(base), first, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
@@ -367,9 +371,11 @@ def _worsens(after, before, scatter):
 
 def explained_by_one(model, library, *, cells=True):
     """Return whether a single cause leaves no more than noise."""
-    best = _best_of(_scanned(model, library, cells), _FITTED[-1])
-    recipes = (one.recipe for one in best if one.evidence > ENOUGH)
-    return any(model.with_effect(*recipe, **_QUICK).p_value > _NOISE for recipe in recipes)
+    found = _scanned(model, library, cells)
+    for one in _best_of(found, _FITTED[-1]):
+        if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
+            return True
+    return False
 
 
 def beside_one(base, selection):
@@ -471,7 +477,7 @@ def _search(task, best, first, most_causes):
         k = len(best.chosen)
         task.say(f"looking for cause {k + 1}, at most {most_causes}")
         # of several runs, whose causes are many, fewer are fitted one step earlier
-        step = k + (k > 1 and len(first.probes.runs) > 1)
+        step = k + (task.has_runs and k > 1)
         fitted = _extensions(task, best, first, _FITTED[min(step, len(_FITTED) - 1)])
         temper = _temper(best, *fitted)
         # those that are worth more than what they are to be better than
@@ -509,7 +515,7 @@ def _extensions(task, state, first, most):
 def _ranked(states):
     """Return sets of causes, those with most evidence first; of the same, the name decides."""
     temper = _temper(*states) if states else 1.0
-    return sorted(states, key=lambda state: (-round(state.evidence(temper), DECIMALS), state.names))
+    return sorted(states, key=lambda state: (-round(state.evidence(temper), DECIMALS), state.name))
 
 
 def _fitted(state, found, most, instead):
@@ -558,9 +564,11 @@ def _simple(state, found, fitted, instead):
     # what derivatives ask a law for may be in the second order
     constant = found.constant(fitted[0].chosen[0])
     constant = constant and _extended(state, (constant,), instead)
-    if constant and constant.model.fit.chi2 - fitted[0].model.fit.chi2 < 2 * ENOUGH * found.temper:
+    few = [fitted[0]]
+    if constant and constant.model.fit.chi2 - few[0].model.fit.chi2 < 2 * ENOUGH * found.temper:
         # what it leaves asks for no other cause
-        fitted[0] = max(fitted[0], constant, key=lambda one: one.evidence(found.temper))
+        few.append(constant)
+    fitted[0] = max(few, key=lambda one: one.evidence(found.temper))
     return new
 
 
@@ -584,7 +592,7 @@ def _at_half_a_wave(state, found, fitted, instead):
 
 def _new(state, added, fitted, instead):
     """Return the sets with each of some causes, fitted in full, that are not among those fitted."""
-    known = {name for grown in fitted for name in grown.names}
+    known = {one for grown in fitted for one in grown.outline}
     new = (one for one in added if one.name not in known)
     grown = [_extended(state, (one,), instead) for one in new]
     return [one for one in grown if one is not None]
