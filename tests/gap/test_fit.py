@@ -290,6 +290,24 @@ def test_a_problem_that_nothing_is_free_in():
 # ---- steps within bounds -----------------------------------------------------------------------
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.sampled_from([0.0, 0.1, 1.0, 10.0]))
+def test_least_squares_within_bounds_are_those_of_scipy(seed, n, room):
+    """Correlated columns of unit length, bounds on either side, some of them closed."""
+    rng = np.random.default_rng(seed)
+    table = rng.normal(size=(3 * n, n)) @ (np.eye(n) + rng.normal(size=(n, n)))
+    base, triangle = np.linalg.qr(table / np.linalg.norm(table, axis=0))
+    wanted = base.T @ rng.normal(size=3 * n)
+    low, high = -room * rng.exponential(size=n), room * rng.exponential(size=n)
+    high[rng.random(n) < 0.2] = 0.0
+    free = np.linalg.solve(triangle, wanted)
+    found = module._within(triangle, wanted, low, high, free)
+    slack = 1e-9
+    other = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
+    assert np.all((low <= found) & (found <= high))
+    squares = [np.sum((triangle @ x - wanted) ** 2) for x in (found, np.clip(other, low, high))]
+    assert squares[0] <= squares[1] * (1 + 1e-9) + 1e-15
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12))
 def test_least_squares_behind_walls_are_those_within_bounds(seed, n):
     """Where the walls are the bounds of the unknowns, some closed, some open."""
@@ -304,7 +322,17 @@ def test_least_squares_behind_walls_are_those_within_bounds(seed, n):
     rows, room = np.concatenate([np.eye(n), -np.eye(n)]), np.concatenate([high, -low])
     found = module._behind_walls(triangle, wanted, rows, room)
     assert np.all(rows @ found < room + 2e-7)
-    slack = 1e-9
-    other = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
-    squares = [np.sum((triangle @ x - wanted) ** 2) for x in (found, np.clip(other, low, high))]
+    expected = module._within(triangle, wanted, low, high, free)
+    squares = [np.sum((triangle @ x - wanted) ** 2) for x in (found, expected)]
     assert squares[0] == pytest.approx(squares[1], rel=1e-5, abs=1e-6)
+
+
+def test_what_is_guessed_wrong_is_left_to_scipy(monkeypatch):
+    triangle, wanted = np.array([[1.0, 0.9], [0.0, 0.1]]), np.array([1.0, -1.0])
+    low, high = np.full(2, -1.0), np.full(2, 1.0)
+    free = np.linalg.solve(triangle, wanted)
+    expected = module._within(triangle, wanted, low, high, free)
+    monkeypatch.setattr(module, "_GUESSES", 0)
+    found = module._within(triangle, wanted, low, high, free)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(expected, [1.0, -0.121951], atol=1e-6)
