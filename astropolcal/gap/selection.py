@@ -2,9 +2,9 @@
 """
 Joint choice of the causes that a model lacks, with probabilities.
 
-A set of causes grows: it is fitted in full with each of the few best continuations, and the scan is
-repeated beside the best of these until no cause is missed any more. Then every cause is looked at
-beside all the others: what explains the data nearly as well in its place is its alias group. An
+Sets of causes grow side by side: the best few sets are kept, each is fitted in full, and the scan
+is repeated beside it until no cause is missed any more. Then every cause of the best set is looked
+at beside all the others: what explains the data nearly as well in its place is its alias group. An
 answer of several unrelated causes is less probable than one cause that no table has, and what the
 set leaves lowers the probability of all its causes.
 """
@@ -44,13 +44,15 @@ _MOST = 8
 _MOST_TOGETHER = 10
 # what a nominal model has of an optic that turns
 _OF_OPTIC = ("retardance_h", "retardance_d", "rotation")
-# by the number of causes: so many continuations of a set are fitted in full
-_FITTED = (6, 4, 4, 3)
+# by the number of causes: so many sets grow side by side, and so many of their continuations
+# are fitted in full
+_WIDTH, _FITTED = (3, 2, 2, 1), (6, 4, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
-# as much freedom as two functions of the frame with a smooth law; beside such a cause those are
-# fitted that have this share of its freedom and of the best evidence
-_FREE, _HALF = 6, 0.5
+# but this, where the freedom of the best costs more (log evidence): two simple ones may do better
+_HALF, _DEAR = 0.5, 30.0
+# as much freedom as two functions of the frame with a smooth law
+_FREE = 6
 # and this of a name with one number, where no derivative explains the gap down to noise
 _FAR_PROMISE = 0.3
 # the evidence ranks sets of at most so many causes, if these leave more than noise
@@ -159,6 +161,11 @@ class _State:
     @property
     def name(self):
         return sorted(self.outline)
+
+    @property
+    def is_dear(self):
+        """Whether one cause alone has much freedom."""
+        return len(self.chosen) == 1 and sum(self.model.costs(1.0).values()) > _DEAR
 
 
 @dataclass
@@ -372,7 +379,7 @@ def _worsens(after, before, scatter):
 def explained_by_one(model, library, *, cells=True):
     """Return whether a single cause leaves no more than noise."""
     found = _scanned(model, library, cells)
-    for one in _best_of(found, _FITTED[-1]):
+    for one in _best_of(found, _WIDTH[0]):
         if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
             return True
     return False
@@ -380,7 +387,7 @@ def explained_by_one(model, library, *, cells=True):
 
 def beside_one(base, selection):
     """Yield a model with each of the few best causes alone."""
-    for one in _best_of(selection.scan, _FITTED[-1]):
+    for one in _best_of(selection.scan, _WIDTH[0]):
         yield base.with_effect(*one.recipe, **_QUICK)
 
 
@@ -473,12 +480,14 @@ def _nominal_changes(first):
 
 def _search(task, best, first, most_causes):
     """Return the best set of causes."""
+    states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
         task.say(f"looking for cause {k + 1}, at most {most_causes}")
-        # of several runs, whose causes are many, fewer are fitted one step earlier
+        # of several runs, whose causes are many, the sets are fewer one step earlier
         step = k + (task.has_runs and k > 1)
-        fitted = _extensions(task, best, first, _FITTED[min(step, len(_FITTED) - 1)])
+        width, most = (part[min(step, len(part) - 1)] for part in (_WIDTH, _FITTED))
+        fitted = _extensions(task, states, known, most)
         temper = _temper(best, *fitted)
         # those that are worth more than what they are to be better than
         least = best.worth(temper)
@@ -489,26 +498,29 @@ def _search(task, best, first, most_causes):
             # is as good as what it says of frames that are left out
             fitted = [state for state in fitted if state.worth(temper) >= least]
             fitted.sort(key=lambda state: foreseen(state.model, task.groups).typical_percent)
-        best = fitted[0]
-        if not k and best.chosen[0].rank >= _FREE and best.model.p_value > REMAINDER:
-            # two of little freedom may be what is there
-            simple = [one for one in fitted if one.chosen[0].rank < _FREE][: _FITTED[-1]]
-            pairs = [two for o in simple for two in _extensions(task, o, first, _FITTED[1])[:1]]
-            temper = _temper(best, *pairs)
-            best = max([best, *pairs], key=lambda state: state.worth(temper))
+        best, states = fitted[0], fitted[:width]
+        if best.model.p_value > REMAINDER:
+            # what is left may be noise: one look beside the best set will tell, and one beside
+            # those of little freedom where it has much
+            simple = [one for one in fitted if not one.is_dear] if best.is_dear else []
+            states = [best, *simple][:width]
     return best
 
 
-def _extensions(task, state, first, most):
-    """Return the sets with one cause more, fitted in full, best first."""
-    k = len(state.chosen)
+def _extensions(task, states, known, most):
+    """Return sets with one cause more, fitted in full, best first."""
+    k = len(states[0].chosen)
     # what takes many causes has no names; they are asked for once more at the end
     names = task.library if k <= _NAMES or not task.cells else ()
-    found = _scanned(state.model, names, task.cells) if k else first
+    for state in states:
+        if state.outline not in known:
+            known[state.outline] = _scanned(state.model, names, task.cells)
     instead = partial(_in_place, replace(task, library=names))
-    fitted = _ranked(_fitted(state, found, most, instead))
+    temper = min(known[state.outline].temper for state in states)
+    fitted = _ranked(_fitted(_grown(states, known, temper, most)[:most], temper, instead))
     for more in (_far, _simple, _at_half_a_wave) if not k else ():
-        fitted = _ranked(fitted + more(state, found, fitted, instead))
+        new = more(states[0], known[states[0].outline], fitted, instead)
+        fitted = _ranked(fitted + new)
     return fitted
 
 
@@ -518,20 +530,20 @@ def _ranked(states):
     return sorted(states, key=lambda state: (-round(state.evidence(temper), DECIMALS), state.name))
 
 
-def _fitted(state, found, most, instead):
+def _fitted(grown, temper, instead):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
-    fitted, before, gained = [], state.evidence(found.temper), -np.inf
-    grown = [(sum(o.evidence for o in added), added) for added in _continuations(found, most)]
-    grown = sorted(grown, key=lambda item: -item[0])[:most]
-    for promised, added in progress.steps(grown, "fits"):
-        if promised < _PROMISING * gained:
+    found, most = [], -np.inf
+    for promised, state, added in progress.steps(grown, "fits"):
+        is_dear = any(one.is_dear and one.model.p_value > REMAINDER for one in found)
+        share, before = _HALF if is_dear else _PROMISING, state.evidence(temper)
+        if promised - before < share * (most - before):
             break
         one = _extended(state, added, instead)
         if one is not None:
-            fitted.append(one)
+            found.append(one)
             # where it does more than its derivative promised, others may, too
-            gained = max(gained, min(one.evidence(found.temper) - before, promised))
-    return fitted
+            most = max(most, min(one.evidence(temper), promised))
+    return found
 
 
 def _far(state, found, fitted, instead):
@@ -547,7 +559,7 @@ def _far(state, found, fitted, instead):
 def _simple(state, found, fitted, instead):
     """Return sets of one cause of little freedom, where one of more freedom explains all."""
     # two of them may be what is there, or one whose derivative promises less than it does
-    free = fitted and fitted[0].chosen[0].rank >= _FREE
+    free = fitted and (fitted[0].is_dear or fitted[0].chosen[0].rank >= _FREE)
     if not (free and fitted[0].model.p_value > REMAINDER):
         return []
     best, most = found.best.evidence, _HALF * fitted[0].chosen[0].rank
@@ -598,17 +610,34 @@ def _new(state, added, fitted, instead):
     return [one for one in grown if one is not None]
 
 
+def _grown(states, known, temper, most):
+    """Return evidence, set and causes to add of all continuations of sets, best first."""
+    grown = {}
+    for state in states:
+        for added in _continuations(known[state.outline], most):
+            promised = sum(one.tempered(temper).evidence for one in added)
+            evidence = state.evidence(temper) + promised
+            outline = state.outline.union(one.name for one in added)
+            if outline not in grown or grown[outline][0] < evidence:
+                grown[outline] = (evidence, state, added)
+    found = sorted(grown.values(), key=lambda item: -item[0])
+    if len(states[0].chosen) < _BY_EVIDENCE:
+        return found
+    # sets of several causes are much alike: another cause tells more than the same beside another
+    names = [sorted(one.name for one in added) for _, _, added in found]
+    return [found[i] for i in sorted(range(len(found)), key=lambda i: names[i] in names[:i])]
+
+
 def _continuations(found, most):
     """Return what may be added to a set: one cause, or one in each of the runs."""
-    # two steps near each other may be one between them
-    few = {one.name: one for one in _best_of(found, most) if one.evidence > ENOUGH}.values()
+    few = [one for one in _best_of(found, most) if one.evidence > ENOUGH]
     if found.probes is None or len(found.probes.runs) < 2:
         return [(one,) for one in few]
     first = {}
     for one in [*few, *found.candidates]:
         run = found.probes.run_of(one.cell)
         if run is not None and run not in first and one.evidence > ENOUGH:
-            first[run] = one if any(one is other for other in few) else found.freer(one)
+            first[run] = one if one in few else found.freer(one)
     # the data of two runs are not the same: their causes can be taken together
     return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
 

@@ -25,7 +25,9 @@ from astropolcal.gap.report import to_dict
 #: By words, the constants of each rule and what they are without it.
 RULES = {
     "all rules": {},
+    "several sets side by side": {"selection._WIDTH": (1,)},
     "only promising sets are fitted": {"selection._PROMISING": 0.0},
+    "one cause with much freedom is weighed against two": {"selection._DEAR": np.inf},
     "two of up to four causes are tried as one": {"selection._MERGED": (99, 4)},
     "more than two causes are ranked by left-out frames": {"selection._BY_EVIDENCE": 99},
     "names are asked for beside at most two causes": {"selection._NAMES": 99},
