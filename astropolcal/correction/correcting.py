@@ -182,7 +182,7 @@ def correct(
     >>> float(star.q[0].round(9)), float(star.u[0].round(9))
     (0.02, -0.01)
     """
-    by_variance = isinstance(weights, str)
+    by_variance, given = isinstance(weights, str), frames
     _check(frames, mode, weights, open_directions, n_samples, seed)
     provenance = dict(provenance or {})
     if hasattr(calibration, "datasets"):
@@ -193,22 +193,13 @@ def correct(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
     observable, doubts = _observable(calibration, frames, observable)
-    how = {
-        "components": components,
-        "observable": observable,
-        "pairs": frames.pairs,
-        "weights": None if by_variance else weights,
-        "max_condition": max_condition,
-        "labels": frames.names,
-    }
-    given = frames
+    how = {"components": components, "observable": observable, "max_condition": max_condition}
+    how |= {"pairs": frames.pairs, "labels": frames.names}
+    how["weights"] = None if by_variance else weights
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    # of an ideal instrument frames are off for that alone
+    unmeasured += _of_errors(systematic, by_variance, frames.source)
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
-    unmeasured += [_OPEN] * (systematic is not None and systematic.is_open)
-    # weights by variances that follow the fluxes
-    unmeasured += [_BIASED] * (by_variance and getattr(frames.source, "estimated", False))
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
     division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
@@ -227,9 +218,20 @@ def correct(
         **known,
     )
     # of images single pixels are noise
-    if found.ndim == 2 and (words := impossible(result.polarization())):
+    return result if found.ndim > 2 else _with_warning(result)
+
+
+def _with_warning(result):
+    """Return spectra, and warn of a polarization that no light has."""
+    if words := impossible(result.polarization()):
         warn(f"{words}: too little of I, as of a background that was subtracted twice, or angles")
     return result
+
+
+def _of_errors(systematic, by_variance, source):
+    """Say where errors are open, and what weights by variances that follow the fluxes do."""
+    is_open = systematic is not None and systematic.is_open
+    return [_OPEN] * is_open + [_BIASED] * (by_variance and getattr(source, "estimated", False))
 
 
 def _check(frames, mode, weights, *choices):
@@ -369,7 +371,10 @@ def _uneven(frames):
 
 
 def _disagreement(solution, frames, systematic):
-    """Say that the light of the frames is off the solution by more than the errors allow for."""
+    """Say that the light of the frames is off the solution by more than the errors allow for.
+
+    A solution for an ideal instrument is off for that alone.
+    """
     light, noise = map(np.nan_to_num, frames._light)
     stokes, channels = np.nan_to_num(solution.apply(light)), solution.channels
     off = light - np.einsum("bwfs,sw->bfw", solution.rows[..., : len(stokes)], stokes)
