@@ -131,10 +131,10 @@ def outlying_data(calibration, limit=_FAR):
         members = [where.start + np.flatnonzero(part.group_of_datum == g) for g in groups]
         bright = brightness(part.observations)
         # few data of a wavelength may have a small scatter by chance
-        floor = np.maximum(scales, np.median(scales[where]))
+        size = np.abs(residuals) / np.maximum(scales, np.median(scales[where]))
         for i, whole in enumerate(_departures(scaled, members)):
-            alone = members[i][np.argmax(np.abs(residuals / floor)[members[i]])]
-            times = abs(residuals[alone]) / floor[alone] * tells
+            alone = members[i][np.argmax(size[members[i]])]
+            times = size[alone] * tells
             if max(whole, times / _ALONE) > limit:
                 own, nm = members[i], np.nan
                 if not whole > limit:
