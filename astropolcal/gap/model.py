@@ -522,14 +522,9 @@ def starting_model(calibration, observations, library, say):
     if _may_be_wrong(made):
         discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         found, read, where = _alternatives(chains, observations, made, discrete, say)
-        most = _FAR_BETTER * _misfit(made)
-        if found and found[0][0] < most:
-            say(f"calibrating: {found[0][1].title}")
-            *read, given = read
-            read = _read(found[0][1], *read)
-            best = nominal_calibration(*read)
-            if _misfit(best) < most:
-                return *_with_alternative(*read, given, best, found), where
+        best = _best_alternative(*read, found, say)
+        if best is not None:
+            return *_with_alternative(*best, read[-1]), where
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, [], where
 
@@ -759,17 +754,40 @@ def _left(best, given):
     return float(left / whole)
 
 
-def _with_alternative(edited, observations, given, best, found):
-    """Return the nominal model, and the model of the alternative with its aliases."""
-    least, effect = found[0]
-    effect = effect.changed(left=_left(best, given))
-    model = nominal_model(edited, observations, best)
+def _best_alternative(chains, observations, made, found, say):
+    """Return an alternative that is far better than the nominal calibration, None without one.
+
+    That is its calibration, the chains and datasets of it, and the effect with its aliases.
+    """
+    most, before, best = _FAR_BETTER * _misfit(made), 0.0, None
+    for misfit, effect in found:
+        # what does as much may end in a better minimum where all wavelengths are fitted, and what
+        # gives the same data does not
+        if misfit > most or (best is not None and misfit > _ALIKE * found[0][0]):
+            break
+        if misfit > (1 + _EQUAL) * before:
+            say(f"calibrating: {effect.title}")
+            asked, before = _read(effect, chains, observations), misfit
+            tried = nominal_calibration(*asked)
+            if _misfit(tried) < (most if best is None else _misfit(best[0])):
+                best = tried, asked, misfit, effect
+    if best is not None:
+        *best, misfit, effect = best
+        alike = (other for left, other in found if left < _ALIKE * misfit)
+        return *best, [effect, *(other for other in alike if other is not effect)]
+    return None
+
+
+def _with_alternative(best, asked, effects, given):
+    """Return the nominal model, the model of an alternative, and this with its aliases."""
+    effect = effects[0].changed(left=_left(best, given))
+    model = nominal_model(*asked, best)
     # what fits badly need not converge to be left behind
-    problem = GapProblem(given.chains, observations, like=model.problem)
+    problem = GapProblem(given.chains, asked[1], like=model.problem)
     residual = problem.residual(problem.start)
     nominal = Model(problem, Fit(problem.start, float(residual @ residual), False))
     model.added[effect.name] = []
-    return nominal, model, [effect, *(o for misfit, o in found[1:] if misfit < _ALIKE * least)]
+    return nominal, model, [effect, *effects[1:]]
 
 
 def thinned(chains, observations, count):

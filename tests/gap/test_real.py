@@ -55,7 +55,8 @@ def test_beam_switcher_that_the_model_lacks_is_a_parity(shared_data):
     chains = [remove_optic(chain, "nbs") for chain in CHARIS.chains_for(data)]
     # of very few wavelengths a plate of another thickness explains half of it
     found = diagnose(*thinned(chains, data, 11), cells=False)
-    assert named(found)[0] == PARITY
+    # with a zero of the derotator 45 deg off the same data come out, to rounding
+    assert PARITY <= named(found)[0] <= PARITY | {"derotator_offset"}
     assert found.causes[0].effect.kind == "discrete"
     assert found.gap_after_percent < found.gap_before_percent / 5
 
