@@ -246,18 +246,22 @@ def test_widened_along_a_direction():
     # a third that is known well, and moves where the way bends
     rows = np.array([[3, 3, 0], [0, 0.01, 0], [0, 0, 0.1]])
     before = Covariance(list("abc"), [u.deg] * 3, rows.T @ rows, factor=rows)
-    way = np.array([1.0, 1.0, 0.5])
-    wide = before.widened([(0, 4.0, way), (0, 2.0, way), (1, -3.0, -way)])
+    way, more = np.array([4.0, 4.0, 0.5]), np.array([1.0, 1.0, 0.5])
+    wide = before.widened([(0, way, more), (0, way / 2, more / 2), (1, -way, -more)])
     assert wide.stds[0] == pytest.approx(4)
     assert wide.propagate([1, -1, 0]) ** 0.5 == pytest.approx(0.01, rel=0.1)
     assert wide.stds[2] == pytest.approx(np.hypot(0.1, 0.5))
     np.testing.assert_allclose(np.diag(wide.factor.T @ wide.factor) ** 0.5, wide.stds)
     assert np.linalg.eigvalsh(wide.matrix - before.matrix).min() > -1e-12
-    assert before.widened([(0, 2.9, way)]) == before
+    assert before.widened([(0, way * 2.9 / 4, more)]) == before
     # two ways of one length, up to rounding
     rng = np.random.default_rng(0)
     for rows in rng.normal(size=(300, 40, 3)):
         many = Covariance(list("abc"), [u.mm] * 3, rows.T @ rows, factor=rows)
-        error = many.stds[0] * rng.uniform(1.1, 2)
-        twice = many.widened([(0, error, way), (0, -error, -way)])
-        assert twice.stds[0] == pytest.approx(error)
+        longer = many.stds[0] * rng.uniform(1.1, 2) * way / way[0]
+        twice = many.widened([(0, longer, more), (0, -longer, -more)])
+        assert twice.stds[0] == pytest.approx(longer[0])
+    # what does not go on with the element stays about as well known, however far the way leads
+    for far in (3.0, 30.0, 3e3):
+        way, more = np.array([3 * far, 3, 0]), np.array([3 * far - 3, 0, 0])
+        assert before.widened([(0, way, more)]).stds[1] < 2 * before.stds[1]

@@ -542,9 +542,7 @@ def _along_valleys(measurement, whitened, covariance, view):
     free, factors = measurement.free, measurement.free.factors()
     stds = covariance.stds * factors
     found = bent_valleys(measurement, whitened, stds)
-    wide = covariance.widened(
-        [(i, (direction / factors)[i], beyond / factors) for i, direction, beyond, _ in found]
-    )
+    wide = covariance.widened([(i, way / factors, more / factors) for i, way, more, _ in found])
     sky_of = partial(consequences_along, view)
     return wide, curved_directions(free, measurement.vector(), found, stds, sky_of)
 

@@ -161,16 +161,17 @@ class Covariance:
     def widened(self, directions):
         """Return the covariance where elements move farther, along ways that bend.
 
-        ``directions`` has the element, its error and by how much its way is beyond the straight
-        one, (n,), of each. What another has widened enough before stays.
+        ``directions`` has the element, its way to one standard error and what of this is beyond the
+        straight one, (n,), of each. What another has widened enough before stays.
         """
         variances = np.diag(self.matrix).copy()
         steps = np.array([declared_step(unit) for unit in self.units])
         rows, count = self.factor / steps, len(self.factor)
-        for i, error, beyond in sorted(directions, key=lambda one: -abs(one[1])):
+        for i, way, beyond in sorted(directions, key=lambda one: -abs(one[1][one[0]])):
             # an element that is known exactly has no straight way, and rounding is no widening
-            if error**2 > variances[i] * (1 + _ASYMMETRY) > 0:
-                more = _beyond(rows, i, abs(error) / steps[i], beyond / steps)
+            lacking = (way[i] ** 2 - variances[i]) / steps[i] ** 2
+            if way[i] ** 2 > variances[i] * (1 + _ASYMMETRY) > 0:
+                more = _beyond(lacking, i, way / steps, beyond / steps)
                 rows = np.vstack([rows, *more])
                 variances += np.square(more * steps).sum(axis=0)
         if len(rows) == count:
@@ -253,16 +254,14 @@ class Covariance:
         return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
 
 
-def _beyond(rows, i, error, beyond):
+def _beyond(lacking, i, way, beyond):
     """Return the two rows with which an element has an error, and others that of a way that bends.
 
-    What moves with the element moves as much farther. What else the way does, as it bends, is
-    no more to one side than to the other.
+    They add the way that bends, and leave of the straight one what is not part of it. So what does
+    not go on with the element is no farther, and what bends has the size that it has there.
     """
-    straight = rows.T @ rows[:, i] / np.linalg.norm(rows[:, i])
-    longer = straight / straight[i]
-    bent = straight + beyond * (error - straight[i]) / beyond[i] - error * longer
-    return [np.sqrt(error**2 - straight[i] ** 2) * longer, bent]
+    straight = way - beyond
+    return [np.sqrt(lacking) * way / way[i], straight[i] * way / way[i] - straight]
 
 
 def same_content(a, b):
