@@ -25,6 +25,7 @@ from astropolcal.exceptions import (
     CalibrationFileError,
     FitError,
     ObservationError,
+    ParameterError,
 )
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
@@ -572,5 +573,12 @@ def test_names_alone_hold_parameters_where_they_start():
     for fix in ("hwp.theta", ["hwp.theta"], {"hwp.theta": None}):
         held = calibrate(chain, observations, fix=fix, cross_validate=False)
         assert held.chain["hwp"].theta.fixed
-    with pytest.raises(FitError, match=r"no parameter 'hwp.tetha'.*did you mean 'hwp.theta'"):
-        calibrate(chain, observations, fix=["hwp.tetha"])
+    # the name of an optic stands for all of its parameters, which have no value in common
+    whole = calibrate(chain, observations, fix="hwp", cross_validate=False)
+    assert whole.settings["gauge"].startswith("held: hwp.theta, hwp.retardance;")
+    for fix, words in [
+        (["hwp.tetha"], r"hwp has no parameter 'tetha'.*did you mean 'theta'"),
+        ({"hwp": 0 * u.deg}, "fix: hwp = 0.0 deg: name the parameter .*, of hwp.theta, hwp.ret"),
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            calibrate(chain, observations, fix=fix)
