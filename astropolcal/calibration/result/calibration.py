@@ -432,14 +432,14 @@ class Calibration:
         Parameters
         ----------
         path : path-like
-            The file.
+            The file, with suffix ``.asdf``.
         overwrite : bool
             Whether an existing file may be replaced.
 
         Raises
         ------
         CalibrationFileError
-            If the file exists or cannot be written.
+            If the file exists, has another suffix or cannot be written.
         """
         _above("converters.files").write_calibration(self, path, overwrite=overwrite)
 
