@@ -2,10 +2,9 @@
 """
 How far the gap shrinks on frames that the fit has not seen.
 
-Frames are left out in groups (a derotator angle at a time, in all datasets),
-the model is fitted to the others, and predicts what was left out. The gap is
-the root mean square of the normalized single differences, in percent of
-polarization. Its errors come from a bootstrap over the groups.
+Frames are left out in groups (a derotator angle at a time, in all datasets), the model is fitted to
+the others, and predicts what was left out. The gap is the root mean square of the normalized single
+differences, in percent of polarization. Its errors come from a bootstrap over the groups.
 """
 
 from dataclasses import dataclass

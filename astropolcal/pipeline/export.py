@@ -1,9 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """System Mueller matrices as plain tables, for pipelines in other languages.
 
-A FITS table holds the matrices of both beams of each frame and wavelength with
-their covariances, an ECSV table the same with one number a column. Both say in
-their header what the numbers mean.
+A FITS table holds the matrices of both beams of each frame and wavelength with their covariances,
+an ECSV table the same with one number a column. Both say in their header what the numbers mean.
 """
 
 from pathlib import Path

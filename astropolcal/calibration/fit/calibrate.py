@@ -1,10 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrate a chain against observations, with any astropy fitter.
 
-The joint strategy fits all free parameters of all datasets at once, from a
-start in which every wavelength sits in its best mirror branch. The two-step
-strategy is the procedure of McIntosh et al. (2026, Sec. 5.2): per wavelength
-with misalignments held, then global, then per wavelength again.
+The joint strategy fits all free parameters of all datasets at once, from a start in which every
+wavelength sits in its best mirror branch. The two-step strategy is the procedure of McIntosh et al.
+(2026, Sec. 5.2): per wavelength with misalignments held, then global, then per wavelength again.
 
 Gauge: where the data do not determine all directions, every point along them fits equally well, and
 where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
