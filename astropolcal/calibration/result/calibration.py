@@ -732,14 +732,9 @@ def with_validity(calibration, **stated):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.calibration import with_validity
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> validity_of(with_validity(cal, valid_from="2025-10-01", mode="JHK")).valid_from
     '2025-10-01'
     """

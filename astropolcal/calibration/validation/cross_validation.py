@@ -303,14 +303,9 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import lack_of_fit
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> bool(lack_of_fit(cal.measurement, cal).p_value > 0.01)
     True
     """
