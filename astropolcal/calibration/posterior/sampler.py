@@ -103,19 +103,7 @@ class LogPosterior:
         return self.fitted[self.sampled]
 
     def __call__(self, values):
-        """
-        Return the log-posterior.
-
-        Parameters
-        ----------
-        values : array_like
-            Canonical values, shape (n,) or (n_walkers, n).
-
-        Returns
-        -------
-        float or `~numpy.ndarray`
-            Shape (n_walkers,) for several.
-        """
+        """Return the log-posterior at canonical values, (n,); (n_walkers,) at (n_walkers, n)."""
         values = np.asarray(values, dtype=float)
         if values.ndim not in (1, 2) or values.shape[-1] != self.sampled.size:
             raise ParameterError(

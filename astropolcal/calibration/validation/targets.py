@@ -488,15 +488,10 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.calibration import four_accuracies
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> four_accuracies(cal, simulate(chain, charis.wavelength, frames, seed=3)).colnames
+    >>> from astropolcal.testing import example_calibration
+    >>> standard = example_calibration(seed=3).measurement.datasets[0].observations
+    >>> four_accuracies(example_calibration(), standard).colnames
     ['wavelength', 's_res', 's_mean', 's_cv', 's_standard']
     """
     record = calibration.datasets[dataset]
