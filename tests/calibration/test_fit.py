@@ -25,7 +25,6 @@ from astropolcal.exceptions import (
     CalibrationFileError,
     FitError,
     ObservationError,
-    ParameterError,
 )
 from astropolcal.measurement import Measurement, Tie
 from astropolcal.observations import OBSERVABLES
@@ -577,8 +576,10 @@ def test_names_alone_hold_parameters_where_they_start():
     whole = calibrate(chain, observations, fix="hwp", cross_validate=False)
     assert whole.settings["gauge"].startswith("held: hwp.theta, hwp.retardance;")
     for fix, words in [
-        (["hwp.tetha"], r"hwp has no parameter 'tetha'.*did you mean 'theta'"),
+        ([3], "fix: no optic '3' in the chain; it has lamp, hwp, wollaston"),
+        (["hpw"], r"fix: no optic 'hpw'.*did you mean 'hwp'"),
+        (["hwp.tetha"], r"fix: hwp has no parameter 'tetha'.*did you mean 'theta'"),
         ({"hwp": 0 * u.deg}, "fix: hwp = 0.0 deg: name the parameter .*, of hwp.theta, hwp.ret"),
     ]:
-        with pytest.raises(ParameterError, match=words):
+        with pytest.raises(FitError, match=words):
             calibrate(chain, observations, fix=fix)

@@ -55,7 +55,7 @@ from astropolcal.calibration.validation.cross_validation import (
 )
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
-from astropolcal.exceptions import FitError, warn
+from astropolcal.exceptions import ChainError, FitError, ParameterError, warn
 from astropolcal.files import columns, provenance
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
@@ -302,7 +302,11 @@ def _fixed(chain, fix):
     copies = [item.copy() for item in ([chain] if single else chain)]
     held = {}
     for name, value in fix.items():
-        found = parameters_named(copies, name, "" if value is None else f"fix: {name} = {value}")
+        try:
+            label = "" if value is None else f"{name} = {value}"
+            found = parameters_named(copies, str(name), label)
+        except (ChainError, ParameterError) as error:
+            raise FitError(f"fix: {error}") from None
         held |= found
         for parameter in (each for parameters in found.values() for each in parameters):
             if value is not None:
