@@ -559,6 +559,7 @@ def test_wrong_derivatives_of_an_optic_of_a_user_are_refused(few):
             calibrate(chain, data, cross_validate=False)
 
 
+@pytest.mark.slow
 def test_names_alone_hold_parameters_where_they_start():
     chain = (
         optics.LinearPolarizer(name="lamp", fixed={"theta": False})
