@@ -2,10 +2,9 @@
 """
 Polarimetric calibration with astropy models.
 
-Every optic is an `astropy.modeling` model, a chain of optics is a compound
-model, and a calibration is a fit of the chain to measurements. The names
-below are loaded when they are first used, so that importing the package
-costs next to nothing.
+Every optic is an `astropy.modeling` model, a chain of optics is a compound model, and a calibration
+is a fit of the chain to measurements. The names below are loaded when they are first used, so that
+importing the package costs next to nothing.
 """
 
 from astropolcal.version import version as __version__

@@ -2,10 +2,9 @@
 """
 Every error and warning that astropolcal raises on purpose.
 
-All errors derive from `AstropolcalError`, so that a pipeline can catch
-what the package objects to in one clause; each also derives from the
-builtin that a Python user expects (`ValueError` for a bad value, `KeyError`
-never, because it mangles its message).
+All errors derive from `AstropolcalError`, so that a pipeline can catch what the package objects to
+in one clause; each also derives from the builtin that a Python user expects (`ValueError` for a bad
+value, `KeyError` never, because it mangles its message).
 """
 
 import warnings

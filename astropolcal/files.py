@@ -49,11 +49,11 @@ _KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _KINDS |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "a device")
 
 
-def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
+def check_new(path, overwrite=False, error=AstropolcalError, sources=(), suffix=""):
     """Return the path of a file to write, before the work of writing it is done.
 
-    It is not a folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
-    content.
+    It is not a folder, does not exist unless ``overwrite``, is none of the ``sources`` of the
+    content, and has the ``suffix``, by which it is found again.
     """
     path = Path(path)
     # os.path answers where pathlib raises: the name may be one that no system takes
@@ -64,6 +64,8 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
         raise error(f"{path}: exists already; {ways}")
     if not os.path.isdir(path.parent):
         raise error(f"{path}: cannot be written: there is no folder {path.parent}")
+    if suffix and path.suffix.lower() != suffix:
+        raise error(f"{one_line(path)}: the name must end with {suffix}")
     for source in sources:
         same = False
         # one of them may not be there

@@ -2,9 +2,8 @@
 """
 Refractive indices of the crystals, metals and films that optics are made of.
 
-Each material knows the wavelengths at which it was measured
-(``measured_range``) and those at which its law is evaluated
-(``valid_range``), and refuses any other.
+Each material knows the wavelengths at which it was measured (``measured_range``) and those at which
+its law is evaluated (``valid_range``), and refuses any other.
 """
 
 import tomllib

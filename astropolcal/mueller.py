@@ -2,9 +2,6 @@
 """
 Mueller algebra: pure functions on arrays of shape (..., 4, 4).
 
-The elementary matrices, their derivatives and their rotation; what a matrix does; and which
-matrices nature allows.
-
 An optic of matrix M turned by an angle is ``T(-angle) M T(angle)``; a matrix
 acts on Stokes vectors (I, Q, U, V) in the sense of `astropolcal.stokes`.
 """

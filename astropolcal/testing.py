@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Whether an instrument does what the rest of the package relies on.
+Whether an instrument does what the rest of the package relies on, and a calibration for examples.
 
 `check_instrument` takes any instrument, also one of another package, which can run it in its
 own tests.
@@ -16,6 +16,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal import instruments
+from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves, stages, states_of, system_mueller, with_beam
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
@@ -24,11 +26,11 @@ from astropolcal.measurement.parameters import limits
 from astropolcal.mueller import is_physical
 from astropolcal.observations.grid import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource, StateAnalyser
-from astropolcal.simulation import simulate
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import check_seed
 from astropolcal.words import check_choice
 
-__all__ = ["check_instrument"]
+__all__ = ["check_instrument", "example_calibration"]
 
 # standard deviation by which the true values of free parameters are moved: in radian or 1,
 # and of other dimensions the share of them
@@ -553,3 +555,33 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
     if raises and not report:
         raise InstrumentError(str(report))
     return report
+
+
+def example_calibration(seed=2, **meta):
+    """
+    Calibrate CHARIS with simulated frames of its internal source, for examples.
+
+    Two cycles of the half-wave plate at each of three angles of the derotator, 50, 65 and 80 deg.
+
+    Parameters
+    ----------
+    seed : int
+        Of the noise.
+    **meta
+        Of the table, such as ``date``.
+
+    Returns
+    -------
+    `~astropolcal.calibration.Calibration`
+
+    Examples
+    --------
+    >>> from astropolcal.testing import example_calibration
+    >>> example_calibration(date="2025-10-05")
+    <Calibration of charis from simulated: 49 free parameters, rank 49>
+    """
+    charis = instruments.get("charis")
+    chain = charis.chain(derotator="linear")
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    data = simulate(chain, charis.wavelength, frames, seed=seed, meta=meta)
+    return calibrate(chain, data, instrument="charis")

@@ -202,9 +202,8 @@ def mjd_of(value, name="time"):
 def plain_number(value, kind=float):
     """Return a number, or the one that a text writes in ASCII digits without separators.
 
-    Python reads ``1_000`` and digits of all scripts as numbers; no file of data means them so.
-    What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
-    TypeError.
+    Python reads ``1_000`` and digits of all scripts as numbers; no file of data means them so. What
+    makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or TypeError.
     """
     # true is 1 for Python
     text = value if isinstance(value, str) else "_" * isinstance(value, bool | np.bool_)

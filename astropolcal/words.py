@@ -6,6 +6,7 @@ And how many of them a terminal shows.
 """
 
 import difflib
+import math
 import re
 from collections.abc import Hashable
 from html import escape
@@ -84,6 +85,13 @@ def html(text, table=None):
     """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
     shown = "" if table is None else table._repr_html_()
     return f"<p>{escape(text.removeprefix('<').removesuffix('>'))}</p>{shown}"
+
+
+def with_error(value, form, error=math.nan):
+    """Return a number with its error, as far as they are known: "1.52 +- 0.03", "1.52" or "-"."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:{form}}" + (f" +- {error:{form}}" if math.isfinite(error) else "")
 
 
 def p_words(value):

@@ -56,7 +56,7 @@ _BLOCK, _BLOCK_HEAD = b"\xd3BLK", struct.Struct(">4sHI4sQQQ")
 
 def write_calibration(calibration, path, overwrite=False):
     """Write a calibration to an ASDF file, which appears complete or not at all."""
-    path = check_new(path, overwrite, CalibrationFileError)
+    path = check_new(path, overwrite, CalibrationFileError, suffix=".asdf")
     with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
         buffer = io.BytesIO()
         with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:

@@ -59,21 +59,14 @@ _USUAL = 0.02, 0.5
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """
-    One place, kind and dependence of a small error.
+    """One place, kind and dependence of a small error.
 
-    Parameters
-    ----------
-    place : str
-        ``"source"``, ``"telescope"``, ``"in:OPTIC"`` (the frame that turns with it),
-        ``"after:OPTIC"`` (the frame that is static) or ``"detector"``.
-    kind : str
-        Kind of a `~astropolcal.optics.Perturbation`, or ``"background"``,
-        ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``, or
-        ``"brightness"``, which a gain is where there is one beam.
-    dependence : str
-        As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of
-        several runs only with ``"/dataset:NAME"`` after it.
+    Places are ``"source"``, ``"telescope"``, ``"in:OPTIC"`` (the frame that turns with it),
+    ``"after:OPTIC"`` (the frame that is static) and ``"detector"``. Kinds are those of a
+    `~astropolcal.optics.Perturbation`, and ``"background"``, ``"background_of_one_beam"``,
+    ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``, and ``"brightness"``, which a gain is
+    where there is one beam. Dependences are as a perturbation takes them, and ``"flux"`` and
+    ``"previous"``; in one of several runs only with ``"/dataset:NAME"`` after it.
     """
 
     place: str
@@ -207,19 +200,9 @@ def alike(cells):
 
 @dataclass(frozen=True)
 class Place:
-    """
-    A place in a chain where a perturbation may stand.
+    """A place in a chain where a perturbation may stand, next to the optic ``before`` or ``after``.
 
-    Parameters
-    ----------
-    name : str
-        As in `Cell`.
-    before, after : str or None
-        Name of the optic next to which it is.
-    mount : str or None
-        Stage whose frame it has, with its sign.
-    theta : float
-        Orientation in that frame, radian.
+    Its frame is that of the stage ``mount``, which has a sign, turned by ``theta``, radian.
     """
 
     name: str
@@ -334,17 +317,10 @@ def _waves(dependence, dataset):
 
 
 class Probes:
-    """
-    Derivatives of the data to all cells at a fitted model.
+    """Derivatives of the data to all cells at a fitted model.
 
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    without : collection of str
-        Names of effects of the model that are taken out, to first order.
-    like : Probes, optional
-        Those of the same model, whose derivatives are taken over.
+    ``without`` are the names of its effects that are taken out, to first order; from ``like``,
+    probes of the same model, the derivatives are taken over.
     """
 
     def __init__(self, model, without=(), like=None):
@@ -559,17 +535,10 @@ def _bilinear(row, light, generator):
 
 
 class Reduced:
-    """
-    Sums over the wavelengths, of one place, kind and law, of which dependences are linear maps.
+    """Sums over the wavelengths, of one place, kind and law, of which dependences are linear maps.
 
-    Parameters
-    ----------
-    probes : Probes
-        Derivatives.
-    slopes : dict of int to `~numpy.ndarray`
-        Of each dataset (2, W, F), or several in a list.
-    law : `~numpy.ndarray`
-        Basis of the law in wavelength, shape (W, k).
+    ``slopes`` are those of each dataset by number, (2, W, F), or several in a list; ``law`` is the
+    basis of the law in wavelength, (W, k).
     """
 
     def __init__(self, probes, slopes, law):

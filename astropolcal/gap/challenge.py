@@ -8,7 +8,6 @@ written to files and the answers of any tool can be scored.
 """
 
 import json
-import os
 from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
@@ -19,7 +18,7 @@ from astropy.stats import binom_conf_interval
 from astropy.table import QTable
 
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.files import append_line, atomic_path, understood
+from astropolcal.files import append_line, atomic_path, read_lines, understood
 from astropolcal.gap._bench import DETECTOR, Bench, Fault, Setup
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
@@ -420,28 +419,25 @@ def _journal(path, settings):
     """Return the records of a checkpoint; the first line of the file holds the settings."""
     if path is None:
         return {}
-    text = b""
-    if os.path.exists(path):
-        with understood(path, GapError, "cannot be read"):
-            text = Path(path).read_bytes()
-    if not text:
+    # a line that is damaged, or was cut off, is a challenge to do again
+    found, _ = read_lines(path, _entry, "a checkpoint of challenges", GapError)
+    if not found:
         _append(path, {"settings": settings})
         return {}
-    whole = text[: text.rfind(b"\n") + 1]
-    try:
-        first, *others = [json.loads(line) for line in whole.splitlines()]
-        known = dict(first["settings"])
-        records = {record["index"]: _checked(record) for record in others}
-    except Exception:  # a damaged line may hold anything
-        raise GapError(f"{path}: is not a checkpoint of challenges") from None
+    known = dict(found).get("settings")
+    if known is None:
+        raise GapError(f"{path}: is not a checkpoint of challenges; take another name")
     wrong = [key for key in settings if known.get(key) != settings[key]]
     if wrong:
         raise GapError(f"{path}: is of other settings ({', '.join(wrong)}); remove it")
-    # a run that was killed may have left half a line
-    if len(whole) < len(text):
-        with understood(path, GapError, "cannot be written", reads=False):
-            os.truncate(path, len(whole))
-    return records
+    return {index: record for index, record in found if index != "settings"}
+
+
+def _entry(content):
+    """Return what a line of a checkpoint holds: "settings", or the index of a record; and it."""
+    if "settings" in content:
+        return "settings", dict(content["settings"])
+    return content["index"], _checked(content)
 
 
 def _append(path, content):

@@ -2,9 +2,8 @@
 """
 Diagnosis of the gap between a model and an instrument.
 
-`diagnose` fits the nominal model, measures the gap, asks the library of effects
-which of them the data miss, checks the answer on frames that were left out, and
-says what stays unexplained.
+`diagnose` fits the nominal model, measures the gap, asks the library of effects which of them the
+data miss, checks the answer on frames that were left out, and says what stays unexplained.
 """
 
 import time

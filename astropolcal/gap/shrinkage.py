@@ -2,10 +2,9 @@
 """
 How far the gap shrinks on frames that the fit has not seen.
 
-Frames are left out in groups (a derotator angle at a time, in all datasets),
-the model is fitted to the others, and predicts what was left out. The gap is
-the root mean square of the normalized single differences, in percent of
-polarization. Its errors come from a bootstrap over the groups.
+Frames are left out in groups (a derotator angle at a time, in all datasets), the model is fitted to
+the others, and predicts what was left out. The gap is the root mean square of the normalized single
+differences, in percent of polarization. Its errors come from a bootstrap over the groups.
 """
 
 from dataclasses import dataclass
@@ -28,19 +27,10 @@ _MOST_LEVER = 0.99
 
 @dataclass
 class HeldOut:
-    """
-    Squares of prediction errors, by group.
+    """Prediction errors of each group that was left out: its label and its number of data.
 
-    Parameters
-    ----------
-    labels : list of str
-        What was left out.
-    squares : `~numpy.ndarray`
-        Sum of squared prediction errors of the normalized single difference, one per group.
-    whitened : `~numpy.ndarray`
-        Half the sum of squares of the whitened prediction errors of both channels.
-    counts : `~numpy.ndarray`
-        Number of data of each group.
+    ``squares`` is the sum of squares in the normalized single difference, ``whitened`` half that
+    of the whitened errors of both channels.
     """
 
     labels: list

@@ -2,130 +2,22 @@
 """
 Dual-beam polarimeters that are known from what is public of them; the rest is nominal.
 
-VLT/FORS2, linear imaging and spectropolarimetry in the visible.
+The page "More instruments" of the documentation says of each where its values, keywords and signs
+come from, and what is not known. Where it has no others, a half-wave plate starts at 178 deg, a
+K-mirror at 160 deg, a prism with an efficiency of 0.99 (0.985 at Subaru), a tertiary mirror as bare
+aluminium, and the rest at 0. What the page leaves out:
 
-FORS2 stands at the Cassegrain focus. Its adapter turns with the sky, so that the sky turns
-upstream of the instrument by the position angle of the instrument; the stage ``parallactic`` of
-the chain has this angle, and there is no derotator. Downstream of the collimator are a half-wave
-plate and a Wollaston prism.
-
-Sources: Patat & Romaniello 2006 (the lenses of the collimator polarize; up to 1.5 % at the edges
-of the field), Cikota et al. 2017 (on the axis at most 0.1 %, a function of the wavelength),
-Gonzalez-Gaitan et al. 2020 (imaging in four filters).
-
-ESO's manual (Sec. 4.6.2, as the public code https://github.com/gongsale/FORS2-INSTPOL reads it)
-has angles of polarization too large by 1.54, 1.80, -1.19 and -2.89 deg in the four filters here,
-because the zero of the plate depends on the wavelength: it starts at half of that with the other
-sign, and is free.
-
-Not known from these, and nominal here: the plate has 178 deg, the prism an efficiency of 0.99,
-and what is polarized on the axis starts at 0. The sign of ``ESO ADA POSANG`` is taken as that of a
-position angle from north to east.
-
-VLT/NaCo, near-infrared dual-beam polarimetry at a Nasmyth focus, decommissioned.
-
-The adapter turns the whole instrument downstream of the tertiary mirror M3, so that there is no
-derotator in the beam. Half-wave plate and Wollaston prism are in the instrument, upstream of the
-plate M3 and the mirrors of the adaptive optics. Witzel et al. (2011) find up to 4 % of
-instrumental polarization in Ks, from bare aluminium on M3 and what is downstream of it, and an
-angle of the plate of 13.2 deg off the header until autumn 2009; a measurement in Proc. SPIE 9147,
-87 (2014) finds 1.8 +/- 0.5 deg.
-
-``ESO INS ADC1 ENC`` is the encoder of the plate, 4096 steps a turn from 205 steps below zero
-(NACO manual, as the public pipeline PIPPIN reads it, https://github.com/samderegt/PIPPIN-NACO).
-``ESO ADA POSANG`` is the position angle of the instrument.
-
-Not known, and assumed or nominal here: the signs of these angles, the retardance of the plate (178
-deg), the efficiency of the prism (0.99). The mirrors downstream of M3, which do not turn against
-the plate, are one diattenuator that starts at 0. Wire grids instead of the prism are not included.
-
-Keck II/NIRC2, near-infrared dual-beam polarimetry downstream of the adaptive optics.
-
-A half-wave plate stands upstream of the K-mirror of the adaptive optics, at the Nasmyth
-focus, and a Wollaston prism. Chain, keywords and signs are those of the public pipeline
-NIRC2Pol-DPP, https://github.com/UCSB-Exoplanet-Polarimetry-Lab/NIRC2Pol-DPP (its Eq. 3: for ideal
-optics Q and U are turned by -2 PARANG + 2 EL + 2 ROTPDEST + 4 offset of the plate; ROTPDEST is
-twice the angle of the K-mirror on the bench). So plate, K-mirror and altitude count the other way
-here than at Subaru. The offset of the plate is found on sky; the pipeline's log has 10.4 to 11.4
-deg in J, H and Kp in June 2026, known up to 45 deg, so that it is free within half of that.
-
-Not published, and nominal here: the retardances of plate and K-mirror (178 and 160 deg), the
-tertiary mirror (aluminium), the efficiency of the prism (0.99). A model is announced as Zhang et
-al. 2026; no values were public.
-
-Magellan/MagAO-X, visible polarimetry with two cameras and a polarizing beam splitter.
-
-From its handbook, https://www.magao-x.org/docs/handbook/operating/polarimetry.html, a work
-in progress: a half-wave plate, a cube that sends horizontal polarization to camsci1 and vertical
-to camsci2, the difference camsci2 - camsci1, and the keywords of the plate's angles. So camsci2 is
-the right beam here. From the public calibration https://github.com/mileslucas/2025_magaox_polcal:
-the plate stands upstream of the K-mirror, whose keyword is ``STAGEK POS``, and static retarders
-downstream of it are not negligible there; no values of them are published.
-
-Not known, and assumed here: plate and K-mirror count as at Subaru, and the tertiary mirror is bare
-aluminium. The retardances (178 and 160 deg, and 0 of the static optics) and the efficiency of the
-cube (0.99) are nominal. Real frames have not been seen.
-
-Gemini South/GPI, near-infrared dual-beam polarimetry at the straight Cassegrain focus.
-
-It turns with the telescope, so that the sky turns upstream of it by the parallactic angle, and
-there is no derotator. The half-wave plate is downstream of the adaptive optics, the Wollaston
-prism downstream of the lenslets (Perrin et al. 2015). What polarizes is all upstream of the plate:
-Wiktorowicz et al. (2014) measured how unpolarized light leaves it in the band H. Millar-Blanchaer
-et al. (2016) find it to be the same at all wavelengths within their errors.
-
-The public pipeline, https://github.com/geminiplanetimager/gpi_pipeline, gives keywords and signs
-(primitive ``gpi_combine_polarization_sequence``): the sky is turned by ``PAR_ANG`` and the plate
-stands at ``WPANGLE`` + 29.14 deg. It has the retardances of the plate measured in the laboratory,
-within 7 deg of half a wave. Both are starts here, and free. That of K2 is above half a wave, and
-starts as far below it: linear polarization does not tell the two apart.
-
-Not known from these, and nominal here: the efficiency of the prism, 0.99.
-
-Coronagraph of the Nancy Grace Roman Space Telescope, linear polarimetry in bands 1 and 4.
-
-One of two Wollaston prisms is in the beam, clocked by 45 deg, so that q and u are measured one
-after the other (Groff et al.); nothing modulates. Rolls of the spacecraft turn the sky. The
-centres of the bands, the keywords ``ROLL`` and ``DPAMNAME``, and the sign of the roll (the angle of
-polarization on the detector is that on the sky plus the roll) are those of the public pipeline
-corgidrp, https://github.com/roman-corgi/corgidrp.
-
-Not known, and nominal here: what telescope and coronagraph do to polarized light, the efficiency
-of the prisms (0.99), and by how much their clocking departs from 0 and 45 deg. There is no
-polarizer on board: standard stars calibrate it.
-
-Instruments at Subaru's telescope that share the half-wave plate and derotator of CHARIS.
-
-HiCIAO, decommissioned: Hashimoto (slides of the SEEDS project on its polarimetric calibration)
-gives bare silver with n = 0.3 + 11.7i at 1.6 um for the tertiary mirror, which makes 0.3 % of
-polarization, and three silver mirrors with silica for the derotator. The silver of the tables
-here, another film, makes 0.55 % in H. The keywords of plate, derotator and altitude are those that
-public code reads of its frames. Not known, and nominal here: the efficiency of its Wollaston prism
-(0.985), and what the adaptive optics do to polarized light. A double Wollaston prism gave each
-polarization twice: add the fluxes of the two images.
-
-IRCS, imaging and spectropolarimetry with adaptive optics: plate and derotator are in the wave plate
-unit of the Nasmyth platform. Its plate for 2 to 5 um (described in a paper of the polarimetric mode
-of IRCS in the thermal infrared, with efficiencies of 90 to 98 %) is another one and not included.
-Not known, and nominal here: the efficiency of its Wollaston prism (0.985), what the adaptive optics
-and the camera do to polarized light, and what the Nasmyth beam switcher changed for it. The
-keywords are those of the same plate and derotator in CHARIS; headers of IRCS have not been seen.
-
-SCExAO/Fast-PDI, polarimetry with a fast camera: the public pipeline fastpdi_dpp,
-https://github.com/scexao-org/fastpdi_dpp, has a polarizing beam splitter, a liquid crystal that
-may be out of the beam, and the bands Y, J and H. The constants in its model carry the names of
-filters of VAMPIRES and are not taken. Not known, and nominal here: the liquid crystal has half a
-wave and switches by 45 deg, the beam splitter an efficiency of 0.985. What the bench does to
-polarized light, with the quarter-wave plates that the pipeline's model has upstream of the liquid
-crystal, is not known and left out, and what the Nasmyth beam switcher changed.
-
-SCExAO/REACH, the spectrograph IRD at high resolution, fed by single-mode fibres: the public
-pipeline pyird, https://github.com/prvjapan/pyird, has their spectra in Y, J and H. Nothing was
-found in public about its polarimetry. Assumed here: two fibres with the two polarizations of a
-beam splitter downstream of the derotator, of efficiency 0.985. What fibres and bench do to
-polarized light is not known and left out, and what the Nasmyth beam switcher changed.
-
-The retardance of the derotator in Y starts at its published value at 1.16 um in both of SCExAO.
+- NaCo: the encoder of the plate has 4096 steps a turn, from 205 steps below zero (NACO manual).
+- NIRC2: the pipeline's ROTPDEST (its Eq. 3) is twice the angle of the K-mirror on the bench.
+- GPI: the plate's retardance in K2 is above half a wave, and starts as far below it, which linear
+  polarization does not tell apart. Signs are of ``gpi_combine_polarization_sequence``.
+- HiCIAO: bare silver of n = 0.3 + 11.7i at 1.6 um (Hashimoto) makes 0.3 % of polarization; that
+  of the tables here, another film, 0.55 % in H. Its keywords are those that public code reads.
+- IRCS: the keywords are those of the same plate and derotator in CHARIS; no header has been seen.
+- Fast-PDI: the constants in the model of fastpdi_dpp carry the names of filters of VAMPIRES and
+  are not taken, nor are its quarter-wave plates upstream of the liquid crystal.
+- REACH: the public pipeline pyird, https://github.com/prvjapan/pyird, has the bands Y, J and H.
+- In Y the derotator of both of SCExAO starts at its published value at 1.16 um.
 """
 
 import astropy.units as u
@@ -141,7 +33,8 @@ __all__ = []
 
 # of the plate of NaCo: one of 4096 (deg)
 _STEP = 360 / 4096
-# of that of FORS2 in b_HIGH, v_HIGH, R_SPECIAL and I_BESS (deg)
+# of that of FORS2 in b_HIGH, v_HIGH, R_SPECIAL and I_BESS (deg): half of the error of angles that
+# ESO's manual (Sec. 4.6.2) has, with the other sign
 _FORS2_ZERO = (-0.77, -0.90, 0.595, 1.445)
 
 

@@ -2,10 +2,9 @@
 """
 A measurement as one fittable model: index of a datum in, predicted datum out.
 
-Every stock astropy fitter takes it: the parameters are scalars, the free
-parameters of the chains in their units, and ``fit_deriv`` is analytic. Inside
-of the package a measurement is asked for vectors, which are canonical: radian,
-micrometre or 1.
+Every stock astropy fitter takes it: the parameters are scalars, the free parameters of the chains
+in their units, and ``fit_deriv`` is analytic. Inside of the package a measurement is asked for
+vectors, which are canonical: radian, micrometre or 1.
 """
 
 import copy as copy_module

@@ -24,11 +24,11 @@ from numbers import Real
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import join, leaves
+from astropolcal.chain import find_optic, join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics._modelling import FrozenNormal
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import check_choice, check_type, counted
+from astropolcal.words import check_choice, check_type, counted, did_you_mean
 
 __all__ = ["Normal", "Tie", "parameter_table"]
 
@@ -198,6 +198,29 @@ def are_outside(values, low, high):
     slack = _ROUNDING * np.maximum(1.0, np.abs(values))
     # written so that NaN is outside
     return ~((values >= low - slack) & (values <= high + slack))
+
+
+def parameters_named(chains, name, label=""):
+    """
+    Return by name the parameters that ``"optic.parameter"`` names, or ``"optic"`` alone, all of it.
+
+    A ``label`` is of an option that gives a value, which only a single parameter can have.
+    """
+    optic, _, key = name.partition(".")
+    # optics of one name are one optic to the fit, so that all get the same
+    table = parameter_table(chains)
+    own = {each: table[each] for each in table if each.partition(".")[0] == optic}
+    if not own:
+        find_optic(chains[0], optic)
+    found = {each: own[each] for each in own if not key or each == name}
+    if not found:
+        keys = [each.partition(".")[2] for each in own]
+        hint = did_you_mean(key, keys)
+        raise ParameterError(f"{optic} has no parameter {key!r}; it has {', '.join(keys)}{hint}")
+    if label and len(found) > 1:
+        known = ", ".join(found)
+        raise ParameterError(f"{label}: name the parameter that has this value, of {known}")
+    return found
 
 
 def with_own(chains, names, own, ties=None):

@@ -8,11 +8,8 @@ degrees further; of four frames see `NormalizedTripleDifference`), ``W`` wavelen
 The derivatives are analytic, because a fit evaluates them at every step. The names X and I follow
 Sec. 2.2 of the CHARIS recalibration paper.
 
-Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ, or both.
-
-Pairs are found from the angles, never from the order of the rows: the angles
-must differ by 45 degrees modulo 180, the derotator must be static and the
-modulator must be in the same state. Among the candidates the nearest in time wins.
+The frames of a pair have half-wave plates 45 degrees apart, or modulators that differ, or both.
+They are found from angles and states, never from the order of the rows, see ``pair_frames``.
 """
 
 from abc import ABC, abstractmethod

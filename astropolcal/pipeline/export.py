@@ -1,9 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """System Mueller matrices as plain tables, for pipelines in other languages.
 
-A FITS table holds the matrices of both beams of each frame and wavelength with
-their covariances, an ECSV table the same with one number a column. Both say in
-their header what the numbers mean.
+A FITS table holds the matrices of both beams of each frame and wavelength with their covariances,
+an ECSV table the same with one number a column. Both say in their header what the numbers mean.
 """
 
 from pathlib import Path
@@ -69,14 +68,9 @@ def mueller_table(calibration, header=None, *, positions=None, light="sky", wave
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.pipeline import load, mueller_table
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> table = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> calibrate(chain, table, instrument="charis").write("to_export.asdf")
+    >>> from astropolcal.testing import example_calibration
+    >>> example_calibration().write("to_export.asdf")
     >>> positions = {"hwp": [0, 22.5] * u.deg, "derotator": [60, 60] * u.deg}
     >>> rows = mueller_table(load("to_export.asdf"), positions=positions, light="internal")
     >>> len(rows), rows["mueller_right"].shape

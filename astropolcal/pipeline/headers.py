@@ -36,13 +36,12 @@ from astropolcal.instruments.layout import ANGLES, TEXTS, frame_time, frame_valu
 from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import dates_of, numeric_column
 from astropolcal.optics.positions import PLACES
-from astropolcal.units import plain_number
 
 __all__ = []
 
 _SKY = ("right_ascension", "declination")
-# columns that are no angles of a stage, though their values may be numbers
-_OTHERS = {"exposure_time", "exposures", "mjd", *TEXTS} - {*_SKY, "flc_state"}
+# of what positions depend on in any layout; the number of a state counts as an angle
+_UNITS = dict.fromkeys((*ANGLES, *_SKY), u.deg) | {"flc_state": u.rad}
 
 
 def describe(header, instrument=None, stated=()):
@@ -123,28 +122,26 @@ class FrameAngles:
             raise ObservationError("no header: at least one frame is needed")
         self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
         self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
-        self._layout, self.keywords = layout, layout.keywords
-        self.n_frames, headers = len(headers), [layout.from_header(header) for header in headers]
-        table = QTable({"frame": np.arange(self.n_frames)})
-        for column in (c for c in layout.keywords if c not in _OTHERS):
-            values = [look_up([header], column, layout)[1] for header in headers]
-            if column == "flc_state":
-                # a word for no modulation is none
-                values = [v if layout.states.get(str(v).strip(), v) else None for v in values]
+        self.keywords, self.n_frames = layout.keywords, len(headers)
+        self._table = QTable({"frame": np.arange(self.n_frames)})
+        headers = [layout.from_header(header) for header in headers]
+        texts = {*TEXTS, *layout.texts}.difference(_UNITS)
+        for column, keyword in layout.keywords.items():
+            unit = _UNITS.get(column, unit_of(column, layout))
+            if column in texts or not unit.is_equivalent(u.deg):
+                continue
+            values = [_angle(i, header, column, layout) for i, header in enumerate(headers)]
             missing = [i for i, value in enumerate(values) if value is None]
-            # some with and some without is a mixture of modes, or a
-            # broken header; none has it: not there
+            # a mixture of modes, or a broken header
             if 0 < len(missing) < len(values):
-                keyword = layout.keywords[column]
                 raise ObservationError(
                     f"frame {missing[0]}: no {keyword} in the header, others have it"
                 )
-            if not missing:
-                table[column] = self._column(column, values)
+            if not missing and str not in map(type, values):
+                self._table[column] = values * unit
         times = [_time(header, layout) for header in headers]
         if all(time is not None for time in times):
-            table["time"] = Time(times)
-        self._table = table
+            self._table["time"] = Time(times)
 
     @property
     def frames(self):
@@ -156,43 +153,36 @@ class FrameAngles:
         """Names of the columns of `frames`."""
         return self._table.colnames
 
-    def _column(self, column, values):
-        """Return angles as a Quantity, anything else as text."""
-        keyword, layout = self._layout.keywords[column], self._layout
-        if column in _SKY:
-            try:
-                return [sky_angle(column, value) for value in values] * u.deg
-            except ValueError as error:
-                raise ObservationError(f"{column}: {one_line(error)}") from None
-        # states of a modulator, cameras and such
-        texts = np.array([str(value).strip() for value in values])
-        if column not in (*ANGLES, *layout.transforms, "flc_state"):
-            try:
-                _ = [plain_number(value) for value in values]
-            except (TypeError, ValueError):
-                return texts
-        if column != "flc_state" and not unit_of(column, layout).is_equivalent(u.deg):
-            return texts
-        found = []
-        for i, value in enumerate(values):
-            try:
-                found.append(frame_value(column, keyword, value, layout))
-            except ValueError as error:
-                raise ObservationError(f"frame {i}: {error}") from None
-        if column == "flc_state":
-            # as positions have them
-            return [float(state == "B") for state in found] * u.rad
-        return found * (u.deg if column in ANGLES else unit_of(column, layout))
-
     def position(self, column):
         """Return an angle of every frame in radian, a moment, a place, or the number of a state."""
         if column in PLACES:
             return frame_coordinate(self, column)
         if column not in self._table.colnames:
-            keyword = self._layout.keywords.get(column)
+            keyword = self.keywords.get(column)
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"
             raise ObservationError(f"position of {column!r}: {lacking} in the header")
         return numeric_column(self._table, column, self.name, u.rad)
+
+
+def _angle(i, header, column, layout):
+    """Return an angle of frame ``i``, 0 or 1 for a state, as text what is none, or None."""
+    keyword, value = look_up([header], column, layout)
+    if value is None:
+        return None
+    try:
+        if column in _SKY:
+            return sky_angle(column, value)
+        found = frame_value(column, keyword, value, layout)
+    except ValueError as error:
+        # the column of a user may hold what is no angle
+        if column not in (*_UNITS, *layout.transforms) and isinstance(value, str | bool):
+            return str(value)
+        words = f"{column}: {one_line(error)}" if column in _SKY else error
+        raise ObservationError(f"frame {i}: {words}") from None
+    if column == "flc_state":
+        # a word for no modulation is none
+        return float(found == "B") if found else None
+    return found
 
 
 # ---- which of a calibration's chains the light of a frame went through ----

@@ -109,15 +109,9 @@ def parameter_history(calibrations, parameters=None):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.pipeline import parameter_history
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i,
-    ...                                    meta={"date": f"202{i}-03-01"})) for i in (5, 6)]
+    >>> from astropolcal.testing import example_calibration
+    >>> years = [example_calibration(seed=i, date=f"202{i}-03-01") for i in (5, 6)]
     >>> table = parameter_history(years, ["hwp.w_sio2"])
     >>> table["date"].iso[0][:10], len(table)
     ('2025-03-01', 2)
@@ -411,15 +405,9 @@ def changes(calibrations, parameters=None):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.pipeline import changes
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i))
-    ...          for i in (5, 6)]
+    >>> from astropolcal.testing import example_calibration
+    >>> years = [example_calibration(seed=i) for i in (5, 6)]
     >>> changes(years)["what"].tolist()
     ['calibration_polarizer', 'hwp', 'derotator', 'wollaston']
     """

@@ -79,13 +79,9 @@ class SystemMueller(MuellerMatrices):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.pipeline import load
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = load(calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2)))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = load(example_calibration())
     >>> positions = {"hwp": [0, 22.5, 45] * u.deg, "derotator": 60 * u.deg}
     >>> matrices = cal.system_mueller(positions=positions, light="internal")
     >>> matrices.value.shape, matrices[1:].covariance.shape, matrices[0].std.shape
@@ -284,17 +280,12 @@ class LoadedCalibration:
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.pipeline import load
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2)).write("lab.asdf")
+    >>> from astropolcal.testing import example_calibration
+    >>> example_calibration().write("lab.asdf")
     >>> load("lab.asdf")
-    <LoadedCalibration lab.asdf: an instrument, any mode, from any date on, optics in the beam not known>
-    """  # noqa: E501
+    <LoadedCalibration lab.asdf: charis, any mode, from any date on, optics in the beam not known>
+    """
 
     def __init__(self, entry, optics_in=None, stated=None, max_age=None):
         self.calibration = entry.calibration

@@ -71,16 +71,10 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     Examples
     --------
     >>> from pathlib import Path
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.pipeline import Library, health
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> table = simulate(chain, charis.wavelength, frames, seed=1, meta={"date": "2025-03-01"})
+    >>> from astropolcal.testing import example_calibration
     >>> Path("runs").mkdir()
-    >>> _ = Library("runs").add(calibrate(chain, table, instrument="charis"))
+    >>> _ = Library("runs").add(example_calibration(date="2025-03-01"))
     >>> (group,) = health("runs", now="2027-01-01")["groups"]
     >>> print(group["alarms"][0])
     The newest calibration is of 2025-03-01, 671 days old; charis needs one every 365 days.

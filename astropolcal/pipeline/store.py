@@ -100,9 +100,7 @@ def _understood(content, path):
 def export(folder, name, path):
     """Write a context and its files as one archive."""
     files = frozen(folder, name)
-    if Path(path).suffix != ".zip":
-        raise CalibrationFileError(f"{one_line(path)}: the name must end with .zip")
-    check_new(path, error=CalibrationFileError, sources=files)
+    check_new(path, error=CalibrationFileError, sources=files, suffix=".zip")
     with (
         atomic_path(path, CalibrationFileError) as new,
         zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive,

@@ -2,9 +2,8 @@
 """
 Figures of a calibration and of a diagnosis.
 
-Every function returns a `~matplotlib.figure.Figure` and leaves pyplot alone,
-so that figures can be made in a pipeline without a window system. Matplotlib
-is imported when the first figure is drawn.
+Every function returns a `~matplotlib.figure.Figure` and leaves pyplot alone, so that figures can be
+made in a pipeline without a window system. Matplotlib is imported when the first figure is drawn.
 """
 
 from astropolcal.plotting.accuracy import *

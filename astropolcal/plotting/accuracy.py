@@ -64,13 +64,9 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_accuracy
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> goal = {"goal": ([1200, 2300] * u.nm, [0.1, 0.1] * u.percent)}
     >>> plot_accuracy(cal, goal).axes[0].get_ylabel()
     'accuracy (% of polarization)'
@@ -222,14 +218,9 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_target_accuracy
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> len(plot_target_accuracy(cal).axes)
     3
     """

@@ -25,8 +25,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     """
     Draw I, Q, U, Q_phi, U_phi and the error of Q of images.
 
-    Q_phi and U_phi are made as if north were up; where that is not known, the heading
-    states it.
+    Q_phi and U_phi are made as if north were up; where that is not known, the heading states it.
 
     Parameters
     ----------

@@ -74,16 +74,12 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.plotting import plot_gap_spectrum
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
+    >>> data = cal.measurement.datasets[0].observations
+    >>> diagnosis = diagnose(cal, data, effects=["beam_gain"], cross_validate=False)
     >>> len(plot_gap_spectrum(diagnosis).axes)
     2
     """
@@ -133,16 +129,12 @@ def plot_gap_frames(diagnosis, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.plotting import plot_gap_frames
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
+    >>> data = cal.measurement.datasets[0].observations
+    >>> diagnosis = diagnose(cal, data, effects=["beam_gain"], cross_validate=False)
     >>> plot_gap_frames(diagnosis).axes[0].get_xlabel()[:5]
     'frame'
     """
@@ -215,16 +207,12 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.plotting import plot_gap_maps
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
+    >>> data = cal.measurement.datasets[0].observations
+    >>> diagnosis = diagnose(cal, data, effects=["beam_gain"], cross_validate=False)
     >>> plot_gap_maps(diagnosis).axes[0].get_ylabel()
     'wavelength (nm)'
     """
@@ -284,16 +272,12 @@ def plot_cause_map(diagnosis, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
     >>> from astropolcal.plotting import plot_cause_map
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
+    >>> data = cal.measurement.datasets[0].observations
+    >>> diagnosis = diagnose(cal, data, effects=["beam_gain"], cross_validate=False)
     >>> plot_cause_map(diagnosis).axes[0].get_yticklabels()[-1].get_text()
     'detector'
     """

@@ -193,14 +193,9 @@ def plot_retardances(calibration, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_retardances
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> len(plot_retardances(cal).axes)
     2
     """
@@ -271,14 +266,9 @@ def plot_efficiency(calibration, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_efficiency
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> len(plot_efficiency(cal).axes)
     1
     """
@@ -515,15 +505,9 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_history
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i,
-    ...                                    meta={"date": f"202{i}-03-01"})) for i in (5, 6)]
+    >>> from astropolcal.testing import example_calibration
+    >>> years = [example_calibration(seed=i, date=f"202{i}-03-01") for i in (5, 6)]
     >>> len(plot_history(years, ["hwp"]).axes)
     3
     """

@@ -258,13 +258,9 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.plotting import plot_double_differences
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> len(plot_double_differences(cal, [1330, 1575] * u.nm).axes)
     4
     """

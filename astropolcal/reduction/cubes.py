@@ -2,10 +2,9 @@
 """
 Simulated image cubes: both beams of any chain, as FITS files of an instrument.
 
-The fluxes of the beams are those of `astropolcal.simulation.simulate`. A star
-is an image with a core and a halo in each beam, the internal source a flat
-field; both are seen through the field stop, of which the beam splitter makes
-two images.
+The fluxes of the beams are those of `astropolcal.simulation.simulate`. A star is an image with a
+core and a halo in each beam, the internal source a flat field; both are seen through the field
+stop, of which the beam splitter makes two images.
 """
 
 import os
@@ -234,11 +233,10 @@ def simulate_cubes(
     instrument : Instrument
         With a `~astropolcal.instruments.FileLayout`.
     frames : `~astropy.table.QTable`
-        One row per frame: ``hwp`` as commanded, ``derotator`` and anything else
-        the chain needs; for a star ``parallactic`` and ``altitude``. A column
-        ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` those of
-        ``files``; ``em_gain`` and ``read_mode`` tell how the detector is read out. All columns
-        that the layout has a keyword for are written.
+        One row per frame: ``hwp`` as commanded, ``derotator`` and anything else the chain needs;
+        for a star ``parallactic`` and ``altitude``. A column ``hwp_true`` replaces the tracking
+        law, ``time`` and ``exposure_time`` those of ``files``; ``em_gain`` and ``read_mode`` tell
+        how the detector is read out. All columns that the layout has a keyword for are written.
     wavelength : `~astropy.units.Quantity`, optional
         Of the slices; by default the instrument's.
     source : {"internal", "star"}

@@ -238,9 +238,8 @@ def reduce_run(
     progress : bool
         Whether to show how far it is; on a terminal only.
     hwp_sequence : sequence of float, optional
-        Commanded angles in degree, which replace those of the headers, in turn and
-        in the order of the frames; for headers that are known to be wrong. Every file has to be
-        usable then.
+        Commanded angles in degree, which replace those of the headers, in turn and in the order of
+        the frames; for headers that are known to be wrong. Every file has to be usable then.
     keep_repeats : bool
         Whether frames of an internal source are kept whose half-wave plate stands
         90 deg from that of another frame at the same derotator angle.

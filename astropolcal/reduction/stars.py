@@ -2,11 +2,9 @@
 """
 Stars in the beams of an image: found, fitted with Gaussians, and measured at each wavelength.
 
-References
-----------
-McIntosh et al. 2026: a two-dimensional Gaussian gives centre and width, the
-aperture is three full widths in radius but at most 45 pixels, and the median
-of a ring of 5 pixels around it is the background.
+As in McIntosh et al. 2026 a two-dimensional Gaussian gives centre and width, the aperture is three
+full widths in radius but at most 45 pixels, and the median of a ring of 5 pixels around it is the
+background.
 """
 
 from collections import namedtuple

@@ -6,9 +6,7 @@ What an aperture measures lacks the wings beyond it, and the wings in the ring a
 background. A field stop cuts them before they reach the detector. So the light outside cannot be
 summed; a profile is fitted to the part that is seen, and integrated.
 
-References
-----------
-Moffat 1969, A&A 3, 455: the profile. Its exponent is 11/6 in the wings of a
+The profile is that of Moffat 1969, A&A 3, 455. Its exponent is 11/6 in the wings of a
 seeing-limited image (Racine 1996, PASP 108, 699).
 """
 

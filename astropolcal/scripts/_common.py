@@ -28,7 +28,7 @@ from astropolcal.observations import Observations
 from astropolcal.observations.pointings import sky_angle
 from astropolcal.progress import clear
 from astropolcal.units import mjd_of, plain_number
-from astropolcal.words import HEIGHT, WIDTH, counted, did_you_mean, listed, shortened
+from astropolcal.words import HEIGHT, WIDTH, counted, listed, shortened
 
 # the first bytes of files that may be taken for tables, and where they belong instead
 _NO_TABLES = {
@@ -538,7 +538,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             parameter.fixed = False
     for text in fix:
         name, _, value = text.partition("=")
-        for parameter in _valued(chains, name, f"--fix {text}" if value else ""):
+        for parameter in _parameters(chains, name, f"--fix {text}" if value else ""):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
@@ -548,7 +548,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             warn(message)
     for text in prior:
         name, _, value = text.partition("=")
-        for parameter in _valued(chains, name, f"--prior {text}"):
+        for parameter in _parameters(chains, name, f"--prior {text}"):
             parameter.prior = _normal(name, parameter, value)
             parameter.fixed = False
     return chains
@@ -603,31 +603,11 @@ def _check_fixed(fix, free, prior):
             )
 
 
-def _parameters(chains, name):
+def _parameters(chains, name, label=""):
     """Return the parameters that ``optic.parameter`` or ``optic`` names, in all chains."""
-    optic, _, key = name.partition(".")
-    # optics of one name are one optic to the fit, so that all get the same
-    carriers = [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic]
-    if not carriers:
-        find_optic(chains[0], optic)
-    found = []
-    for leaf in carriers:
-        if key and key not in leaf.param_names:
-            known = ", ".join(leaf.param_names)
-            hint = did_you_mean(key, leaf.param_names)
-            raise ParameterError(f"{optic} has no parameter {key!r}; it has {known}{hint}")
-        found += [getattr(leaf, each) for each in ([key] if key else leaf.param_names)]
-    return found
+    from astropolcal.measurement.parameters import parameters_named
 
-
-def _valued(chains, name, option):
-    """Return the same, of a single parameter where an option gives it a value."""
-    found = _parameters(chains, name)
-    keys = list(dict.fromkeys(parameter.name for parameter in found))
-    if option and len(keys) > 1:
-        known = ", ".join(f"{name}.{key}" for key in keys)
-        raise ParameterError(f"{option}: name the parameter that has this value, of {known}")
-    return found
+    return [one for same in parameters_named(chains, name, label).values() for one in same]
 
 
 def _normal(name, parameter, text):

@@ -22,7 +22,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.scripts import _common as common
 from astropolcal.standards.priors import assumed_polarization
 from astropolcal.standards.visibility import SITES, location
-from astropolcal.words import counted, did_you_mean
+from astropolcal.words import counted, did_you_mean, with_error
 
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
@@ -101,7 +101,7 @@ def _one(arguments):
         # the format z: what rounds to zero has no sign
         f"  altitude     {low:z.1f} to {high:z.1f} deg",
         f"  parallactic  {first:z.1f} to {last:z.1f} deg",
-        f"  M3 error     {_pair(error, '.3f')} of one frame's error (32 frames)",
+        f"  M3 error     {with_error(error, '.3f')} of one frame's error (32 frames)",
     ]
     return lines, content, [seen], 1
 
@@ -132,10 +132,10 @@ def _describe(star, known):
     if known is not None:
         lines += ["", "  In a calibration"]
         for row in known["stokes"]:
-            degree = f"{_pair(row['p_percent'], '.2f', row['p_err_percent'])} %"
+            degree = f"{with_error(row['p_percent'], '.2f', row['p_err_percent'])} %"
             what = f"q, u {degree}"
             if row["theta_deg"] is not None:
-                angle = _pair(row["theta_deg"], ".1f", row["theta_err_deg"])
+                angle = with_error(row["theta_deg"], ".1f", row["theta_err_deg"])
                 what = f"p {degree}, theta {angle} deg"
             lines.append(f"    {row['wavelength_um']:.2f} um   {what}")
         lines += [common.wrapped(f"    - {words}", indent=6) for words in known["words"]]
@@ -143,20 +143,13 @@ def _describe(star, known):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]
     for row in star.polarization:
         mark = " " if row["checked"] else "*"
-        degree = _pair(row["p"].value, ".3f", row["p_err"].value)
-        angle = _pair(row["theta"].value, ".1f", row["theta_err"].value)
+        degree = with_error(row["p"].value, ".3f", row["p_err"].value)
+        angle = with_error(row["theta"].value, ".1f", row["theta_err"].value)
         text = f"{mark} {row['band']:<8}  {row['wavelength'].value:.2f}   {degree:<13} {angle:<13}"
         lines.append(f"{text} {row['reference']}")
     if not star.checked:
         lines.append("  * partly from memory: compare with the source before use")
     return lines
-
-
-def _pair(value, form, error=math.nan):
-    """Return a number with its error, as far as they are known."""
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:{form}}" + (f" +- {error:{form}}" if math.isfinite(error) else "")
 
 
 # ---- many stars ---------------------------------------------------------------------
@@ -223,7 +216,7 @@ def _table(found, band=None):
         hours = row["ra"].value / 15
         clock = f"{int(hours):02d} {60 * (hours % 1):04.1f}"
         away = f"  {row['separation'].value:5.1f}" if near else ""
-        degree = f"{_pair(row['p'].value, '.3f', row['p_err'].value):<15}"
+        degree = f"{with_error(row['p'].value, '.3f', row['p_err'].value):<15}"
         mark = " " if _has_degree(row, band) else "*"
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+z6.1f}   "
@@ -240,7 +233,7 @@ def _night_table(found):
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:z2.0f} to "
             f"{high:z2.0f}  {first:z4.0f} to {last:z4.0f}  {row['hours'].value:4.1f} "
-            f"{_pair(row['m3_error'], '6.3f'):>6}  {_pair(row['m3_score'], '6.3f'):>6}"
+            f"{with_error(row['m3_error'], '6.3f'):>6}  {with_error(row['m3_score'], '6.3f'):>6}"
         )
     return [
         *lines,

@@ -617,6 +617,11 @@ def test_inconsistent_calibration_is_not_written(calibration, path):
         assert_not_written(dataclasses.replace(calibration, **change), path, message)
 
 
+def test_only_names_that_a_folder_is_searched_for_are_written(calibration, tmp_path):
+    for name in ("cal.fits", "cal", "cal.asdf.gz"):
+        assert_not_written(calibration, tmp_path / name, f"{name}: the name must end with .asdf")
+
+
 def test_identifiability_of_another_size_is_not_written(calibration, path):
     for key in ["singular_values", "null_vectors", "identifiable"]:
         wrong = dataclasses.replace(calibration.identifiability, **{key: np.zeros((2, 2))})

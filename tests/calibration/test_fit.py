@@ -559,6 +559,7 @@ def test_wrong_derivatives_of_an_optic_of_a_user_are_refused(few):
             calibrate(chain, data, cross_validate=False)
 
 
+@pytest.mark.slow
 def test_names_alone_hold_parameters_where_they_start():
     chain = (
         optics.LinearPolarizer(name="lamp", fixed={"theta": False})
@@ -572,5 +573,14 @@ def test_names_alone_hold_parameters_where_they_start():
     for fix in ("hwp.theta", ["hwp.theta"], {"hwp.theta": None}):
         held = calibrate(chain, observations, fix=fix, cross_validate=False)
         assert held.chain["hwp"].theta.fixed
-    with pytest.raises(FitError, match=r"no parameter 'hwp.tetha'.*did you mean 'hwp.theta'"):
-        calibrate(chain, observations, fix=["hwp.tetha"])
+    # the name of an optic stands for all of its parameters, which have no value in common
+    whole = calibrate(chain, observations, fix="hwp", cross_validate=False)
+    assert whole.settings["gauge"].startswith("held: hwp.theta, hwp.retardance;")
+    for fix, words in [
+        ([3], "fix: no optic '3' in the chain; it has lamp, hwp, wollaston"),
+        (["hpw"], r"fix: no optic 'hpw'.*did you mean 'hwp'"),
+        (["hwp.tetha"], r"fix: hwp has no parameter 'tetha'.*did you mean 'theta'"),
+        ({"hwp": 0 * u.deg}, "fix: hwp = 0.0 deg: name the parameter .*, of hwp.theta, hwp.ret"),
+    ]:
+        with pytest.raises(FitError, match=words):
+            calibrate(chain, observations, fix=fix)

@@ -273,7 +273,7 @@ def test_without_a_choice_there_is_no_gauge(observations):
 def test_nonsense_is_refused(observations):
     for options, error, complaint in [
         ({"gauge": "landau"}, FitError, "allowed are minimal, None"),
-        ({"fix": {"hwp.tilt": None}}, FitError, "no parameter 'hwp.tilt'"),
+        ({"fix": {"hwp.tilt": None}}, FitError, "fix: hwp has no parameter 'tilt'"),
         ({"fix": {"hwp.theta": 1 * u.mm}}, ParameterError, "not convertible"),
         ({"fix": {"hwp.theta": 1}}, ParameterError, "needs a unit"),
         ({"fix": {"hwp.theta": [1, 2] * u.deg}}, FitError, r"\[1. 2.\] deg; allowed is one value$"),

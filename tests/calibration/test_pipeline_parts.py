@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What stands between a header and a Mueller matrix: wavelengths, chains, angles, statements."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -275,6 +276,22 @@ def test_angles_that_cannot_be_used():
     instrument = SimpleNamespace(name="lab", files=None, headers=None)
     with pytest.raises(InstrumentError, match="lab: no map of header keywords; give positions"):
         FrameAngles([_header()], instrument)
+
+
+def test_columns_of_a_user_may_hold_what_is_no_angle():
+    files = replace(CHARIS.files, keywords=CHARIS.files.keywords | {"slit": "SLIT", "lamp": "LAMP"})
+    lab = SimpleNamespace(name="lab", files=files)
+    for slit, lamp, angles in [
+        ("open", True, {}),
+        (30.0, "off", {"slit": 30}),
+        ("12", 1, {"slit": 12, "lamp": 1}),
+    ]:
+        frames = FrameAngles([_header(SLIT=slit, LAMP=lamp)] * 2, lab)
+        for name, angle in angles.items():
+            np.testing.assert_allclose(frames.position(name), np.deg2rad([angle, angle]))
+        np.testing.assert_allclose(frames.position("hwp"), np.deg2rad([22.5, 22.5]))
+    with pytest.raises(ObservationError, match=r"frame 0: SLIT = 1000\.0, allowed"):
+        FrameAngles([_header(SLIT=1e3)], lab)
 
 
 def test_positions_on_sky_may_be_sexagesimal_or_degrees():

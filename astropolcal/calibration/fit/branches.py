@@ -333,10 +333,9 @@ def undecided_signs(measurement, view, stds):
     These are phases, and diattenuations, of which the other sign, all else of the wavelength
     refitted, and of a few wavelengths everything, is less than three standard deviations worse, or
     better. Phases that fit exactly as well are a mirror solution anyway; what is zero within three
-    of its ``stds`` has no sign.
-    With them the mean squares of the errors of q and u that the other signs would be on sky, times
-    their probabilities: in proportion to the polarization and apart from it, (2, n_wavelengths);
-    zero where the phases beside tell the sign.
+    of its ``stds`` has no sign. With them the mean squares of the errors of q and u that the other
+    signs would be on sky, times their probabilities: in proportion to the polarization and apart
+    from it, (2, n_wavelengths); zero where the phases beside tell the sign.
     """
     problem = BinProblem(measurement, measurement.weighting)
     vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))

@@ -1,10 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrate a chain against observations, with any astropy fitter.
 
-The joint strategy fits all free parameters of all datasets at once, from a
-start in which every wavelength sits in its best mirror branch. The two-step
-strategy is the procedure of McIntosh et al. (2026, Sec. 5.2): per wavelength
-with misalignments held, then global, then per wavelength again.
+The joint strategy fits all free parameters of all datasets at once, from a start in which every
+wavelength sits in its best mirror branch. The two-step strategy is the procedure of McIntosh et al.
+(2026, Sec. 5.2): per wavelength with misalignments held, then global, then per wavelength again.
 
 Gauge: where the data do not determine all directions, every point along them fits equally well, and
 where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
@@ -56,14 +55,14 @@ from astropolcal.calibration.validation.cross_validation import (
 )
 from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.chain import leaves
-from astropolcal.exceptions import FitError, warn
+from astropolcal.exceptions import ChainError, FitError, ParameterError, warn
 from astropolcal.files import columns, provenance
-from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import as_pairs, refuse_repeated
-from astropolcal.measurement.parameters import with_own
+from astropolcal.measurement.parameters import parameters_named, with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.words import check_choice, did_you_mean
+from astropolcal.words import check_choice
 
 __all__ = ["calibrate"]
 
@@ -152,7 +151,7 @@ def calibrate(
         a bootstrap and samples take them as known, and may be a third narrower.
     fix : str or sequence of str, or dict of str to `~astropy.units.Quantity` or None, optional
         Parameters to hold, ``"optic.parameter"``, at a value or (None, or a name alone) at
-        that of the chain: another way to choose a gauge.
+        that of the chain: another way to choose a gauge. ``"optic"`` holds all of its parameters.
     instrument : str, optional
         Name to record.
     errors : {"scatter", "white"}
@@ -197,14 +196,14 @@ def calibrate(
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     if not isinstance(fix, Mapping):
         fix = dict.fromkeys([fix] if isinstance(fix, str) else fix or ())
-    chain = _fixed(chain, fix) if fix else chain
+    chain, held = _fixed(chain, fix) if fix else (chain, ())
     copies = {}
     if own:
         chains, tables, _ = zip(*as_pairs(chain, observations, positions), strict=True)
         chain, ties, copies = with_own(chains, [table.name for table in tables], own, ties)
     measurement = Measurement(chain, observations, ties=ties, **options)
     how = {"weights": weights, "fitter": fitter, "search": search, "options": options}
-    found = fitted(measurement, chosen, **how, instrument=instrument, held=list(fix))
+    found = fitted(measurement, chosen, **how, instrument=instrument, held=held)
     found.settings |= {"own": copies} if copies else {}
     return found.calibration(cross_validate=cross_validate)
 
@@ -298,15 +297,18 @@ def _robust(measurement, loss, fitter):
 
 
 def _fixed(chain, fix):
-    """Return copies of the chains with parameters held."""
+    """Return copies of the chains with parameters held, and the names of these."""
     single = isinstance(chain, Model)
     copies = [item.copy() for item in ([chain] if single else chain)]
-    table = parameter_table(copies)
+    held = {}
     for name, value in fix.items():
-        if name not in table:
-            known, near = ", ".join(table), did_you_mean(name, table)
-            raise FitError(f"fix: no parameter {name!r}; there are {known}{near}")
-        for parameter in table[name]:
+        try:
+            label = "" if value is None else f"{name} = {value}"
+            found = parameters_named(copies, str(name), label)
+        except (ChainError, ParameterError) as error:
+            raise FitError(f"fix: {error}") from None
+        held |= found
+        for parameter in (each for parameters in found.values() for each in parameters):
             if value is not None:
                 # every dataset's chain has its own Parameter object of the name
                 number, shape = to_unit(value, parameter.unit, name), np.shape(parameter.value)
@@ -315,7 +317,7 @@ def _fixed(chain, fix):
                     raise FitError(f"fix: {name} = {value}; allowed is one value{words}")
                 parameter.value = np.broadcast_to(number, shape).copy()
             parameter.fixed = True
-    return copies[0] if single else copies
+    return copies[0] if single else copies, list(held)
 
 
 def _check(measurement):

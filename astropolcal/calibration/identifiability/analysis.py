@@ -6,8 +6,6 @@ A parameter is *identifiable* if no combination of parameters that leaves all da
 it. An error is given for identifiable parameters only: a pseudo-inverse would return a small and
 wrong number for the others.
 
-What other values give the same data, and what data would tell them apart.
-
 Discrete mirror solutions: each candidate is tried on the measurement and counts only if it predicts
 the same data and stays within the bounds. What the bounds, or the model of an optic, exclude may be
 the truth all the same: it is reported where it matters on sky.

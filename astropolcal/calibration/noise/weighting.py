@@ -109,14 +109,9 @@ def outlying_data(calibration, limit=_FAR):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.noise import outlying_data
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> len(outlying_data(cal))
     0
     """

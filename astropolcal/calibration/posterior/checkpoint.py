@@ -1,14 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Checkpoints of a sampler: one HDF5 file that a kill at any moment leaves usable.
 
-HDF5 lays the file out in memory, without the steps, and never touches it again: where a write
-of its own fails it takes the process with it. The block before its structures, which it leaves to
-the user, says where the steps are and (JSON) of which run, so that no structure is read that may be
-damaged.
-All steps have the same size, with their number, the state of the random numbers and a CRC; a run
-writes them in place. What counts is the beginning of the file up to the first step that is not
-whole; the rest is computed again, with the same random numbers. The CRC goes on from that of the
-step before: what an earlier run has left after a step that was computed again may follow from
+HDF5 lays the file out in memory, without the steps, and never touches it again: where a write of
+its own fails it takes the process with it. The block before its structures, which it leaves to the
+user, says where the steps are and (JSON) of which run, so that no structure is read that may be
+damaged. All steps have the same size, with their number, the state of the random numbers and a CRC;
+a run writes them in place. What counts is the beginning of the file up to the first step that is
+not whole; the rest is computed again, with the same random numbers. The CRC goes on from that of
+the step before: what an earlier run has left after a step that was computed again may follow from
 other places of the walkers, where another machine rounds otherwise or no seed was given.
 """
 

@@ -64,14 +64,9 @@ class LogPosterior:
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.posterior import LogPosterior
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> posterior = LogPosterior(cal.measurement, parameters=["hwp.w_sio2", "hwp.w_mgf2"])
     >>> posterior.names, posterior(posterior.centre) > posterior(posterior.centre + 1.0)
     (['hwp.w_sio2', 'hwp.w_mgf2'], True)
@@ -108,19 +103,7 @@ class LogPosterior:
         return self.fitted[self.sampled]
 
     def __call__(self, values):
-        """
-        Return the log-posterior.
-
-        Parameters
-        ----------
-        values : array_like
-            Canonical values, shape (n,) or (n_walkers, n).
-
-        Returns
-        -------
-        float or `~numpy.ndarray`
-            Shape (n_walkers,) for several.
-        """
+        """Return the log-posterior at canonical values, (n,); (n_walkers,) at (n_walkers, n)."""
         values = np.asarray(values, dtype=float)
         if values.ndim not in (1, 2) or values.shape[-1] != self.sampled.size:
             raise ParameterError(

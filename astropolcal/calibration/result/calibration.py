@@ -205,14 +205,11 @@ class Calibration:
 
         Examples
         --------
-        >>> import astropy.units as u
-        >>> from astropolcal import Calibration, calibrate, instruments
-        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-        >>> charis = instruments.get("charis")
-        >>> chain = charis.chain(derotator="linear")
-        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-        >>> data = simulate(chain, charis.wavelength, frames, seed=2)
-        >>> calibrate(chain, data, instrument="charis").write("with_data.asdf")
+        >>> from astropolcal import Calibration
+        >>> from astropolcal.testing import example_calibration
+        >>> made = example_calibration()
+        >>> made.write("with_data.asdf")
+        >>> data = made.measurement.datasets[0].observations
         >>> cal = Calibration.read("with_data.asdf").with_observations(data)
         >>> cal.residuals.size
         264
@@ -242,14 +239,9 @@ class Calibration:
 
         Examples
         --------
-        >>> import astropy.units as u
-        >>> from astropolcal import calibrate, instruments
-        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-        >>> charis = instruments.get("charis")
-        >>> chain = charis.chain(derotator="linear")
-        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-        >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-        >>> new = simulate(chain, charis.wavelength, frames, seed=3)
+        >>> from astropolcal.testing import example_calibration
+        >>> cal = example_calibration()
+        >>> new = example_calibration(seed=3).measurement.datasets[0].observations
         >>> bool(abs(cal.measurement_of(new).residuals()).max() < 0.01)
         True
         """
@@ -432,14 +424,14 @@ class Calibration:
         Parameters
         ----------
         path : path-like
-            The file.
+            The file, with suffix ``.asdf``.
         overwrite : bool
             Whether an existing file may be replaced.
 
         Raises
         ------
         CalibrationFileError
-            If the file exists or cannot be written.
+            If the file exists, has another suffix or cannot be written.
         """
         _above("converters.files").write_calibration(self, path, overwrite=overwrite)
 
@@ -732,14 +724,9 @@ def with_validity(calibration, **stated):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.calibration import with_validity
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> validity_of(with_validity(cal, valid_from="2025-10-01", mode="JHK")).valid_from
     '2025-10-01'
     """

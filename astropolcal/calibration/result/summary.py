@@ -24,7 +24,7 @@ from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
 from astropolcal.chain import leaves
 from astropolcal.files import columns, plain
-from astropolcal.words import WIDTH, counted
+from astropolcal.words import WIDTH, counted, with_error
 
 __all__ = []
 
@@ -437,7 +437,7 @@ def mirror_lines(calibration):
         line = f"{calibration.wavelength[i].to_value(u.nm):9.1f}"
         for table in tables:
             value, std = (table[f"diattenuation{end}"][i].value for end in ("", "_err"))
-            line += f"{_with_error(value, std, 3):>17}"
+            line += with_error(value, ".3f", std).rjust(17)
         metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
         lines.append(line + "".join(f"{value.to_value(u.percent):10.2f}" for value in metals))
     # the table may be wider, a sentence need not
@@ -466,12 +466,6 @@ def _above_metals(table):
     )
 
 
-def _with_error(value, std, digits):
-    if not np.isfinite(value):
-        return "-"
-    return f"{value:.{digits}f}" + (f" +- {std:.{digits}f}" if np.isfinite(std) else "")
-
-
 def star_lines(entry):
     """Return what a star of known polarization says of the calibration."""
     lines = [
@@ -483,7 +477,7 @@ def star_lines(entry):
         for key, unit, digits in (("dolp", "percent", 3), ("aolp", "deg", 1)):
             for name in (key, f"{key}_known"):
                 value, std = entry[f"{name}_{unit}"][i], entry[f"{name}_err_{unit}"][i]
-                line += f"{_with_error(value, std, digits):>17}"
+                line += with_error(value, f".{digits}f", std).rjust(17)
         lines.append(line)
     return lines
 

@@ -149,14 +149,9 @@ def propagate(calibration, function, derivatives=None):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.calibration import propagate
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> ratio = propagate(cal, lambda chain: chain["hwp"].w_sio2.value / chain["hwp"].w_mgf2.value)
     >>> bool(0 < ratio.std < 1e-3)
     True
@@ -270,12 +265,8 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     --------
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_retardance
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> half_wave = derived_retardance(cal, "hwp", 1.65 * u.um)
     >>> bool(half_wave.std < 0.1 * u.deg)
     True
@@ -327,14 +318,9 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_efficiency
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> derived_efficiency(cal).value.shape
     (22,)
     """
@@ -435,12 +421,8 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     --------
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_mueller
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> derived_mueller(cal, {"hwp": 0 * u.deg, "derotator": 45 * u.deg}).std.shape
     (22, 4, 4)
     """
@@ -497,14 +479,9 @@ def derived_data(calibration, observations=None, dataset=0):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_data
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> bool(derived_data(cal).is_determined.all())
     True
     """
@@ -565,14 +542,10 @@ def derived_sky(calibration, q, u, positions, *, wavelength=None, chain=None, da
 
     Examples
     --------
-    >>> import astropy.units as units
+    >>> from astropy import units
     >>> from astropolcal.calibration.uncertainty import derived_sky
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * units.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> positions = {"hwp": [0, 22.5] * units.deg, "derotator": 60 * units.deg}
     >>> derived_sky(cal, 0.01, 0.0, positions).value.shape
     (22, 2)

@@ -186,14 +186,9 @@ def profile(calibration, name, values=None, n=21):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
     >>> from astropolcal.calibration import profile
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> low, high = profile(cal, "hwp.w_sio2", n=7).interval()
     >>> bool(low < cal.chain["hwp"].w_sio2.quantity < high)
     True
@@ -502,14 +497,9 @@ def standard_errors(calibration, method=None, groups=None):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import standard_errors
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> standard_errors(cal, method="van-holstein").meta["held"][:2]
     ['calibration_polarizer.theta', 'hwp.theta']
     """

@@ -6,8 +6,6 @@ The first two accuracies look back at the data of the fit. The others are errors
 settings that were left out of the fit, and of a dataset that was not fitted (a standard).
 Whether the residuals exceed the noise is decided by chi-square where the noise is known, and by F
 where it is itself estimated.
-
-Prediction of standards: datasets that the fit of a calibration did not use.
 """
 
 from dataclasses import dataclass
@@ -303,14 +301,9 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import lack_of_fit
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
     >>> bool(lack_of_fit(cal.measurement, cal).p_value > 0.01)
     True
     """
@@ -687,13 +680,10 @@ def add_standard(calibration, chain, observations, positions=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal.calibration import add_standard
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> table = add_standard(cal, chain, simulate(chain, charis.wavelength, frames, seed=3))
+    >>> from astropolcal.testing import example_calibration
+    >>> cal = example_calibration()
+    >>> standard = example_calibration(seed=3).measurement.datasets[0].observations
+    >>> table = add_standard(cal, cal.chain, standard)
     >>> u.allclose(cal.accuracy["s_standard"], table["s_standard"])
     True
     """
