@@ -258,7 +258,7 @@ def _beyond(lacking, i, way, beyond):
     """Return the two rows with which an element has an error, and others that of a way that bends.
 
     They add the way that bends, and leave of the straight one what is not part of it. So what does
-    not go on with the element is no farther, and what bends has the size that it has there.
+    not go on with the element stays where it was, and what bends has the size that it has there.
     """
     straight = way - beyond
     return [np.sqrt(lacking) * way / way[i], straight[i] * way / way[i] - straight]
