@@ -378,6 +378,9 @@ def _disagreement(solution, frames, systematic):
     light, noise = map(np.nan_to_num, frames._light)
     stokes, channels = np.nan_to_num(solution.apply(light)), solution.channels
     off = light - np.einsum("bwfs,sw->bfw", solution.rows[..., : len(stokes)], stokes)
+    # fluxes over the brightness of their frame are what was fitted
+    bright, own = solution.scale.T, np.einsum("wkbf,bfw->kw", solution.gain[:, 1:3] ** 2, noise)
+    off, noise = off / bright, noise / bright**2
     # of the difference of the beams: the brightness of a frame takes up their sum
     shares = CHANNELS["single" if channels.observable == "intensity" else channels.observable][0]
     off = np.einsum("bk,buk...->u...", shares, off[:, channels.units])
@@ -395,7 +398,7 @@ def _disagreement(solution, frames, systematic):
     share = np.where(used, off[:, good] / bright, 0.0)
     spread = np.where(used, spread[:, good] / bright**2, 1.0)
     # of q and u: what noise does, and the calibration, the same at all wavelengths
-    own = np.einsum("wkbf,bfw->kw", solution.gain[:, 1:3] ** 2, noise)[:, good] / bright**2
+    own = own[:, good] / bright**2
     known = 0.0
     if systematic is not None:
         known = [systematic.covariance(stokes[:, w], w) for w in np.flatnonzero(good)]
@@ -574,9 +577,10 @@ def _equations(source, solution, wavelengths, pixels, by_variance, groups):
     size = channels.units.shape[1]
     alone = Channels(channels.observable, size, [range(size)])
 
-    def beams_of(read, frames):
+    def beams_of(read, frames, power=1):
         found = [[read(beam, slice(f, f + 1), wavelengths)[0] for f in frames] for beam in (0, 1)]
-        return np.reshape(found, (2, len(frames), *pixels.shape))[..., pixels]
+        found = np.reshape(found, (2, len(frames), *pixels.shape))[..., pixels]
+        return found / solution.scale[wavelengths].T[frames][:, of] ** power
 
     for group in groups:
         # of each beam and frame, what it adds to the right sides, and its variance
@@ -585,7 +589,7 @@ def _equations(source, solution, wavelengths, pixels, by_variance, groups):
             frames = channels.units[unit]
             data = alone.combine(beams_of(source.fluxes, frames))[:, 0]
             if source.has_variances:
-                own = beams_of(source.variances, frames)
+                own = beams_of(source.variances, frames, 2)
                 variance = alone.combine(own, 2)[:, 0]
                 noise |= {(b, f): own[b, k] for b in (0, 1) for k, f in enumerate(frames)}
             for channel in (0, 1):

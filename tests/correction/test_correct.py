@@ -301,6 +301,24 @@ def test_dask_changes_no_number(disk_frames, sky, charis):
     np.testing.assert_array_equal(correct(sky, lazy, workers=2).stokes, plain.stokes)
 
 
+def test_a_gain_of_one_beam_cancels_in_pairs_of_unequal_brightness(sky, charis, track, seen):
+    """Of spectra, of images, and of pixels that lack a flux in one frame."""
+    hwp, positions = track(2)
+    positions["derotator"] = np.repeat([60, 70], 4) * u.deg
+    light = np.array([1e5, 2e3, -1e3])[:, None] * np.ones(22)
+    beams = seen(sky, positions, charis.wavelength, light)
+    beams *= np.array([0.4, 1.0, 0.7, 0.5, 1.2, 0.8, 1.0, 0.6])[:, None]
+    beams[0] *= 1.1
+    images = beams[..., None, None] * np.ones((3, 3))
+    images[0, 2, :, 1, 1] = np.nan
+    for fluxes in (beams, images):
+        frames = ScienceFrames.from_arrays(*fluxes, charis.wavelength, positions, hwp=hwp)
+        found = correct(sky, frames, observable="double")
+        # what is left is of second order: a gain changes the sum of polarized beams too
+        np.testing.assert_allclose(found.q, 0.02, atol=4e-4)
+        np.testing.assert_allclose(found.u, -0.01, atol=4e-4)
+
+
 def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen):
     for spectrum in [True, False]:
         from astropolcal.correction import measurement_rows
