@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import Observations, calibrate, optics
+from astropolcal import Observations, calibrate, instruments, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.correction.correcting import _uneven
@@ -230,6 +230,52 @@ def test_frames_that_disagree_beyond_all_errors_are_told(calibration, star, char
             assert len(found) == bool(odd), (odd, observable, found)
             if observable == "single":
                 assert all(odd in one for one in found), (odd, found)
+
+
+def test_exchanges_in_one_cycle_show_in_the_sums_of_pairs(sky, charis, track, seen):
+    """Of cameras or states: the differences agree with each other, and are wrong."""
+    vampires = instruments.get("vampires")
+    both = vampires.on_sky(vampires.chain(derotator="linear"))
+    rng, words = (
+        np.random.default_rng(5),
+        "the frames disagree: sums .* against those of .* q and u",
+    )
+    for chain, instrument in ((sky, charis), (both, vampires)):
+        hwp, positions = track(1)
+        positions["derotator"] = np.full(4, 60) * u.deg
+        n, states = 4, chain is both
+        if states:
+            hwp, n = np.repeat(hwp, 2), 8
+            positions = {key: np.repeat(each, 2) for key, each in positions.items()}
+            positions["flc_state"] = np.tile([0.0, 1.0], 4)
+        wavelength = instrument.wavelength
+        light = np.array([1e6, 2e4, 1e4])[:, None] * np.ones(len(wavelength))
+        clean = seen(chain, positions, wavelength, light) * np.linspace(0.5, 1, n)[:, None]
+        # gains differ by some percent, not the same at all wavelengths
+        clean[0] *= 1 + np.linspace(0.02, 0.05, len(wavelength))
+        half, exchanged = clean.copy(), np.arange(n) < n // 2
+        half[:, exchanged] = clean[::-1, exchanged]
+        cases = [(clean, positions, ()), (half, positions, exchanged)]
+        if states:
+            wrong = positions["flc_state"].copy()
+            wrong[:2] = 1, 0
+            cases += [(clean, positions | {"flc_state": wrong}, np.arange(n) < 2)]
+        for fluxes, where, odd in cases:
+            noisy = fluxes + np.sqrt(fluxes) * rng.standard_normal(fluxes.shape)
+            variances = dict(zip(("variance_right", "variance_left"), fluxes, strict=True))
+            frames = ScienceFrames.from_arrays(*noisy, wavelength, where, hwp=hwp, **variances)
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                found = correct(chain, frames, observable="double")
+            told = [str(one.message) for one in told if "disagree" in str(one.message)]
+            off = np.hypot(found.q - 0.02, found.u - 0.01)
+            assert (off.max() > 0.01) == (len(odd) > 0), (instrument.name, odd)
+            assert len(told) == (len(odd) > 0), (instrument.name, odd, told)
+            for one in told:
+                named = [int(i) for i in re.findall(r"frame (\d)", re.search(words, one)[0])]
+                # two pairs, of which one is right
+                assert len(named) == 4
+                assert set(odd[named]) == {True, False}, (one, odd)
 
 
 def test_a_spectrum_polarized_by_more_than_all_of_it_is_told(star, sky, charis, seen, track):
