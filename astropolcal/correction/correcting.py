@@ -388,13 +388,13 @@ def _disagreement(solution, frames, systematic):
     if not good.any():
         return []
     bright, used = stokes[0, good], used[:, good]
-    # of q and u: what noise does, and the calibration, the same at all wavelengths
-    own = np.einsum("wkbf,bfw->kw", solution.gain[:, 1:3] ** 2, noise)[:, good] / bright**2
-    known = 0.0
+    # of q and u: what noise does, and the calibration
+    own = np.einsum("wkbf,bfw->w", solution.gain[:, 1:3] ** 2, noise)[good] / bright**2 / 2
+    known = np.zeros_like(own)
     if systematic is not None:
         known = [systematic.covariance(stokes[:, w], w) for w in np.flatnonzero(good)]
-        known = np.diagonal(known, axis1=1, axis2=2)[:, 1:3].T / bright**2
-        known = np.nan_to_num(known, posinf=0.0).mean()
+        known = np.diagonal(known, axis1=1, axis2=2)[:, 1:3].mean(axis=1) / bright**2
+        known = np.nan_to_num(known, posinf=0.0)
     # of the difference of the beams: the brightness of a frame takes up their sum
     shares = CHANNELS["single" if channels.observable == "intensity" else channels.observable][0]
     bright = bright * solution.scale.T[:, good]
@@ -404,7 +404,7 @@ def _disagreement(solution, frames, systematic):
     names = [" and ".join(str(frames.names[i]) for i in unit) for unit in units]
     lost = len(stokes) - 1 + (0 if frames.groups is None else len(np.unique(frames.groups)))
     what = "differences of their beams are {:.2g} % of I off the solution"
-    told = _beyond(what, names, apart, noise, used.sum(axis=0) - lost, own.mean(), known)
+    told = _beyond(what, names, apart, noise, used.sum(axis=0) - lost, own, known)
     if told or channels.observable != "double" or frames.groups is not None:
         return told
     # what double differences do not contain, and beams or states that are exchanged turn them into:
@@ -420,7 +420,7 @@ def _disagreement(solution, frames, systematic):
     names = [f"{name} against those of {names[i]}" for name, i in zip(names, far, strict=True)]
     free = used.sum(axis=0) - len(np.unique(states))
     what = "sums of the differences of pairs are {:.2g} % of I apart"
-    return _beyond(what, names, apart, noise, free, own.mean(), known, least=_UNSTEADY)
+    return _beyond(what, names, apart, noise, free, own, known, least=_UNSTEADY)
 
 
 def _beyond(what, names, off, noise, free, own, known, least=0.0):
@@ -429,25 +429,30 @@ def _beyond(what, names, off, noise, free, own, known, least=0.0):
     ``off`` and the variances ``noise`` of the data have shape (n_units, n_wavelengths), ``free``
     is the degrees of freedom of each wavelength.
     """
-    off, noise, free = off[:, free > 0], noise[:, free > 0], free[free > 0]
+    kept = free > 0
+    off, noise, free, own, known = (x[..., kept] for x in (off, noise, free, own, known))
     if not free.size:
         return []
     n = free.size
-    means = (each.mean(axis=1, keepdims=True) for each in (off, noise / n))
-    for each, spread, error, number, of in (
-        (off, noise, own, free.sum(), ""),
-        (*means, own / n, free.min(), ", in the mean of the wavelengths"),
+    means = [each.mean(axis=-1, keepdims=True) for each in (off, noise / n, own / n, known)]
+    for each, spread, error, systematic, number, of in (
+        (off, noise, own, known, free, ""),
+        (*means, free.min(keepdims=True), ", in the mean of the wavelengths"),
     ):
-        square = (each**2 / spread).sum(axis=1)
-        # what the scatter beyond chance makes of the error by noise
-        found = max(square.sum() - 4 * np.sqrt(2 * number), 0.0) / number * error
-        real = np.where(each, each**2 - spread, 0.0).sum() / number
-        if found > _BEYOND_ERRORS**2 * (error + known) and real > least**2:
+        square = each**2 / spread
+        # what the scatter beyond chance makes of the error by noise, of all of the error squared
+        share = error / (error + systematic)
+        beyond = square.sum(axis=0) @ share - 4 * np.sqrt(2 * number @ share**2)
+        beyond = max(beyond, 0.0) / number.sum()
+        real = np.where(each, each**2 - spread, 0.0).sum() / number.sum()
+        if beyond > _BEYOND_ERRORS**2 and real > least**2:
+            usual = 100 * np.sqrt(np.median(error + systematic))
             return [
-                f"the frames disagree: {what.format(100 * np.sqrt((each**2).sum() / number))}, "
-                f"{np.sqrt(square.sum() / number):.2g} times their noise{of}, most those of "
-                f"{names[np.argmax(square)]}; q and u may be wrong by {100 * np.sqrt(found):.2g} "
-                f"%, and their errors, {100 * np.sqrt(error + known):.2g} %, are too small"
+                "the frames disagree: "
+                f"{what.format(100 * np.sqrt((each**2).sum() / number.sum()))}, "
+                f"{np.sqrt(square.sum() / number.sum()):.2g} times their noise{of}, most those of "
+                f"{names[np.argmax(square.sum(axis=1))]}; q and u may be wrong by "
+                f"{usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too small"
             ]
     return []
 

@@ -232,6 +232,28 @@ def test_frames_that_disagree_beyond_all_errors_are_told(calibration, star, char
                 assert all(odd in one for one in found), (odd, found)
 
 
+def test_frames_disagree_by_the_errors_of_each_wavelength(calibration, charis, seen, track):
+    """Noise at one wavelength says nothing about how well the calibration is known at others."""
+    hwp, positions = track(2)
+    positions["derotator"] = np.repeat([55, 62, 70, 77], 2) * u.deg
+    rng, light = np.random.default_rng(2), np.array([1e10, 2e8, 1e8])[:, None] * np.ones(22)
+    for faint in (1.0, 1e-8):
+        for size, odd in ((0.001, False), (0.03, True)):
+            stokes = light * np.where(np.arange(22) == 8, faint, 1.0)
+            fluxes = seen(calibration, positions, charis.wavelength, stokes)
+            fluxes[0, 5] *= 1 + size
+            noisy = fluxes + np.sqrt(fluxes) * rng.standard_normal(fluxes.shape)
+            variances = dict(zip(("variance_right", "variance_left"), fluxes, strict=True))
+            frames = ScienceFrames.from_arrays(
+                *noisy, charis.wavelength, positions, hwp=hwp, **variances
+            )
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                correct(calibration, frames, observable="double")
+            found = [str(one.message) for one in told if "disagree" in str(one.message)]
+            assert len(found) == odd, (faint, size, found)
+
+
 def test_exchanges_in_one_cycle_show_in_the_sums_of_pairs(sky, charis, track, seen):
     """Of cameras or states: the differences agree with each other, and are wrong."""
     vampires = instruments.get("vampires")
