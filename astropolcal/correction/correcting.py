@@ -33,6 +33,8 @@ _LEAKS = 0.3
 _UNEVEN, _BEYOND = 0.05, 10.0
 # times the stated errors, from which on an error that the scatter of the frames shows is told
 _BEYOND_ERRORS = 3.0
+# of I: what the sums of differences of pairs vary by in real stars, gains not being quite steady
+_UNSTEADY = 0.005
 # what a result keeps of the solution and of the frames
 _OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
 _OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
@@ -378,45 +380,79 @@ def _disagreement(solution, frames, systematic):
     light, noise = map(np.nan_to_num, frames._light)
     stokes, channels = np.nan_to_num(solution.apply(light)), solution.channels
     off = light - np.einsum("bwfs,sw->bfw", solution.rows[..., : len(stokes)], stokes)
-    # of the difference of the beams: the brightness of a frame takes up their sum
-    shares = CHANNELS["single" if channels.observable == "intensity" else channels.observable][0]
-    off = np.einsum("bk,buk...->u...", shares, off[:, channels.units])
-    spread = np.einsum("bk,buk...->u...", shares**2, noise[:, channels.units])
-    used = solution.weights[0].T > 0
-    free = used.sum(axis=0) - (len(stokes) - 1)
-    free -= 0 if frames.groups is None else len(np.unique(frames.groups))
+    units, used = channels.units, solution.weights[0].T > 0
     # a wavelength at which a frame has no light, or no error, tells nothing
-    seen = (noise > 0).all(axis=0)[channels.units].all(axis=1)
-    good = (free > 0) & (stokes[0] > 0) & (seen | ~used).all(axis=0)
+    seen = (noise > 0).all(axis=0)[units].all(axis=1)
+    good = (stokes[0] > 0) & (seen | ~used).all(axis=0)
     good &= solution.determined[:, :3].all(axis=1)
     if not good.any():
         return []
-    bright, used, n = stokes[0, good], used[:, good], good.sum()
-    share = np.where(used, off[:, good] / bright, 0.0)
-    spread = np.where(used, spread[:, good] / bright**2, 1.0)
-    # of q and u: what noise does, and the calibration, the same at all wavelengths
-    own = np.einsum("wkbf,bfw->kw", solution.gain[:, 1:3] ** 2, noise)[:, good] / bright**2
-    known = 0.0
+    bright, used = stokes[0, good], used[:, good]
+    # of q and u: what noise does, and the calibration
+    own = np.einsum("wkbf,bfw->w", solution.gain[:, 1:3] ** 2, noise)[good] / bright**2 / 2
+    known = np.zeros_like(own)
     if systematic is not None:
         known = [systematic.covariance(stokes[:, w], w) for w in np.flatnonzero(good)]
-        known = np.diagonal(known, axis1=1, axis2=2)[:, 1:3].T / bright**2
-        known = np.nan_to_num(known, posinf=0.0).mean()
-    means = (each.mean(axis=1, keepdims=True) for each in (share, spread / n))
-    for off, noise, least, number, of in (
-        (share, spread, own.mean(), free[good].sum(), ""),
-        (*means, own.mean() / n, free[good].min(), ", in the mean of the wavelengths"),
+        known = np.diagonal(known, axis1=1, axis2=2)[:, 1:3].mean(axis=1) / bright**2
+        known = np.nan_to_num(known, posinf=0.0)
+    # of the difference of the beams: the brightness of a frame takes up their sum
+    shares = CHANNELS["single" if channels.observable == "intensity" else channels.observable][0]
+    bright = bright * solution.scale.T[:, good]
+    off, noise = (off[..., good] / bright)[:, units], (noise[..., good] / bright**2)[:, units]
+    noise = np.where(used, np.einsum("bk,buk...->u...", shares**2, noise), 1.0)
+    apart = np.where(used, np.einsum("bk,buk...->u...", shares, off), 0.0)
+    names = [" and ".join(str(frames.names[i]) for i in unit) for unit in units]
+    lost = len(stokes) - 1 + (0 if frames.groups is None else len(np.unique(frames.groups)))
+    what = "differences of their beams are {:.2g} % of I off the solution"
+    told = _beyond(what, names, apart, noise, used.sum(axis=0) - lost, own, known)
+    if told or channels.observable != "double" or frames.groups is not None:
+        return told
+    # what double differences do not contain, and beams or states that are exchanged turn them into:
+    # regardless of the gains, it is the same in all pairs of a state
+    apart = np.where(used, np.einsum("bk,buk...->u...", shares * [1, -1], off), 0.0)
+    states = np.atleast_2d(frames.positions.get("flc_state", 0.0))[0]
+    states = np.broadcast_to(states, channels.n_frames)[units[:, 0]]
+    same = np.equal.outer(states, states)
+    apart -= used * (same @ apart) / np.maximum(same @ used.astype(float), 1)
+    # of each pair that of its state which is farthest from it
+    product = apart @ apart.T
+    far = np.where(same, np.diag(product) - 2 * product, -np.inf).argmax(axis=1)
+    names = [f"{name} against those of {names[i]}" for name, i in zip(names, far, strict=True)]
+    free = used.sum(axis=0) - len(np.unique(states))
+    what = "sums of the differences of pairs are {:.2g} % of I apart"
+    return _beyond(what, names, apart, noise, free, own, known, least=_UNSTEADY)
+
+
+def _beyond(what, names, off, noise, free, own, known, least=0.0):
+    """Return in words that data are off by more than the errors of q and u, and all by ``least``.
+
+    ``off`` and the variances ``noise`` of the data have shape (n_units, n_wavelengths), ``free``
+    is the degrees of freedom of each wavelength.
+    """
+    kept = free > 0
+    off, noise, free, own, known = (x[..., kept] for x in (off, noise, free, own, known))
+    if not free.size:
+        return []
+    n = free.size
+    means = [each.mean(axis=-1, keepdims=True) for each in (off, noise / n, own / n, known)]
+    for each, spread, error, systematic, number, of in (
+        (off, noise, own, known, free, ""),
+        (*means, free.min(keepdims=True), ", in the mean of the wavelengths"),
     ):
-        square = (off**2 / noise).sum(axis=1)
-        # what the scatter beyond chance makes of the error by noise
-        found = max(square.sum() - 4 * np.sqrt(2 * number), 0.0) / number * least
-        if found > _BEYOND_ERRORS**2 * (least + known):
-            worst = [str(frames.names[i]) for i in channels.units[np.argmax(square)]]
+        square = each**2 / spread
+        # what the scatter beyond chance makes of the error by noise, of all of the error squared
+        share = error / (error + systematic)
+        beyond = square.sum(axis=0) @ share - 4 * np.sqrt(2 * number @ share**2)
+        beyond = max(beyond, 0.0) / number.sum()
+        real = np.where(each, each**2 - spread, 0.0).sum() / number.sum()
+        if beyond > _BEYOND_ERRORS**2 and real > least**2:
+            usual = 100 * np.sqrt(np.median(error + systematic))
             return [
-                "the frames disagree: differences of their beams are "
-                f"{100 * np.sqrt((off**2).sum() / number):.2g} % of I off the solution, "
-                f"{np.sqrt(square.sum() / number):.2g} times their noise{of}, most those of "
-                f"{' and '.join(worst)}; q and u may be wrong by {100 * np.sqrt(found):.2g} %, "
-                f"and their errors, {100 * np.sqrt(least + known):.2g} %, are too small"
+                "the frames disagree: "
+                f"{what.format(100 * np.sqrt((each**2).sum() / number.sum()))}, "
+                f"{np.sqrt(square.sum() / number.sum()):.2g} times their noise{of}, most those of "
+                f"{names[np.argmax(square.sum(axis=1))]}; q and u may be wrong by "
+                f"{usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too small"
             ]
     return []
 
@@ -574,9 +610,10 @@ def _equations(source, solution, wavelengths, pixels, by_variance, groups):
     size = channels.units.shape[1]
     alone = Channels(channels.observable, size, [range(size)])
 
-    def beams_of(read, frames):
+    def beams_of(read, frames, power=1):
         found = [[read(beam, slice(f, f + 1), wavelengths)[0] for f in frames] for beam in (0, 1)]
-        return np.reshape(found, (2, len(frames), *pixels.shape))[..., pixels]
+        found = np.reshape(found, (2, len(frames), *pixels.shape))[..., pixels]
+        return found / solution.scale[wavelengths].T[frames][:, of] ** power
 
     for group in groups:
         # of each beam and frame, what it adds to the right sides, and its variance
@@ -585,7 +622,7 @@ def _equations(source, solution, wavelengths, pixels, by_variance, groups):
             frames = channels.units[unit]
             data = alone.combine(beams_of(source.fluxes, frames))[:, 0]
             if source.has_variances:
-                own = beams_of(source.variances, frames)
+                own = beams_of(source.variances, frames, 2)
                 variance = alone.combine(own, 2)[:, 0]
                 noise |= {(b, f): own[b, k] for b in (0, 1) for k, f in enumerate(frames)}
             for channel in (0, 1):

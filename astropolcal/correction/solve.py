@@ -101,7 +101,7 @@ class Estimator:
     # with the brightness of the frames, (2, n_wavelengths, n_frames, 4)
     rows: np.ndarray
     channels: Channels
-    # (2, n_wavelengths, n_units, 4) and (2, n_wavelengths, n_units)
+    # of fluxes over brightness, (2, n_wavelengths, n_units, 4) and (2, n_wavelengths, n_units)
     channel_rows: np.ndarray
     weights: np.ndarray
     # largest over smallest singular value for each wavelength, of all components asked for
@@ -155,17 +155,19 @@ def estimator(
     weights = 1.0 if weights is None else _positive("weights", weights, shape, beams=True)
     weights = np.broadcast_to(weights, (2, *shape))
     scale = np.ones(shape) if scale is None else _positive("scale", scale, shape)
-    rows = rows * scale[..., None]
+    # fluxes are divided by the brightness of their frame: an unequal gain cancels in pairs
     combined = np.moveaxis(channels.combine(np.moveaxis(rows, 1, 2)), 2, 1)
     with np.errstate(divide="ignore"):
         # a weight of zero is an infinite variance, and stays a weight of zero in its pair
-        inverse = np.moveaxis(1 / channels.combine(np.moveaxis(1 / weights, 1, 2), 2), 2, 1)
+        variances = np.moveaxis(1 / (weights * scale**2), 1, 2)
+        inverse = np.moveaxis(1 / channels.combine(variances, 2), 2, 1)
     solved = [
         _solve(combined[:, w].reshape(-1, 4), inverse[:, w].ravel(), components, max_condition)
         for w in range(shape[0])
     ]
     gain, condition, determined, weak = map(np.array, zip(*solved, strict=True))
     gain = channels.to_beams(gain.reshape(shape[0], len(components), 2, -1))
+    gain, rows = gain / scale[:, None, None], rows * scale[..., None]
     if not determined[:, 1:3].all(axis=1).any():
         raise ObservationError(_undetermined(channels, labels, weak[0]))
     leakage = np.einsum("wkbf,bwf->wk", gain, rows[..., 3])

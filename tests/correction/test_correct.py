@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import Observations, calibrate, optics
+from astropolcal import Observations, calibrate, instruments, optics
 from astropolcal.calibration import fitted_stars, with_validity
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.correction.correcting import _uneven
@@ -232,6 +232,74 @@ def test_frames_that_disagree_beyond_all_errors_are_told(calibration, star, char
                 assert all(odd in one for one in found), (odd, found)
 
 
+def test_frames_disagree_by_the_errors_of_each_wavelength(calibration, charis, seen, track):
+    """Noise at one wavelength says nothing about how well the calibration is known at others."""
+    hwp, positions = track(2)
+    positions["derotator"] = np.repeat([55, 62, 70, 77], 2) * u.deg
+    rng, light = np.random.default_rng(2), np.array([1e10, 2e8, 1e8])[:, None] * np.ones(22)
+    for faint in (1.0, 1e-8):
+        for size, odd in ((0.001, False), (0.03, True)):
+            stokes = light * np.where(np.arange(22) == 8, faint, 1.0)
+            fluxes = seen(calibration, positions, charis.wavelength, stokes)
+            fluxes[0, 5] *= 1 + size
+            noisy = fluxes + np.sqrt(fluxes) * rng.standard_normal(fluxes.shape)
+            variances = dict(zip(("variance_right", "variance_left"), fluxes, strict=True))
+            frames = ScienceFrames.from_arrays(
+                *noisy, charis.wavelength, positions, hwp=hwp, **variances
+            )
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                correct(calibration, frames, observable="double")
+            found = [str(one.message) for one in told if "disagree" in str(one.message)]
+            assert len(found) == odd, (faint, size, found)
+
+
+def test_exchanges_in_one_cycle_show_in_the_sums_of_pairs(sky, charis, track, seen):
+    """Of cameras or states: the differences agree with each other, and are wrong."""
+    vampires = instruments.get("vampires")
+    both = vampires.on_sky(vampires.chain(derotator="linear"))
+    rng, words = (
+        np.random.default_rng(5),
+        "the frames disagree: sums .* against those of .* q and u",
+    )
+    for chain, instrument in ((sky, charis), (both, vampires)):
+        hwp, positions = track(1)
+        positions["derotator"] = np.full(4, 60) * u.deg
+        n, states = 4, chain is both
+        if states:
+            hwp, n = np.repeat(hwp, 2), 8
+            positions = {key: np.repeat(each, 2) for key, each in positions.items()}
+            positions["flc_state"] = np.tile([0.0, 1.0], 4)
+        wavelength = instrument.wavelength
+        light = np.array([1e6, 2e4, 1e4])[:, None] * np.ones(len(wavelength))
+        clean = seen(chain, positions, wavelength, light) * np.linspace(0.5, 1, n)[:, None]
+        # gains differ by some percent, not the same at all wavelengths
+        clean[0] *= 1 + np.linspace(0.02, 0.05, len(wavelength))
+        half, exchanged = clean.copy(), np.arange(n) < n // 2
+        half[:, exchanged] = clean[::-1, exchanged]
+        cases = [(clean, positions, ()), (half, positions, exchanged)]
+        if states:
+            wrong = positions["flc_state"].copy()
+            wrong[:2] = 1, 0
+            cases += [(clean, positions | {"flc_state": wrong}, np.arange(n) < 2)]
+        for fluxes, where, odd in cases:
+            noisy = fluxes + np.sqrt(fluxes) * rng.standard_normal(fluxes.shape)
+            variances = dict(zip(("variance_right", "variance_left"), fluxes, strict=True))
+            frames = ScienceFrames.from_arrays(*noisy, wavelength, where, hwp=hwp, **variances)
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                found = correct(chain, frames, observable="double")
+            told = [str(one.message) for one in told if "disagree" in str(one.message)]
+            off = np.hypot(found.q - 0.02, found.u - 0.01)
+            assert (off.max() > 0.01) == (len(odd) > 0), (instrument.name, odd)
+            assert len(told) == (len(odd) > 0), (instrument.name, odd, told)
+            for one in told:
+                named = [int(i) for i in re.findall(r"frame (\d)", re.search(words, one)[0])]
+                # two pairs, of which one is right
+                assert len(named) == 4
+                assert set(odd[named]) == {True, False}, (one, odd)
+
+
 def test_a_spectrum_polarized_by_more_than_all_of_it_is_told(star, sky, charis, seen, track):
     positions = track(1)[1]
     for degree, odd in ((0.99, False), (1.2, True)):
@@ -299,6 +367,24 @@ def test_dask_changes_no_number(disk_frames, sky, charis):
         positions,
     )
     np.testing.assert_array_equal(correct(sky, lazy, workers=2).stokes, plain.stokes)
+
+
+def test_a_gain_of_one_beam_cancels_in_pairs_of_unequal_brightness(sky, charis, track, seen):
+    """Of spectra, of images, and of pixels that lack a flux in one frame."""
+    hwp, positions = track(2)
+    positions["derotator"] = np.repeat([60, 70], 4) * u.deg
+    light = np.array([1e5, 2e3, -1e3])[:, None] * np.ones(22)
+    beams = seen(sky, positions, charis.wavelength, light)
+    beams *= np.array([0.4, 1.0, 0.7, 0.5, 1.2, 0.8, 1.0, 0.6])[:, None]
+    beams[0] *= 1.1
+    images = beams[..., None, None] * np.ones((3, 3))
+    images[0, 2, :, 1, 1] = np.nan
+    for fluxes in (beams, images):
+        frames = ScienceFrames.from_arrays(*fluxes, charis.wavelength, positions, hwp=hwp)
+        found = correct(sky, frames, observable="double")
+        # what is left is of second order: a gain changes the sum of polarized beams too
+        np.testing.assert_allclose(found.q, 0.02, atol=4e-4)
+        np.testing.assert_allclose(found.u, -0.01, atol=4e-4)
 
 
 def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen):
