@@ -478,3 +478,21 @@ def test_exposures_without_a_value_are_refused(raw):
         hdus[0].data[1] = np.nan
     (why,) = reduced(raw).problems.values()
     assert "1 of its 3 exposures, such as number 2, have no pixel with a value" in why[0]
+
+
+def test_whole_numbers_of_a_camera_are_read_and_need_a_dark(raw, tmp_path):
+    """As cameras write them: 16 bits without a sign, with a bias."""
+    wanted = reduced(raw).observations
+    for path in raw.glob("*.fits"):
+        with fits.open(path) as hdus:
+            data, header = np.rint(hdus[0].data + 200).astype("u2"), hdus[0].header
+        fits.writeto(path, data, header, overwrite=True)
+    for camera in (1, 2):
+        dark = np.full((SIDE, SIDE), 200.0)
+        fits.writeto(tmp_path / f"dark_cam{camera}.fits", dark, fits.Header({"U_CAMERA": camera}))
+    told = reduced(raw).doubts
+    assert len(told) == 16
+    assert all("whole numbers, as of a raw frame, and no dark" in why[0] for why in told.values())
+    found = reduced(raw, dark=tmp_path / "dark_cam1.fits")
+    assert found.doubts == {}
+    np.testing.assert_allclose(found.observations.flux_right, wanted.flux_right, rtol=1e-3)

@@ -44,6 +44,7 @@ from astropolcal.reduction.photometry import (
     measure_internal,
     outside_share,
     piled_up,
+    rectangles,
     sharpest,
 )
 from astropolcal.reduction.stars import measure_stars
@@ -84,6 +85,8 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
                 even = evenly_lit(cube, good, layout)
                 frame.values["light"] = "even" if even else "uneven"
                 frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
+                dark = masters is not None and masters.dark is not None
+                frame.doubts += [] if dark else _raw(cube, good, frame, layout)
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
@@ -107,6 +110,22 @@ def _background(cube, good, layout, result):
         f"outside the beams there is {100 * share:.2g} % of the light inside, on the same area; "
         "where it is under the beams, too, they seem less polarized (background='outside', "
         "--background outside, subtracts it)"
+    ]
+
+
+def _raw(cube, good, frame, layout):
+    """Say that nothing was subtracted from the whole numbers of a raw frame."""
+    rows, columns, _ = rectangles(layout.internal_apertures, cube.shape[1:])[0]
+    # of the right beam, which is in its own unit; of a mean the sum is whole
+    pixels = cube[:, rows, columns][good[:, rows, columns]].astype(float)
+    sums = pixels[pixels != 0] * frame.values.get("exposures", 1.0)
+    # some pixels are whole by chance
+    whole = sums.size and np.mean(np.abs(sums - np.rint(sums)) < 1e-6) > 0.9
+    if not whole or frame.photometry.background.any():
+        return []
+    return [
+        "its pixels are whole numbers, as of a raw frame, and no dark was given (dark, --dark): "
+        "bias and dark current are taken for unpolarized light"
     ]
 
 
@@ -135,7 +154,7 @@ def open_cube(path, layout, masters=None):
             warnings.filterwarnings("error", message=".*truncated.*")
             stream = stack.enter_context(open_fits(path))
             try:
-                hdus = stack.enter_context(fits.open(stream, memmap=True))
+                hdus = stack.enter_context(fits.open(stream))
                 opened = _read(path, hdus, layout, masters)
             except AstropyUserWarning as warning:
                 # its type tells a user nothing
@@ -560,7 +579,7 @@ def _survey(files, layout, raw, find):
 def _known(path, layout, raw):
     """Return what is known of a frame whose light is not measured."""
     frame = read_header(path, layout, raw=raw)
-    with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
+    with readable_fits(path), open_fits(path) as stream, fits.open(stream) as hdus:
         # what is not there is refused where it is corrected
         if len(hdus) > layout.cube_extension and hdus[layout.cube_extension].data is not None:
             cube = hdus[layout.cube_extension]
