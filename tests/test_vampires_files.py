@@ -325,6 +325,21 @@ def test_a_frame_without_a_state_is_left_out_and_its_partner_named(copied, tmp_p
             find()
 
 
+def test_frames_of_other_optics_than_most_are_left_out(copied):
+    for path in copied.glob("*.fits"):
+        # the words of the header have changed
+        edit(path, U_FLCST="In" if "0001" in path.name else "IN")
+    for camera in (1, 2):
+        edit(copied / f"VMPA00000002_cam{camera}.fits", U_FLCST="OUT")
+        edit(copied / f"VMPA00000003_cam{camera}.fits", **{"DATA-TYP": "DARK"})
+    run = reduced(copied)
+    (one, (typed, *_)), (other, word) = run.problems.items()
+    assert (one[-17:], other[-17:]) == ("00000003_cam1.fits"[1:], "00000002_cam1.fits"[1:])
+    assert typed == "DATA-TYP = 'DARK': it has no light of the source"
+    assert word == ["flc 'out', the others of the run have 'in'"]
+    assert run.meta["flc"] == "in"
+
+
 def test_images_of_another_size(copied):
     header = fits.getheader(copied / "VMPA00000001_cam2.fits")
     fits.writeto(

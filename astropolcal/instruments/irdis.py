@@ -26,7 +26,7 @@ from astropolcal.chain import join
 from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, warn
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
+from astropolcal.instruments.layout import COMMON, NO_LIGHT, RANGES, FileLayout, side_by_side
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
@@ -341,6 +341,11 @@ LAYOUT = IrdisLayout(
     site=shared.PARANAL,
     stacked=True,
     centred=True,
+    wanted={
+        "ESO DPR TYPE": NO_LIGHT,
+        "ESO INS4 OPTI8 NAME": ("H_NIR", "the half-wave plate is not in the beam"),
+        "ESO INS1 OPTI2 NAME": ("P0-90", "the pair of polarizers is not in the beam"),
+    },
     **side_by_side(1024, 1024, _LIT),
 )
 
@@ -529,10 +534,11 @@ class IRDIS(Instrument):
         one.wavelength = np.atleast_1d(_BANDS[_filter(_Header(0, header))])
         # without NAXIS1 they are of full frames
         columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
-        if columns % 2 or min(rows, columns // 2) < 16:
+        # as high as broad is one half, and higher one that lies on its side
+        if columns % 2 or min(rows, columns // 2) < 16 or rows >= columns:
             raise InstrumentError(
                 f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, "
-                "of 16 x 16 pixels and more each"
+                "of 16 x 16 pixels and more each, broader together than high"
             )
         places = side_by_side(rows, columns // 2, _LIT) | {"tracking": law.plate_law("field")}
         if str(header.get(_ROTATION, "")).strip() == "PUPIL":

@@ -172,6 +172,10 @@ def read_header(path, layout, *, header=None, raw=None):
                 headers.append(_raw_header(frame, raw[frame.number], header, layout))
             except ObservationError as error:
                 frame.errors.append(f"raw frame: {error}")
+    for header, (keyword, (usual, why)) in product(headers, layout.wanted.items()):
+        word = str(card_value(header, keyword) or "").strip()
+        if word and not re.fullmatch(usual, word, re.IGNORECASE):
+            frame.errors.append(f"{keyword} = {word!r}: {why}")
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
         if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
             frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"

@@ -448,7 +448,10 @@ def _meta(frames, instrument, source, given):
         if texts and (key != "object" or "star" in source):
             usual = Counter(texts).most_common(1)[0][0]
             meta[key] = usual[:10] if key == "date" else usual
-    meta |= _optics(values, instrument.files)
+    for key in instrument.files.optics:
+        # all that say it say the same
+        if said := {_optic(instrument.files, key, frame) for frame in frames} - {None}:
+            (meta[key],) = said
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
@@ -459,14 +462,11 @@ def _meta(frames, instrument, source, given):
     return meta | dict(given)
 
 
-def _optics(values, layout):
-    """Return what the headers say of optics in the beam, by the first pattern that is found."""
-    found = {}
-    for key, (column, words) in layout.optics.items():
-        said = next((v[column] for v in values if v.get(column)), "")
-        hits = [word for pattern, word in words.items() if re.search(pattern, said)]
-        found |= {key: hits[0]} if hits else {}
-    return found
+def _optic(layout, key, frame):
+    """Return what a header says of an optic, by the first pattern that is found, or None."""
+    column, words = layout.optics[key]
+    said = frame.values.get(column) or ""
+    return next((word for pattern, word in words.items() if re.search(pattern, said)), None)
 
 
 def _wrong_source(frames, instrument, told):
@@ -525,6 +525,9 @@ def set_aside(frames, reduction):
     stages = reduction.instrument.files.stages if reduction.instrument else ()
     for name in (name for name in _KINDS[reduction.source] if name not in stages):
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
+    # by what they are to a chain, and not by how they are written
+    for key in reduction.instrument.files.optics if reduction.instrument else ():
+        kept = _of_one_kind(kept, key, partial(_optic, reduction.instrument.files, key), reduction)
     # what has no number comes last, by time
     time = {frame.path: frame.values.get("mjd", np.inf) for frame in kept}
     return sorted(
