@@ -495,6 +495,23 @@ def test_exposures_without_a_value_are_refused(raw):
     assert "1 of its 3 exposures, such as number 2, have no pixel with a value" in why[0]
 
 
+def test_exposures_that_one_camera_lacks_are_refused(raw):
+    paths = sorted(raw.glob("*.fits"))
+    spoilt = next(path for path in paths if fits.getval(path, "U_CAMERA") == 1)
+
+    def scale(path, factor):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].data[2] *= np.float32(factor)
+
+    scale(spoilt, 0.02)
+    (why,) = reduced(raw).problems.values()
+    assert "1 of its 3 exposures, such as number 3 with 2% of the usual light, where VMPA" in why[0]
+    # a lamp that fades does so in both
+    for path in paths:
+        scale(path, 1.0 if path == spoilt else 0.02)
+    assert reduced(raw).problems == {}
+
+
 def test_whole_numbers_of_a_camera_are_read_and_need_a_dark(raw, tmp_path):
     """As cameras write them: 16 bits without a sign, with a bias."""
     wanted = reduced(raw).observations
