@@ -41,6 +41,7 @@ from astropolcal.reduction.headers import (
 from astropolcal.reduction.photometry import (
     detector_of,
     evenly_lit,
+    light_in_parts,
     measure_internal,
     outside_share,
     piled_up,
@@ -84,6 +85,7 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             if source == "internal":
                 even = evenly_lit(cube, good, layout)
                 frame.values["light"] = "even" if even else "uneven"
+                frame.values["parts"] = light_in_parts(cube, good, layout).tolist()
                 frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
                 dark = masters is not None and masters.dark is not None
                 frame.doubts += [] if dark else _raw(cube, good, frame, layout)

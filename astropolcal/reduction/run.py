@@ -22,7 +22,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import append_line, read_lines
 from astropolcal.observations import Observations
-from astropolcal.observations.grid import is_star
+from astropolcal.observations.grid import MAD_TO_SIGMA, is_star
 from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
@@ -42,6 +42,13 @@ __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
+# single difference in a part of the rectangles, and standard deviations, from what is expected; and
+# of how many frames the others are told from
+_UNLIKE, _FEWEST = (0.03, 6.0), 6
+_UNLIKE_OTHERS = (
+    "in a part of the rectangles the beams differ otherwise than in the other frames, as where "
+    "pixels are damaged or one beam is cut"
+)
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
 
 
@@ -316,6 +323,8 @@ def reduce_run(
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
     wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
+    for frame in _unlike_others(frames, layout):
+        frame.doubts.append(_UNLIKE_OTHERS)
     for frame in frames:
         frame.doubts += [*wrong, *masters.doubts(frame.values, settings)]
         if frame.values.get("light") == "uneven":
@@ -467,6 +476,38 @@ def _optic(layout, key, frame):
     column, words = layout.optics[key]
     said = frame.values.get(column) or ""
     return next((word for pattern, word in words.items() if re.search(pattern, said)), None)
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _unlike_others(frames, layout):
+    """
+    Return the frames of a lamp in which a part of one beam has another light than in the others.
+
+    How the ratio of both beams in a part compares with that of all of the rectangles is the same in
+    all frames, wherever the lamp is bright and however it is polarized.
+    """
+    frames = [frame for frame in frames if frame.values.get("light") == "even"]
+    if len(frames) < _FEWEST or not layout.two_beams:
+        return []
+    # (frame, part), and with one part for the mean of all
+    right, left = np.moveaxis(np.array([frame.values["parts"] for frame in frames]), 1, 0)
+    whole, rest = (np.ma.masked_invalid(beam).mean(axis=1)[:, None] for beam in (right, left))
+    odds = (right / left) / (whole / rest)
+    # of light that is all in one beam the other one says nothing
+    both = (np.abs(whole - rest) < 0.9 * (whole + rest)).all(axis=1)
+    usual = np.ma.median(np.ma.masked_invalid(odds[both]), axis=0)
+    off = (right - left) / (right + left) - (usual * whole - rest) / (usual * whole + rest)
+    flux, variance = (
+        np.array([getattr(f.photometry, name)[:, ~f.photometry.failed].sum(axis=1) for f in frames])
+        for name in ("flux", "variance")
+    )
+    # of the single difference in a part
+    error = 2 * np.sqrt((flux[:, ::-1] ** 2 * variance).sum(axis=1)) / flux.sum(axis=1) ** 2
+    error, off = np.sqrt(right.shape[1]) * error[:, None], np.ma.masked_invalid(np.abs(off))
+    # errors may lack something, such as the noise of a dark
+    error = error * max(1.0, MAD_TO_SIGMA * np.ma.median(off / error))
+    bad = (off > np.maximum(_UNLIKE[0], _UNLIKE[1] * error)).filled(False).any(axis=1)
+    return [frame for frame, unlike in zip(frames, bad, strict=True) if unlike]
 
 
 def _wrong_source(frames, instrument, told):
