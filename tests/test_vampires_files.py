@@ -266,6 +266,7 @@ def test_cameras_that_contradict_each_other(copied):
         ({"RET-ANG1": 30.0}, "hwp = 0.0, but 30.0 in VMPA00000001_cam2.fits"),
         ({"U_FLC": "B"}, "flc_state = A, but B in VMPA00000001_cam2.fits"),
         ({"U_CAMERA": 1}, "U_CAMERA = 1, its name says 'cam2'"),
+        ({"U_EMGAIN": 300}, "em_gain = None, but 300.0 in VMPA00000001_cam2.fits"),
         ({"U_FLC": "C"}, "VMPA00000001_cam2.fits: U_FLC = 'C', allowed are A, B"),
     ]:
         path.write_bytes(content)

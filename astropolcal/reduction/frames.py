@@ -427,6 +427,8 @@ def _read_image(path, shape, changed):
 
 # what the headers of both files must agree in, and by how much numbers may differ
 _COMMON = {"hwp": 0.1, "derotator": 0.5, "exposure_time": 1e-3, "flc_state": None, "filter": None}
+# the gains may differ, but a detector without one is of another kind
+_COMMON |= {"em_gain": np.inf}
 
 
 def match_beams(frame, layout, cube, detector):
