@@ -341,6 +341,25 @@ def test_frames_of_other_optics_than_most_are_left_out(copied):
     assert run.meta["flc"] == "in"
 
 
+def test_a_first_file_of_another_mode_does_not_name_that_of_the_run(copied):
+    wanted = reduced(copied).observations
+    first = [copied / f"VMPA00000001_cam{camera}.fits" for camera in (1, 2)]
+    for words, why in (
+        ({"FILTER01": "625-50"}, "filter '625-50', the others of the run have '725-50'"),
+        ({"FILTER01": "H-alpha"}, "filter 'H-alpha', the others of the run have '725-50'"),
+        ({"OBS-MOD": "IPOL_MBI"}, "pickoff 'IPOL_MBI', the others of the run have 'IPOL'"),
+    ):
+        for path in first:
+            edit(path, **{"OBS-MOD": "IPOL", "FILTER01": "725-50"} | words)
+        run = reduced(copied)
+        assert run.problems == {str(first[0]): [why]}, words
+        assert run.observations.wavelength == wanted.wavelength == FILTER
+    for path in copied.glob("*.fits"):
+        edit(path, FILTER01="H-alpha", **{"OBS-MOD": "IPOL"})
+    with pytest.raises(InstrumentError, match=r"VMPA00000001_cam1.fits: FILTER01 = 'H-alpha'"):
+        reduced(copied)
+
+
 def test_images_of_another_size(copied):
     header = fits.getheader(copied / "VMPA00000001_cam2.fits")
     fits.writeto(
