@@ -341,6 +341,7 @@ def test_frames_of_other_optics_than_most_are_left_out(copied):
     assert run.meta["flc"] == "in"
 
 
+@pytest.mark.slow
 def test_a_first_file_of_another_mode_does_not_name_that_of_the_run(copied):
     wanted = reduced(copied).observations
     first = [copied / f"VMPA00000001_cam{camera}.fits" for camera in (1, 2)]
@@ -515,6 +516,7 @@ def test_exposures_without_a_value_are_refused(raw):
     assert "1 of its 3 exposures, such as number 2, have no pixel with a value" in why[0]
 
 
+@pytest.mark.slow
 def test_exposures_that_one_camera_lacks_are_refused(raw):
     paths = sorted(raw.glob("*.fits"))
     spoilt = next(path for path in paths if fits.getval(path, "U_CAMERA") == 1)
@@ -532,6 +534,7 @@ def test_exposures_that_one_camera_lacks_are_refused(raw):
     assert reduced(raw).problems == {}
 
 
+@pytest.mark.slow
 def test_whole_numbers_of_a_camera_are_read_and_need_a_dark(raw, tmp_path):
     """As cameras write them: 16 bits without a sign, with a bias."""
     wanted = reduced(raw).observations
