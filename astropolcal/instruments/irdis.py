@@ -305,7 +305,7 @@ class IrdisLayout(FileLayout):
         # of a lamp there is none
         if kind and self.sky_law.plate_law(kind) != self.tracking:
             raise ObservationError(
-                f"{_ROTATION} = {kind.upper()}, but the first file has another: frames of one kind "
+                f"{_ROTATION} = {kind.upper()}, but most files have another: frames of one kind "
                 "of tracking are needed"
             )
         angles = KEYWORDS.keys() & set(row.colnames)

@@ -46,7 +46,7 @@ _AMBIGUOUS = (0.15, 0.4)
 # of how many frames the others are told from
 _UNLIKE, _FEWEST = (0.03, 6.0), 6
 _UNLIKE_OTHERS = (
-    "in a part of the rectangles the beams differ otherwise than in the other frames, as where "
+    "in a part of the rectangles the beams compare differently from the other frames, as where "
     "pixels are damaged or one beam is cut"
 )
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"

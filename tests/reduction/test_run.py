@@ -715,4 +715,4 @@ def test_part_of_a_beam_unlike_that_in_the_other_frames_is_told(tmp_path, small)
     doubts = reduce_run(paths, small).doubts
     assert sorted(doubts) == [str(path) for path in paths[1:3]]
     for why in doubts.values():
-        assert "in a part of the rectangles the beams differ otherwise than in the other" in why[-1]
+        assert "in a part of the rectangles the beams compare differently from the other" in why[-1]
