@@ -2,6 +2,8 @@
 """SPHERE/IRDIS: its chain against the published formulae, its headers, correction, diagnosis."""
 
 import datetime
+import re
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -417,6 +419,28 @@ def test_angles_of_the_start_alone_are_taken_and_told():
             assert lost > 0.1, mode
             assert words.endswith(f"it turns by up to {lost:.2g} deg"), mode
             assert warning.filename == __file__, mode
+
+
+def test_stage_that_moves_within_a_frame_is_told():
+    absent = dict.fromkeys(("ESO TEL PARANG START", "ESO OCS DPI H2RT STOKES", "RA"))
+    for number, column in ((2, "derotator"), (3, "hwp_true")):
+        first, last = (f"ESO INS4 DROT{number} {word}" for word in ("BEGIN", "END"))
+        # a lamp stands still; with a star near the zenith the stages turn in half an hour
+        for off_sky, cards, turn, told in (
+            (absent, {}, 0.9, ""),
+            (absent, {}, -12.0, "12"),
+            ({}, {}, 1.1, ""),
+            ({}, {"ESO DET NDIT": 100}, 1.9, ""),
+            ({}, {}, 40.0, "40"),
+        ):
+            angles = {first: 359.0, last: (359.0 + turn) % 360}
+            frames = [header(**off_sky), header(**off_sky, **cards, **angles)]
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                IRDIS_.frame_table(frames)
+            words = " ".join(str(warning.message) for warning in caught)
+            assert bool(caught) == bool(told), (column, turn, words)
+            assert re.search(rf"^$|by up to {told}.* frame 1: {column} moved", words), words
 
 
 def test_internal_frames_have_no_sky():

@@ -105,7 +105,7 @@ def test_frames_of_both_kinds_of_tracking_are_refused_in_any_order(science, tmp_
     fits.setval(other, "HIERARCH ESO INS4 COMB ROT", value="PUPIL")
     for files in ([one, other], [other, one]):
         layout = Small().configured(fits.getheader(files[0])).files
-        with pytest.raises(ObservationError, match="but the first file has another: frames of one"):
+        with pytest.raises(ObservationError, match="but most files have another: frames of one"):
             survey_frames(files, layout)
 
 
@@ -116,12 +116,32 @@ def test_filter_and_size_are_those_of_the_file():
     assert IRDIS_.mode_header([1.043] * u.um) == {"ESO INS1 FILT ID": "FILT_BBF_Y"}
     for header, message in [
         ({"ESO INS1 FILT ID": "FILT_DBF_H23"}, "has no coefficients; allowed are FILT_BBF_Y"),
-        ({"ESO INS1 FILT ID": "FILT_BBF_H", "NAXIS1": 401}, "images of 401 x 1024 pixels; two ha"),
+        (H | {"NAXIS1": 401}, "images of 401 x 1024 pixels; two ha"),
+        # one half, and an image whose axes are exchanged
+        (H | {"NAXIS1": 1024}, "images of 1024 x 1024 pixels; two ha"),
+        (H | {"NAXIS1": 1024, "NAXIS2": 2048}, "images of 1024 x 2048 pixels; two ha"),
     ]:
         with pytest.raises(InstrumentError, match=message):
             IRDIS_.configured(header)
     with pytest.raises(InstrumentError, match="a file is of one filter, not of Y, J, H, Ks"):
         IRDIS_.mode_header(IRDIS_.wavelength)
+
+
+def test_frames_without_light_or_without_optics_are_left_out(lamp, tmp_path):
+    paths = copied(lamp, tmp_path)
+    cases = (
+        ("ESO DPR TYPE", "FLAT,LAMP", ""),
+        ("ESO DPR TYPE", "DARK", "it has no light of the source"),
+        ("ESO INS4 OPTI8 NAME", "h_nir", ""),
+        ("ESO INS4 OPTI8 NAME", "CLEAR", "the half-wave plate is not in the beam"),
+        ("ESO INS1 OPTI2 NAME", "P0-90", ""),
+        ("ESO INS1 OPTI2 NAME", "D_H23", "the pair of polarizers is not in the beam"),
+    )
+    wanted = {}
+    for path, (keyword, word, why) in zip(paths, cases, strict=False):
+        fits.setval(path, f"HIERARCH {keyword}", value=word)
+        wanted |= {str(path): [f"{keyword} = {word!r}: {why}"]} if why else {}
+    assert reduce_run(paths, Small(), source="polarized").problems == wanted
 
 
 def test_a_mean_of_exposures_has_the_noise_of_all(lamp, tmp_path):

@@ -266,6 +266,7 @@ def test_cameras_that_contradict_each_other(copied):
         ({"RET-ANG1": 30.0}, "hwp = 0.0, but 30.0 in VMPA00000001_cam2.fits"),
         ({"U_FLC": "B"}, "flc_state = A, but B in VMPA00000001_cam2.fits"),
         ({"U_CAMERA": 1}, "U_CAMERA = 1, its name says 'cam2'"),
+        ({"U_EMGAIN": 300}, "em_gain = None, but 300.0 in VMPA00000001_cam2.fits"),
         ({"U_FLC": "C"}, "VMPA00000001_cam2.fits: U_FLC = 'C', allowed are A, B"),
     ]:
         path.write_bytes(content)
@@ -323,6 +324,41 @@ def test_a_frame_without_a_state_is_left_out_and_its_partner_named(copied, tmp_p
             ObservationError, match=r"obs\.ecsv, row 3: flc_state B at hwp = 45 deg"
         ):
             find()
+
+
+def test_frames_of_other_optics_than_most_are_left_out(copied):
+    for path in copied.glob("*.fits"):
+        # the words of the header have changed
+        edit(path, U_FLCST="In" if "0001" in path.name else "IN")
+    for camera in (1, 2):
+        edit(copied / f"VMPA00000002_cam{camera}.fits", U_FLCST="OUT")
+        edit(copied / f"VMPA00000003_cam{camera}.fits", **{"DATA-TYP": "DARK"})
+    run = reduced(copied)
+    (one, (typed, *_)), (other, word) = run.problems.items()
+    assert (one[-17:], other[-17:]) == ("00000003_cam1.fits"[1:], "00000002_cam1.fits"[1:])
+    assert typed == "DATA-TYP = 'DARK': it has no light of the source"
+    assert word == ["flc 'out', the others of the run have 'in'"]
+    assert run.meta["flc"] == "in"
+
+
+@pytest.mark.slow
+def test_a_first_file_of_another_mode_does_not_name_that_of_the_run(copied):
+    wanted = reduced(copied).observations
+    first = [copied / f"VMPA00000001_cam{camera}.fits" for camera in (1, 2)]
+    for words, why in (
+        ({"FILTER01": "625-50"}, "filter '625-50', the others of the run have '725-50'"),
+        ({"FILTER01": "H-alpha"}, "filter 'H-alpha', the others of the run have '725-50'"),
+        ({"OBS-MOD": "IPOL_MBI"}, "pickoff 'IPOL_MBI', the others of the run have 'IPOL'"),
+    ):
+        for path in first:
+            edit(path, **{"OBS-MOD": "IPOL", "FILTER01": "725-50"} | words)
+        run = reduced(copied)
+        assert run.problems == {str(first[0]): [why]}, words
+        assert run.observations.wavelength == wanted.wavelength == FILTER
+    for path in copied.glob("*.fits"):
+        edit(path, FILTER01="H-alpha", **{"OBS-MOD": "IPOL"})
+    with pytest.raises(InstrumentError, match=r"VMPA00000001_cam1.fits: FILTER01 = 'H-alpha'"):
+        reduced(copied)
 
 
 def test_images_of_another_size(copied):
@@ -478,3 +514,40 @@ def test_exposures_without_a_value_are_refused(raw):
         hdus[0].data[1] = np.nan
     (why,) = reduced(raw).problems.values()
     assert "1 of its 3 exposures, such as number 2, have no pixel with a value" in why[0]
+
+
+@pytest.mark.slow
+def test_exposures_that_one_camera_lacks_are_refused(raw):
+    paths = sorted(raw.glob("*.fits"))
+    spoilt = next(path for path in paths if fits.getval(path, "U_CAMERA") == 1)
+
+    def scale(path, factor):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].data[2] *= np.float32(factor)
+
+    scale(spoilt, 0.02)
+    (why,) = reduced(raw).problems.values()
+    assert "1 of its 3 exposures, such as number 3 with 2% of the usual light, where VMPA" in why[0]
+    # a lamp that fades does so in both
+    for path in paths:
+        scale(path, 1.0 if path == spoilt else 0.02)
+    assert reduced(raw).problems == {}
+
+
+@pytest.mark.slow
+def test_whole_numbers_of_a_camera_are_read_and_need_a_dark(raw, tmp_path):
+    """As cameras write them: 16 bits without a sign, with a bias."""
+    wanted = reduced(raw).observations
+    for path in raw.glob("*.fits"):
+        with fits.open(path) as hdus:
+            data, header = np.rint(hdus[0].data + 200).astype("u2"), hdus[0].header
+        fits.writeto(path, data, header, overwrite=True)
+    for camera in (1, 2):
+        dark = np.full((SIDE, SIDE), 200.0)
+        fits.writeto(tmp_path / f"dark_cam{camera}.fits", dark, fits.Header({"U_CAMERA": camera}))
+    told = reduced(raw).doubts
+    assert len(told) == 16
+    assert all("whole numbers, as of a raw frame, and no dark" in why[0] for why in told.values())
+    found = reduced(raw, dark=tmp_path / "dark_cam1.fits")
+    assert found.doubts == {}
+    np.testing.assert_allclose(found.observations.flux_right, wanted.flux_right, rtol=1e-3)

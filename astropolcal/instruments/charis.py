@@ -19,7 +19,7 @@ from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import SubaruPolarimeter
-from astropolcal.instruments.layout import COMMON, FileLayout, frame_time
+from astropolcal.instruments.layout import COMMON, NO_LIGHT, FileLayout, frame_time
 from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
@@ -86,6 +86,7 @@ class CHARIS(SubaruPolarimeter):
         raw_columns=("hwp", "hwp_true", "derotator", "instrument"),
         identities=("CHARIS",),
         prefix="CRSA",
+        wanted={"DATA-TYP": NO_LIGHT},
         gain=2.0,
         read_noise=10.0,
         saturation=40000.0,

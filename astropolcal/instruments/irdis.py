@@ -26,7 +26,7 @@ from astropolcal.chain import join
 from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, warn
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.base import Instrument, SkyLaw
-from astropolcal.instruments.layout import COMMON, RANGES, FileLayout, side_by_side
+from astropolcal.instruments.layout import COMMON, NO_LIGHT, RANGES, FileLayout, side_by_side
 from astropolcal.observations.grid import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.reading import stated_date
@@ -41,6 +41,8 @@ _PLATE_ZERO, _PUPIL_OFFSET = 152.15, 135.99
 _READ_OUT, _START = 0.938, 2.4
 # degrees by which a stage or the sky may turn within a frame
 _MOST_TURN = 90.0
+# degrees by which a stage may turn more than the sky asks for
+_MORE_TURN = 1.0
 _COMMANDED = {"Qplus": 0.0, "Qminus": 45.0, "Uplus": 22.5, "Uminus": 67.5}
 _STAGES = {"hwp_true": "ESO INS4 DROT3", "derotator": "ESO INS4 DROT2"}
 _ROTATION, _STOKES = "ESO INS4 COMB ROT", "ESO OCS DPI H2RT STOKES"
@@ -90,6 +92,7 @@ class _Header:
         return value
 
     def mean_angle(self, first, last):
+        """Return the mean of two angles, and the turn from the first to the last."""
         ends = [self.number_of(key, *RANGES["parallactic"]) for key in (first, last)]
         turn = (ends[1] - ends[0] + 180) % 360 - 180
         # half a turn has no middle, and long before light of all angles is mixed
@@ -99,7 +102,7 @@ class _Header:
                 f"frame up to {_MOST_TURN:g} deg are allowed"
             )
         # on the circle: 359 and 3 deg have the mean 1, not 181
-        return float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(ends)).sum())))
+        return float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(ends)).sum()))), turn
 
 
 def frame_table(headers, site, sky_law):
@@ -119,7 +122,8 @@ def frame_table(headers, site, sky_law):
             raise ObservationError(f"frames of several {what}: {names}")
     (band,), (tracking,) = bands, trackings
     rows = [_row(frame, tracking, site if stars[0] else None) for frame in frames]
-    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, sky_law)
+    moved = [row.pop("moved") for row in rows]
+    _warn_of_stages(frames, moved, tracking, sky_law)
     table = QTable({key: [row[key] for row in rows] for key in rows[0]})
     table["wavelength"] = np.full(len(rows), 1.0) * _BANDS[band]
     table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
@@ -140,7 +144,9 @@ def _filter(frame):
 
 def _row(frame, tracking, site):
     """Return the angles and times of a frame, of a star with the site of the telescope."""
-    angles = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
+    stages = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
+    angles = {column: mean for column, (mean, _) in stages.items()}
+    moved = {column: turn for column, (_, turn) in stages.items()}
     angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
     # the image turns by twice the derotator
     angles["derotator"] += 0.5 * _PUPIL_OFFSET if tracking == "pupil" else 0.0
@@ -152,7 +158,7 @@ def _row(frame, tracking, site):
         middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
         moment = middle.isot
     if site is not None:
-        angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
+        angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")[0]
         limits = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0)}
         target = SkyCoord(*(frame.number_of(key, *limits[key]) for key in limits), unit=u.deg)
         places = pointing(target, Time([start, middle]), location_of(site))
@@ -163,36 +169,47 @@ def _row(frame, tracking, site):
         angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0, 90.0) + motion[1]
     commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
     angles["hwp"] = angles["hwp_true"] if commanded is None else commanded
-    row = {"frame": frame.number, "motion": motion} | {
+    row = {"frame": frame.number, "moved": moved | {"sky": motion}} | {
         key: value * u.deg for key, value in angles.items()
     }
     return row | {"exposure_time": dit * ndit * u.s, "time": moment}
 
 
 def _stage(frame, keyword):
-    """Return the mean angle of a stage, or that of the start where there is no other."""
+    """Return the mean angle of a stage, and its turn; of the start where there is no other."""
     first, last = f"{keyword} BEGIN", f"{keyword} END"
     if first not in frame and f"{keyword} START" in frame:
         first = f"{keyword} START"
     return frame.mean_angle(first, last if last in frame else first)
 
 
-def _warn_of_starts(frames, motions, tracking, sky_law):
-    """Say which angles are those of the start, and by how much the middle differs."""
+def _warn_of_stages(frames, moved, tracking, sky_law):
+    """Say which angles are those of the start, and which stages turn more than with the sky."""
     for column, keyword in _STAGES.items():
-        few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
-        if not few:
-            continue
         on_sky = (0.0, 0.0)
         if tracking is not None:
             law = sky_law.plate_law if column == "hwp_true" else sky_law.derotator_law
             on_sky = law(tracking)
-        lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
+        # until the middle of the exposure
+        asked = np.abs([np.dot(on_sky, one["sky"]) for one in moved])
+        beyond = np.abs([one[column] for one in moved]) - 2 * asked
+        if (much := beyond > _MORE_TURN).any():
+            warn(
+                f"{keyword} BEGIN and END differ by up to {beyond.max():.2g} deg more than the sky "
+                f"turns in {counted(int(much.sum()), 'frame')} of {len(frames)}, the first is "
+                f"frame {int(much.argmax())}: {column} moved while the frame was taken, and is "
+                "that of the middle",
+                stacklevel=4,
+            )
+        few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
+        if not few:
+            continue
+        lost = asked[few].max()
         warn(
             f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
             f"is frame {few[0]}: {column} is that of the start; until the middle of the exposure "
             f"it turns by up to {lost:.2g} deg",
-            # _warn_of_starts, frame_table of this module, that of the instrument: who called it
+            # _warn_of_stages, frame_table of this module, that of the instrument: who called it
             stacklevel=4,
         )
 
@@ -288,7 +305,7 @@ class IrdisLayout(FileLayout):
         # of a lamp there is none
         if kind and self.sky_law.plate_law(kind) != self.tracking:
             raise ObservationError(
-                f"{_ROTATION} = {kind.upper()}, but the first file has another: frames of one kind "
+                f"{_ROTATION} = {kind.upper()}, but most files have another: frames of one kind "
                 "of tracking are needed"
             )
         angles = KEYWORDS.keys() & set(row.colnames)
@@ -311,7 +328,7 @@ class IrdisLayout(FileLayout):
         # a star that is always up: by its motion the altitude is that of the start
         own = {_ROTATION: "FIELD", "RA": 0.0, "DEC": -80.0} | own
         own["ESO TEL PARANG END"] = own[_PARALLACTIC]
-        _, motion = _row(_Header(0, own), None, self.site)["motion"]
+        _, motion = _row(_Header(0, own), None, self.site)["moved"]["sky"]
         return own | {"ESO TEL ALT": own["ESO TEL ALT"] - motion}
 
 
@@ -341,6 +358,11 @@ LAYOUT = IrdisLayout(
     site=shared.PARANAL,
     stacked=True,
     centred=True,
+    wanted={
+        "ESO DPR TYPE": NO_LIGHT,
+        "ESO INS4 OPTI8 NAME": ("H_NIR", "the half-wave plate is not in the beam"),
+        "ESO INS1 OPTI2 NAME": ("P0-90", "the pair of polarizers is not in the beam"),
+    },
     **side_by_side(1024, 1024, _LIT),
 )
 
@@ -529,10 +551,11 @@ class IRDIS(Instrument):
         one.wavelength = np.atleast_1d(_BANDS[_filter(_Header(0, header))])
         # without NAXIS1 they are of full frames
         columns, rows = int(header.get("NAXIS1", 2048)), int(header.get("NAXIS2", 1024))
-        if columns % 2 or min(rows, columns // 2) < 16:
+        # as high as broad is one half, and higher one that lies on its side
+        if columns % 2 or min(rows, columns // 2) < 16 or rows >= columns:
             raise InstrumentError(
                 f"irdis: images of {columns} x {rows} pixels; two halves side by side are needed, "
-                "of 16 x 16 pixels and more each"
+                "of 16 x 16 pixels and more each, broader together than high"
             )
         places = side_by_side(rows, columns // 2, _LIT) | {"tracking": law.plate_law("field")}
         if str(header.get(_ROTATION, "")).strip() == "PUPIL":
@@ -580,6 +603,8 @@ class IRDIS(Instrument):
         AstropolcalWarning
             If plate or derotator are known at the start of an exposure only (``BEGIN`` or
             ``START`` without ``END``), with how far they turn until its middle.
+
+        Or if a stage turns within a frame by a degree more than the sky asks for.
 
         Notes
         -----

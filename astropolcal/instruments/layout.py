@@ -172,6 +172,9 @@ class FileLayout:
     optics : dict of str to (str, dict of str to str)
         What headers say of optics in the beam: key of the table's meta to (column, {regular
         expression: word}). The first expression found in the column's text gives the word.
+    wanted : dict of str to (str, str)
+        What further keywords have to hold, if they are there: keyword to (regular expression,
+        what is wrong with a frame that has another word).
 
     Raises
     ------
@@ -221,6 +224,7 @@ class FileLayout:
     stacked: bool = False
     centred: bool = False
     optics: dict = field(default_factory=dict)
+    wanted: dict = field(default_factory=dict)
 
     def __post_init__(self):
         for name in ("gain", "saturation", "pixel_scale", "fwhm", "hwp_step"):
@@ -359,6 +363,9 @@ COMMON = {
     "object": "OBJECT",
     "instrument": "INSTRUME",
 }
+
+#: Types of frames that have none of the light that is measured, by a keyword ``wanted``.
+NO_LIGHT = (r"(?!.*\b(DARK|BIAS|SKY)\b).*", "it has no light of the source")
 
 #: Columns that are angles of a stage.
 ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")

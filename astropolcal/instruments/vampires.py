@@ -84,6 +84,7 @@ LAYOUT = layout.FileLayout(
     beam_files=("cam1", "cam2"),
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
+    wanted={"DATA-TYP": layout.NO_LIGHT},
     optics={"flc": ("flc", {r"(?i)^\s*in": "in", r"(?i)^\s*out": "out"})},
     **layout.side_by_side(_FIELD_SIDE, _FIELD_SIDE, _LIT),
 )

@@ -41,9 +41,11 @@ from astropolcal.reduction.headers import (
 from astropolcal.reduction.photometry import (
     detector_of,
     evenly_lit,
+    light_in_parts,
     measure_internal,
     outside_share,
     piled_up,
+    rectangles,
     sharpest,
 )
 from astropolcal.reduction.stars import measure_stars
@@ -83,7 +85,10 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
             if source == "internal":
                 even = evenly_lit(cube, good, layout)
                 frame.values["light"] = "even" if even else "uneven"
+                frame.values["parts"] = light_in_parts(cube, good, layout).tolist()
                 frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
+                dark = masters is not None and masters.dark is not None
+                frame.doubts += [] if dark else _raw(cube, good, frame, layout)
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
@@ -107,6 +112,22 @@ def _background(cube, good, layout, result):
         f"outside the beams there is {100 * share:.2g} % of the light inside, on the same area; "
         "where it is under the beams, too, they seem less polarized (background='outside', "
         "--background outside, subtracts it)"
+    ]
+
+
+def _raw(cube, good, frame, layout):
+    """Say that nothing was subtracted from the whole numbers of a raw frame."""
+    rows, columns, _ = rectangles(layout.internal_apertures, cube.shape[1:])[0]
+    # of the right beam, which is in its own unit; of a mean the sum is whole
+    pixels = cube[:, rows, columns][good[:, rows, columns]].astype(float)
+    sums = pixels[pixels != 0] * frame.values.get("exposures", 1.0)
+    # some pixels are whole by chance
+    whole = sums.size and np.mean(np.abs(sums - np.rint(sums)) < 1e-6) > 0.9
+    if not whole or frame.photometry.background.any():
+        return []
+    return [
+        "its pixels are whole numbers, as of a raw frame, and no dark was given (dark, --dark): "
+        "bias and dark current are taken for unpolarized light"
     ]
 
 
@@ -135,7 +156,7 @@ def open_cube(path, layout, masters=None):
             warnings.filterwarnings("error", message=".*truncated.*")
             stream = stack.enter_context(open_fits(path))
             try:
-                hdus = stack.enter_context(fits.open(stream, memmap=True))
+                hdus = stack.enter_context(fits.open(stream))
                 opened = _read(path, hdus, layout, masters)
             except AstropyUserWarning as warning:
                 # its type tells a user nothing
@@ -145,7 +166,7 @@ def open_cube(path, layout, masters=None):
 
 
 def _read(path, hdus, layout, masters):
-    primary, header, cube, good = _read_beams(path, hdus, layout, masters)
+    primary, header, cube, good, light = _read_beams(path, hdus, layout, masters)
     left = layout.left_file(path)
     if left is None:
         return primary, header, cube, good
@@ -154,7 +175,8 @@ def _read(path, hdus, layout, masters):
     # what is joined is in memory, so that this file need not stay open
     with readable_fits(left), open_fits(left) as stream, fits.open(stream, memmap=False) as others:
         own = masters and masters.of_left(layout)
-        _, _, other, known = _read_beams(left, others, layout, own)
+        _, _, other, known, theirs = _read_beams(left, others, layout, own)
+    _check_exposures(path, light, left, theirs)
     joined, good = (np.concatenate(pair, axis=-1) for pair in ((other, cube), (known, good)))
     return primary, header, joined, good
 
@@ -189,7 +211,7 @@ def _read_beams(path, hdus, layout, masters):
     primary, header = hdus[0].header, hdus[number].header
     values = read_header(path, layout, header=primary).values
     detector = detector_of(layout, _unit_of(header, primary), values)
-    several, good = cube.shape != wanted, good & ~detector.blank(cube)
+    light, several, good = None, cube.shape != wanted, good & ~detector.blank(cube)
     if (piled := piled_up(cube)).any() and np.isfinite(detector.saturation):
         # cut off below the limit that is stated: as full as those above it
         cube = np.where(piled, np.maximum(cube, 1.001 * detector.saturation), cube)
@@ -205,10 +227,44 @@ def _read_beams(path, hdus, layout, masters):
             raise ObservationError(f"{path}: {count} have no pixel with a value; leave them out")
         # one saturated exposure spoils the mean, and is to be seen in it
         full = np.where(good, cube, -np.inf).max(axis=0) >= detector.saturation
+        light = _light(cube, good, detector) if layout.beam_files else None
         # of few exposures a star may stand elsewhere than in the mean
         cube = np.where(full, detector.saturation, mean_of_exposures(cube, good)[0])
         good = (full | (good.mean(axis=0) > 0.5))[None]
-    return primary, header, cube, good
+    return primary, header, cube, good, light
+
+
+# more than so many times the light of the same exposure is in one camera than in the other
+_UNLIKE = 2.0
+
+
+def _light(stack, good, detector):
+    """Return the light of each exposure, where most of it is, or None if it is hardly any."""
+    mean = np.where(good.all(axis=0), stack.mean(axis=0), -np.inf)
+    # a tenth of the pixels: those of a lamp, or of a star and its halo
+    bright = mean >= np.quantile(mean, 0.9)
+    # single pixels that are hot, or were hit, do not count
+    sums = np.minimum(stack[:, bright], 3 * np.median(mean[bright])).sum(axis=1)
+    level = np.median(sums) if np.isfinite(sums).all() else 0.0
+    # that of the detector is the noise of the mean
+    variance = len(stack) * (detector.photon_noise(level) + bright.sum() * detector.read_noise**2)
+    return sums if level > 20 * np.sqrt(variance) else None
+
+
+def _check_exposures(path, light, left, theirs):
+    """Refuse means to which both cameras do not contribute the same exposures."""
+    if light is None or theirs is None or len(light) != len(theirs):
+        return
+    # of the usual exposure the ratio is one
+    ours, theirs = (np.maximum(each / np.median(each), 0.0) for each in (light, theirs))
+    wrong = np.flatnonzero((ours > _UNLIKE * theirs) | (theirs > _UNLIKE * ours))
+    if wrong.size:
+        first = wrong[0]
+        raise ObservationError(
+            f"{path}: {wrong.size} of its {len(light)} exposures, such as number {first + 1} with "
+            f"{ours[first]:.0%} of the usual light, where {left.name} has {theirs[first]:.0%}, "
+            "are not the same in both cameras; leave them out"
+        )
 
 
 def _check_header(frame, layout, source):
@@ -371,6 +427,8 @@ def _read_image(path, shape, changed):
 
 # what the headers of both files must agree in, and by how much numbers may differ
 _COMMON = {"hwp": 0.1, "derotator": 0.5, "exposure_time": 1e-3, "flc_state": None, "filter": None}
+# the gains may differ, but a detector without one is of another kind
+_COMMON |= {"em_gain": np.inf}
 
 
 def match_beams(frame, layout, cube, detector):
@@ -560,7 +618,7 @@ def _survey(files, layout, raw, find):
 def _known(path, layout, raw):
     """Return what is known of a frame whose light is not measured."""
     frame = read_header(path, layout, raw=raw)
-    with readable_fits(path), open_fits(path) as stream, fits.open(stream, memmap=True) as hdus:
+    with readable_fits(path), open_fits(path) as stream, fits.open(stream) as hdus:
         # what is not there is refused where it is corrected
         if len(hdus) > layout.cube_extension and hdus[layout.cube_extension].data is not None:
             cube = hdus[layout.cube_extension]

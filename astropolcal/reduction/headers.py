@@ -21,7 +21,12 @@ from astropy.coordinates import FK5, SkyCoord
 from astropy.time import Time
 from erfa import ErfaError
 
-from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.instruments.layout import (
@@ -127,13 +132,31 @@ def raw_frames(folder, layout):
 
 
 def configured(instrument, files):
-    """Return the instrument as the first header that can be read says; as it is without one."""
+    """Return the instrument as most headers that can be read say; as it is without one."""
+    found, wrong = [], []
     for path in files:
         with suppress(ObservationError), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # wavelengths and shape of the cubes may depend on it
-            return instrument.configured(primary_header(path))
-    return instrument
+            try:
+                # wavelengths and shape of the cubes may depend on it
+                one = instrument.configured(primary_header(path))
+            except InstrumentError as error:
+                wrong.append(f"{path}: {error}")
+                continue
+            # a file of another mode may come first
+            same = next((each for each in found if _same_mode(one, each[0])), [one, 0])
+            found += [] if same[1] else [same]
+            same[1] += 1
+    if wrong and not found:
+        raise InstrumentError(wrong[0])
+    return max(found, key=lambda each: each[1])[0] if found else instrument
+
+
+def _same_mode(one, other):
+    """Return whether the files of two configurations of an instrument have the same slices."""
+    return one is other or (
+        one.files == other.files and np.array_equal(one.wavelength, other.wavelength)
+    )
 
 
 def read_header(path, layout, *, header=None, raw=None):
@@ -172,6 +195,10 @@ def read_header(path, layout, *, header=None, raw=None):
                 headers.append(_raw_header(frame, raw[frame.number], header, layout))
             except ObservationError as error:
                 frame.errors.append(f"raw frame: {error}")
+    for header, (keyword, (usual, why)) in product(headers, layout.wanted.items()):
+        word = str(card_value(header, keyword) or "").strip()
+        if word and not re.fullmatch(usual, word, re.IGNORECASE):
+            frame.errors.append(f"{keyword} = {word!r}: {why}")
     for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
         if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
             frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"

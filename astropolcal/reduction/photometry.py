@@ -338,6 +338,32 @@ def evenly_lit(cube, good, layout):
     return bool(median >= 0.5 * mean)
 
 
+# a rectangle is looked at in so many parts along each of its sides
+_PARTS = 4
+
+
+def light_in_parts(cube, good, layout):
+    """Return the light of a mean pixel in parts of the rectangles, (n_beams, parts), or NaN.
+
+    All slices together.
+    """
+    found, (*_, width, height, angle) = [], layout.internal_apertures
+    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
+        known = good[:, rows, columns]
+        total = np.sum(cube[:, rows, columns], axis=0, dtype=float, where=known)
+        number = known.sum(axis=0)
+        middle = (weights.shape[1] - 1) / 2, (weights.shape[0] - 1) / 2
+        sides = zip(turned(weights.shape, middle, angle), (width, height), strict=True)
+        along, across = (np.clip(_PARTS * (0.5 + x / side), 0, _PARTS - 1) for x, side in sides)
+        part = (_PARTS * along.astype(int) + across.astype(int)).ravel()
+        light, area, whole = (
+            np.bincount(part, (weights * values).ravel(), _PARTS**2)
+            for values in (total / np.maximum(number, 1), number > 0, np.ones(weights.shape))
+        )
+        found.append(np.where(area > 0.5 * whole, light / np.maximum(area, 0.5), np.nan))
+    return np.array(found)
+
+
 def sharpest(square):
     """Return how many times the light of its neighbours a pixel may have, by the squared width."""
     # below no star is as sharp as a pixel that was hit; else three times what the peak of a star

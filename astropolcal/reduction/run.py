@@ -22,7 +22,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import append_line, read_lines
 from astropolcal.observations import Observations
-from astropolcal.observations.grid import is_star
+from astropolcal.observations.grid import MAD_TO_SIGMA, is_star
 from astropolcal.observations.reading import stated_date, write_table
 from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
@@ -42,6 +42,13 @@ __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
 # modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
+# single difference in a part of the rectangles, and standard deviations, from what is expected; and
+# of how many frames the others are told from
+_UNLIKE, _FEWEST = (0.03, 6.0), 6
+_UNLIKE_OTHERS = (
+    "in a part of the rectangles the beams compare differently from the other frames, as where "
+    "pixels are damaged or one beam is cut"
+)
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
 
 
@@ -315,6 +322,8 @@ def reduce_run(
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
     wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
+    for frame in _unlike_others(frames, layout):
+        frame.doubts.append(_UNLIKE_OTHERS)
     for frame in frames:
         frame.doubts += [*wrong, *masters.doubts(frame.values, settings)]
         if frame.values.get("light") == "uneven":
@@ -447,7 +456,10 @@ def _meta(frames, instrument, source, given):
         if texts and (key != "object" or "star" in source):
             usual = Counter(texts).most_common(1)[0][0]
             meta[key] = usual[:10] if key == "date" else usual
-    meta |= _optics(values, instrument.files)
+    for key in instrument.files.optics:
+        # all that say it say the same
+        if said := {_optic(instrument.files, key, frame) for frame in frames} - {None}:
+            (meta[key],) = said
     if any(v.get("flc_state") for v in values):
         # the states alternate within an exposure, so that their difference is the better one
         meta["pairing"] = "flc_state"
@@ -458,14 +470,43 @@ def _meta(frames, instrument, source, given):
     return meta | dict(given)
 
 
-def _optics(values, layout):
-    """Return what the headers say of optics in the beam, by the first pattern that is found."""
-    found = {}
-    for key, (column, words) in layout.optics.items():
-        said = next((v[column] for v in values if v.get(column)), "")
-        hits = [word for pattern, word in words.items() if re.search(pattern, said)]
-        found |= {key: hits[0]} if hits else {}
-    return found
+def _optic(layout, key, frame):
+    """Return what a header says of an optic, by the first pattern that is found, or None."""
+    column, words = layout.optics[key]
+    said = frame.values.get(column) or ""
+    return next((word for pattern, word in words.items() if re.search(pattern, said)), None)
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _unlike_others(frames, layout):
+    """
+    Return the frames of a lamp in which a part of one beam has another light than in the others.
+
+    How the ratio of both beams in a part compares with that of all of the rectangles is the same in
+    all frames, wherever the lamp is bright and however it is polarized.
+    """
+    frames = [frame for frame in frames if frame.values.get("light") == "even"]
+    if len(frames) < _FEWEST or not layout.two_beams:
+        return []
+    # (frame, part), and with one part for the mean of all
+    right, left = np.moveaxis(np.array([frame.values["parts"] for frame in frames]), 1, 0)
+    whole, rest = (np.ma.masked_invalid(beam).mean(axis=1)[:, None] for beam in (right, left))
+    odds = (right / left) / (whole / rest)
+    # of light that is all in one beam the other one says nothing
+    both = (np.abs(whole - rest) < 0.9 * (whole + rest)).all(axis=1)
+    usual = np.ma.median(np.ma.masked_invalid(odds[both]), axis=0)
+    off = (right - left) / (right + left) - (usual * whole - rest) / (usual * whole + rest)
+    flux, variance = (
+        np.array([getattr(f.photometry, name)[:, ~f.photometry.failed].sum(axis=1) for f in frames])
+        for name in ("flux", "variance")
+    )
+    # of the single difference in a part
+    error = 2 * np.sqrt((flux[:, ::-1] ** 2 * variance).sum(axis=1)) / flux.sum(axis=1) ** 2
+    error, off = np.sqrt(right.shape[1]) * error[:, None], np.ma.masked_invalid(np.abs(off))
+    # errors may lack something, such as the noise of a dark
+    error = error * max(1.0, MAD_TO_SIGMA * np.ma.median(off / error))
+    bad = (off > np.maximum(_UNLIKE[0], _UNLIKE[1] * error)).filled(False).any(axis=1)
+    return [frame for frame, unlike in zip(frames, bad, strict=True) if unlike]
 
 
 def _wrong_source(frames, instrument, told):
@@ -524,6 +565,9 @@ def set_aside(frames, reduction):
     stages = reduction.instrument.files.stages if reduction.instrument else ()
     for name in (name for name in _KINDS[reduction.source] if name not in stages):
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
+    # by what they are to a chain, and not by how they are written
+    for key in reduction.instrument.files.optics if reduction.instrument else ():
+        kept = _of_one_kind(kept, key, partial(_optic, reduction.instrument.files, key), reduction)
     # what has no number comes last, by time
     time = {frame.path: frame.values.get("mjd", np.inf) for frame in kept}
     return sorted(

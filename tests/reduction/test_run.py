@@ -692,3 +692,27 @@ def test_one_beam_and_four_beams_are_measured_as_two_are(tmp_path):
             save_quicklook(reduce_run(files, star, source="star"), folder)
     with pytest.raises(InstrumentError, match="beams = \\('a', 'a'\\)"):
         beams_of(("a", "a"), ())
+
+
+@pytest.mark.slow
+def test_part_of_a_beam_unlike_that_in_the_other_frames_is_told(tmp_path, small):
+    paths = flat_frames(tmp_path, np.arange(0, 90, 11.25).tolist())
+    rows, columns = np.indices((201, 201))
+    for number, path in enumerate(paths):
+        with fits.open(path, mode="update") as hdus:
+            # a lamp that moves, and another response in each beam, are the same to both
+            lamp = 1 + 0.2 * np.sin(number) * (rows - 100) / 100
+            hdus[1].data = (hdus[1].data * lamp * (1 + (columns > 100) * rows / 400)).astype("f4")
+    assert reduce_run(paths, small).doubts == {}
+    for path, change in zip(paths[1:3], (0.5, None), strict=True):
+        with fits.open(path, mode="update") as hdus:
+            if change:
+                # a third of one beam is cut
+                hdus[1].data[:, :70, :] *= np.float32(change)
+            else:
+                # pixels that all say the same
+                hdus[1].data[:, 90:120, 60:80] = 300.0
+    doubts = reduce_run(paths, small).doubts
+    assert sorted(doubts) == [str(path) for path in paths[1:3]]
+    for why in doubts.values():
+        assert "in a part of the rectangles the beams compare differently from the other" in why[-1]

@@ -231,10 +231,10 @@ def test_failed_slices_do_not_tell():
 
 
 def test_headers_tell_optics_by_the_first_pattern_that_is_found():
-    from astropolcal.reduction.run import _optics
+    from astropolcal.reduction.run import _optic
 
     words = {"nothing": "out", "JH": "in"}
     layout = SimpleNamespace(optics={"dichroic": ("pickoff", words), "stop": ("mask", {"x": "in"})})
-    assert _optics([{}, {"pickoff": "JH nothing"}], layout) == {"dichroic": "out"}
-    assert _optics([{"pickoff": "JH"}], layout) == {"dichroic": "in"}
-    assert _optics([{"pickoff": "K"}], layout) == {}
+    for pickoff, word in (("JH nothing", "out"), ("JH", "in"), ("K", None), (None, None)):
+        one = frame(1, **({"pickoff": pickoff} if pickoff else {}))
+        assert (_optic(layout, "dichroic", one), _optic(layout, "stop", one)) == (word, None)
