@@ -4,6 +4,7 @@ How the FITS files of an instrument look, and what their headers say in the unit
 """
 
 import math
+import re
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -468,6 +469,42 @@ def frame_time(header, layout):
     A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
     """
     return time_of(*(look_up([header], key, layout)[1] for key in ("mjd", "date", "time")))
+
+
+# these state the start of an exposure; others the middle, or it is not known
+_STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
+_DAY = 86400.0
+# in which the times and the places of targets are understood
+_SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
+
+
+def other_system(headers):
+    """Return in words that headers have times or places in another system, or an empty text."""
+    for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
+        value = card_value(header, keyword)
+        if not re.fullmatch(usual, str(value).strip()):
+            return f"{keyword} = {value!r}: times in UTC and places of J2000 are needed"
+    return ""
+
+
+def states_start(headers, layout):
+    """Return whether the time of headers is that at which an exposure starts."""
+    keyword, value = look_up(headers, "mjd", layout)
+    return (look_up(headers, "date", layout)[0] if value is None else keyword) in _STARTS
+
+
+def middle_time(header, layout):
+    """Return the middle of an exposure (UTC), None where a header does not say the time of day."""
+    mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
+    if mjd is None and clock is None and ":" not in str(date):
+        return None
+    time, length = time_of(mjd, date, clock), {"exposure_time": 0.0, "exposures": 1.0}
+    for column in length if states_start([header], layout) else ():
+        keyword, value = look_up([header], column, layout)
+        if value is not None:
+            length[column] = frame_value(column, keyword, value, layout)
+    half = length["exposure_time"] * length["exposures"] / 2 / _DAY
+    return Time(time.mjd + half, format="mjd", scale="utc") if half else time
 
 
 # local and universal dates differ by one day at most

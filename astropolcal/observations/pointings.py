@@ -225,7 +225,8 @@ def sky_angles(observations, location=None):
             raise ObservationError(
                 f"{observations.name}: a star needs its pointing: columns altitude and "
                 f"parallactic (there is no {' and no '.join(absent)}), or all of "
-                f"{', '.join(needed)}; missing: {', '.join(lacking)}"
+                f"{', '.join(needed)}; missing: "
+                f"{getattr(observations, 'unfit', '') or ', '.join(lacking)}"
             )
         angles = [angle.to_value(u.rad) for angle in pointing(target, time, location)]
     # the stage of that name need not stand at the parallactic angle: what is stated counts

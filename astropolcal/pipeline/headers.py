@@ -32,7 +32,16 @@ from astropolcal.exceptions import (
 from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.instruments.layout import ANGLES, TEXTS, frame_time, frame_value, look_up, unit_of
+from astropolcal.instruments.layout import (
+    ANGLES,
+    TEXTS,
+    frame_time,
+    frame_value,
+    look_up,
+    middle_time,
+    other_system,
+    unit_of,
+)
 from astropolcal.observations.pointings import frame_coordinate, offline, sky_angle
 from astropolcal.observations.reading import dates_of, numeric_column
 from astropolcal.optics.positions import PLACES
@@ -99,10 +108,10 @@ def recognized(header, known=None):
     )
 
 
-def _time(header, layout):
+def _time(header, layout, read=frame_time):
     """Return when a frame was taken, or None."""
     try:
-        return frame_time(header, layout)
+        return read(header, layout)
     except (TypeError, ValueError) as error:
         known = (_text(header, key, layout) for key in ("mjd", "date", "time"))
         shown = " ".join(filter(None, known))
@@ -139,8 +148,10 @@ class FrameAngles:
                 )
             if not missing and str not in map(type, values):
                 self._table[column] = values * unit
-        times = [_time(header, layout) for header in headers]
-        if all(time is not None for time in times):
+        #: Why no sky can be computed from the headers, or an empty text.
+        self.unfit = other_system(headers)
+        times = [_time(header, layout, middle_time) for header in headers]
+        if not self.unfit and all(time is not None for time in times):
             self._table["time"] = Time(times)
 
     @property

@@ -35,7 +35,9 @@ from astropolcal.instruments.layout import (
     convert,
     frame_value,
     look_up,
+    other_system,
     stated,
+    states_start,
     time_of,
 )
 from astropolcal.observations import pointing as sky_pointing
@@ -47,10 +49,6 @@ from astropolcal.words import listed
 __all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
-# these state the start of an exposure; others the middle, or it is not known
-_STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
-# in which the times and the places of targets are understood
-_SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
 
 @dataclass
@@ -199,9 +197,8 @@ def read_header(path, layout, *, header=None, raw=None):
         word = str(card_value(header, keyword) or "").strip()
         if word and not re.fullmatch(usual, word, re.IGNORECASE):
             frame.errors.append(f"{keyword} = {word!r}: {why}")
-    for header, (keyword, usual) in product(headers, _SYSTEMS.items()):
-        if not re.fullmatch(usual, str(card_value(header, keyword)).strip()):
-            frame.values["system"] = f"{keyword} = {card_value(header, keyword)!r}"
+    if other := other_system(headers):
+        frame.values["system"] = other
     for column in columns:
         keyword, value = look_up(headers, column, layout)
         if value is not None and column not in frame.values:
@@ -213,7 +210,7 @@ def read_header(path, layout, *, header=None, raw=None):
             if len({layout.states.get(str(v), str(v).strip()) for _, v in told} - {""}) > 1:
                 words = ", but ".join(f"{keyword} = {value!r}" for keyword, value in told)
                 frame.errors.append(f"{words}: which state of the modulator?")
-    if look_up(headers, "mjd" if "mjd" in frame.values else "date", layout)[0] in _STARTS:
+    if states_start(headers, layout):
         frame.values["starts"] = True
     return frame
 
@@ -326,7 +323,7 @@ def _target(values, site):
     if not site:
         raise ObservationError("no site of the telescope to compute the pointing from")
     if "system" in values:
-        raise ObservationError(f"{values['system']}: times in UTC and places of J2000 are needed")
+        raise ObservationError(values["system"])
     time = observation_time(values)
     # the angles are those of the middle of the exposure
     length = values.get("exposure_time", 0.0) * values.get("exposures", 1.0)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time
 
@@ -29,6 +30,8 @@ from astropolcal.exceptions import (
     ParameterError,
     WavelengthRangeError,
 )
+from astropolcal.observations import pointing
+from astropolcal.observations.pointings import sky_angles
 from astropolcal.pipeline.headers import (
     FrameAngles,
     describe,
@@ -305,6 +308,25 @@ def test_positions_on_sky_may_be_sexagesimal_or_degrees():
             assert frames[key][0].to_value(u.deg) == pytest.approx(expected)
     with pytest.raises(ObservationError, match="right_ascension: "):
         FrameAngles([_header(RA="north", DEC="0")], CHARIS)
+
+
+def test_sky_of_headers_is_that_of_the_middle_of_the_exposure():
+    known = {"RA": 90.0, "DEC": 10.0, "EXPTIME": 1200.0, "TIMESYS": "UTC", "EQUINOX": 2000.0}
+    known |= {"ALTITUDE": None, "PARANG": None, "MJD": None, "UT": None}
+    target, start = SkyCoord(90 * u.deg, 10 * u.deg), "2025-10-05T14:00:00"
+    angles = sky_angles(
+        FrameAngles([_header(**known | {"DATE-OBS": start})], CHARIS), CHARIS.location
+    )
+    middle = pointing(target, Time(start) + 600 * u.s, CHARIS.location)
+    np.testing.assert_allclose(angles, u.Quantity(middle).to_value(u.rad)[:, None], rtol=1e-9)
+    for changed, words in [
+        # a date alone is no moment
+        ({"DATE-OBS": "2025-10-05"}, "missing: a column time"),
+        ({"DATE-OBS": start, "TIMESYS": "TAI"}, "missing: TIMESYS = 'TAI': times in UTC"),
+        ({"DATE-OBS": start, "EQUINOX": 1950.0}, "missing: EQUINOX = 1950.0: times in UTC"),
+    ]:
+        with pytest.raises(ObservationError, match=words):
+            sky_angles(FrameAngles([_header(**known | changed)], CHARIS), CHARIS.location)
 
 
 # --- statements ---------------------------------------------------------------------------------
