@@ -319,20 +319,25 @@ def reduce_run(
     if not frames:
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
-    middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     settings = masters.settings(layout)
     wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
+    _doubt(frames, layout, lambda frame: [*wrong, *masters.doubts(frame.values, settings)])
+    reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
+    reduction.meta = _meta(frames, instrument, source, meta or {})
+    return reduction
+
+
+def _doubt(frames, layout, others):
+    """Note what is doubtful about frames, behind what ``others`` returns of each."""
+    middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     for frame in _unlike_others(frames, layout):
         frame.doubts.append(_UNLIKE_OTHERS)
     for frame in frames:
-        frame.doubts += [*wrong, *masters.doubts(frame.values, settings)]
+        frame.doubts += others(frame)
         if frame.values.get("light") == "uneven":
             frame.doubts.append("the light in the rectangles is uneven, as that of a star")
         if abs(frame.values.get("mjd", np.nan) - middle) > 1:
             frame.doubts.append(_OTHER_DAY)
-    reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
-    reduction.meta = _meta(frames, instrument, source, meta or {})
-    return reduction
 
 
 def _usable(frames, reduction, layout, hwp_sequence, keep_repeats):

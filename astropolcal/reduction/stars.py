@@ -286,8 +286,7 @@ def _aperture(cube, k, beam, places, radius):
         ring &= other > radius + cube.annulus
     if ring.sum() < 20:
         return "no background"
-    weights = CircularAperture(places[beam], radius).to_mask(method="exact")
-    weights = weights.to_image(image.shape)
+    weights = CircularAperture(places[beam], radius).to_mask(method="exact").to_image(image.shape)
     area, inside = weights.sum(), weights > 0
     if weights[~known].sum() > cube.max_masked * area:
         return "aperture masked"
