@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
+from astropolcal.calibration.fit.strategies import stands_out
 from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -302,17 +303,70 @@ MIRRORED_TWICE = {
 }
 
 
+# one whose switching angle is far from the usual, and where its fit used to end: the third
+# wavelength has the wrong signs, and the switching angle is near the usual
+FAR_SWITCHING = {
+    "calibration_polarizer.theta": 89.3,
+    "hwp.theta": -0.2,
+    "hwp.retardance": [-158.7, -169.1, -171.0, -179.1],
+    "derotator.theta": 0.6,
+    "derotator.horizontal": [280.6, 244.9, 206.5, 189.2],
+    "derotator.diagonal": [0.0, -3.4, -20.3, 6.1],
+    "derotator.circular": [13.5, -22.0, -3.6, -2.0],
+    "relay.diattenuation": [-0.009, -0.044, 0.011, -0.043],
+    "relay.retardance": [4.8, -41.3, 26.5, 10.6],
+    "flc.theta": 2.8,
+    "flc.retardance": [175.2, 157.8, 163.7, 186.2],
+    "flc.switching_angle": 46.7,
+    "wollaston.efficiency": [0.963, 0.983, 0.92, 0.94],
+    "cameras.imbalance": [0.085, 0.023, 0.008, 0.066],
+}
+WRONG_SIGNS = {
+    "calibration_polarizer.theta": 90.5,
+    "hwp.theta": 0.9,
+    "hwp.retardance": [-160.1, -166.1, -168.6, -177.8],
+    "derotator.theta": 0.0,
+    "derotator.horizontal": [280.2, 244.7, 199.9, 188.3],
+    "derotator.diagonal": [11.8, 15.8, -49.9, 14.9],
+    "derotator.circular": [12.9, -23.5, -16.1, -3.8],
+    "relay.diattenuation": [-0.041, 0.041, 0.004, 0.168],
+    "relay.retardance": [176.0, 133.5, -17.2, -158.4],
+    "flc.theta": -3.1,
+    "flc.retardance": [186.9, 207.7, 161.5, 170.7],
+    "flc.switching_angle": 43.7,
+    "wollaston.efficiency": [0.963, 0.981, 0.923, 0.94],
+    "cameras.imbalance": [0.052, 0.116, 0.125, -0.035],
+}
+
+
+def with_values(values):
+    """The chain with values of its free parameters."""
+    chain = VAMPIRES.chain()
+    for name, value in values.items():
+        optic, key = name.split(".")
+        getattr(chain[optic], key).value = value
+    return chain
+
+
+def run_of_plate(values, seed):
+    """A simulated run that is fitted in pairs of angles of the plate in the same state."""
+    frames = both_states(half_wave_plate_cycles(derotator=np.arange(45, 140, 12.5) * u.deg))
+    settings = {"flux": 2.5e5, "meta": VAMPIRES.published_meta() | {"pairing": "hwp"}}
+    return simulate(with_values(values), VAMPIRES.wavelength, frames, seed=seed, **settings)
+
+
+def test_a_wrong_minimum_stands_out():
+    night = run_of_plate(FAR_SWITCHING, 2)
+    for values, expected in ((FAR_SWITCHING, False), (WRONG_SIGNS, True)):
+        # the null channel that wrong signs predict is wrong, too, and no measure of the noise
+        assert stands_out(Measurement(with_values(values), night)) is expected
+
+
 @pytest.mark.long
 def test_no_fit_ends_where_half_a_wave_mirrors_the_liquid_crystal():
-    frames = both_states(half_wave_plate_cycles(derotator=np.arange(45, 140, 12.5) * u.deg))
-    # pairs of angles of the plate in the same state
-    settings = {"flux": 2.5e5, "meta": VAMPIRES.published_meta() | {"pairing": "hwp"}}
-    for values, seed in ((MIRRORED, 1), (MIRRORED, 2), (MIRRORED_TWICE, 14)):
-        truth = VAMPIRES.chain()
-        for name, value in values.items():
-            optic, key = name.split(".")
-            getattr(truth[optic], key).value = value
-        night = simulate(truth, VAMPIRES.wavelength, frames, seed=seed, **settings)
+    runs = (MIRRORED, 1), (MIRRORED, 2), (MIRRORED_TWICE, 14), (FAR_SWITCHING, 2)
+    for values, seed in runs:
+        night = run_of_plate(values, seed)
         found = calibrate(VAMPIRES.chain(), night, cross_validate=False)
         assert np.sqrt(np.mean(found.residuals**2)) < 2e-3, seed
         assert abs(found.chain["flc"].theta.value - values["flc.theta"]) < 1, seed

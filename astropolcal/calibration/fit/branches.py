@@ -567,7 +567,8 @@ def other_axes(problem, vector, origin):
 def centres(problem):
     """Return what priors hold near a centre: common angles, and phases of single wavelengths.
 
-    Each is its elements and its centre, and of a phase whether half a turn stays in its bounds.
+    Each is its elements and its centre, with the width of the prior of an angle, and of a phase
+    whether half a turn stays in its bounds.
     """
     free, axes, phases = problem.measurement.free, [], []
     for slot, prior in free.priors:
@@ -578,7 +579,7 @@ def centres(problem):
             places = problem.elements[problem.slots.index(slot)]
             phases.append((places, centre, high - low > _WHOLE_TURN))
         else:
-            axes.append((slice(slot.start, slot.start + slot.size), centre))
+            axes.append((slice(slot.start, slot.start + slot.size), centre, prior.width))
     return axes, phases
 
 
@@ -617,11 +618,26 @@ def mirrored(vector, axes):
     static retarder of any retardance hides the signs of what is downstream of it.
     """
     found = [vector]
-    for places, centre in axes:
+    for places, centre, _ in axes:
         for one in list(found):
             other = one.copy()
             other[places] = 2 * centre - other[places]
             found.append(other)
+    return found
+
+
+def beside_centres(vector, axes):
+    """Return vectors with common angles on all sides of their centres, the width of a prior away.
+
+    A wavelength of the wrong sign may have drawn an angle to its centre, of which the mirror is
+    nearly the same.
+    """
+    found = []
+    for sides in product((1, -1), repeat=len(axes)):
+        other = vector.copy()
+        for side, (places, centre, width) in zip(sides, axes, strict=True):
+            other[places] = centre + side * width
+        found.append(other)
     return found
 
 

@@ -23,6 +23,7 @@ from astropolcal.calibration.fit.branches import (
     GLANCE,
     ROUNDED,
     BinProblem,
+    beside_centres,
     best_signs,
     centres,
     least_bent,
@@ -214,7 +215,7 @@ def _behind_mirrors(measurement, best, how):
         return best
     found = measurement.vector()
     starts, least = mirrored(found, axes), np.sum(problem.residuals(found) ** 2)
-    first, worth = least, 2 * problem.noise**2
+    first, worth, is_last = least, 2 * problem.noise**2, False
     while starts:
         start = starts.pop(0)
         # where a fit leads, wavelengths may have other signs again
@@ -226,8 +227,10 @@ def _behind_mirrors(measurement, best, how):
                 break
         if left < least - worth:
             found, least, starts = start, left, mirrored(start, axes)
+            measurement.stand_at(found)
+        if not (starts or is_last) and stands_out(measurement):
+            starts, is_last = beside_centres(found, axes), True
     if least < first:
-        measurement.stand_at(found)
         best = _descend(measurement, best[1], *how, is_searched=True)
     return best
 
@@ -247,11 +250,13 @@ def known_noises(measurement):
 
 def stands_out(measurement):
     """Whether the residuals are far above the noise that the frames show, or the table states."""
-    residuals = measurement.residuals()
-    for noise in known_noises(measurement):
-        pulls = residuals / np.maximum(noise.sigma_of_data, ROUNDED)
-        return bool(np.mean(pulls**2) > _STANDS_OUT**2)
-    return False
+    known = [*known_noises(measurement)]
+    if not known:
+        return False
+    # a wrong minimum predicts a wrong null channel, so that this noise is too large as well
+    noise = known[-1 if known[0].method == "null channel" else 0]
+    pulls = measurement.residuals() / np.maximum(noise.sigma_of_data, ROUNDED)
+    return bool(np.mean(pulls**2) > _STANDS_OUT**2)
 
 
 def _descend(measurement, weighting, fitter, search, options, origin, is_searched=False):
