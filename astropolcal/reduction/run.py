@@ -328,7 +328,7 @@ def reduce_run(
 
 
 def _doubt(frames, layout, others):
-    """Note what is doubtful about frames, behind what ``others`` returns of each."""
+    """Note what is doubtful about frames, after what ``others`` returns of each."""
     middle = np.median([f.values["mjd"] for f in frames if "mjd" in f.values] or [np.nan])
     for frame in _unlike_others(frames, layout):
         frame.doubts.append(_UNLIKE_OTHERS)

@@ -2,7 +2,8 @@
 """
 Calibrate polarimeters, and say how well their model fits.
 
-Exit status: 0; 1 if sequences of an archive failed; 2 with one clear line on bad input.
+Exit status: 0; 1 if sequences of an archive failed; 2 with one clear line on
+bad input.
 
 For example::
 
