@@ -11,7 +11,8 @@ For example::
   astropolcal challenge make cases --count 100 --seed 7
   astropolcal challenge score cases outputs --figure rates.png
 
-A run that was interrupted goes on if it is started again with the same checkpoint.
+A run that was interrupted goes on if it is started again with the same
+checkpoint.
 """
 
 import multiprocessing

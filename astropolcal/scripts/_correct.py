@@ -2,8 +2,9 @@
 r"""
 Correct science cubes with a calibration and write Stokes parameters.
 
-They are those of the light that entered the telescope, by least squares over all frames, with their
-errors. The cubes must be without sky background: it is not subtracted.
+They are those of the light that entered the telescope, by least squares over
+all frames, with their errors. The cubes must be without sky background: it is
+not subtracted.
 
 For example::
 

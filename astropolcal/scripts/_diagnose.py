@@ -2,7 +2,8 @@
 """
 Find what a model lacks to explain the measurements.
 
-That is where the gap lies, which effect causes it, and how far it shrinks on left-out frames.
+That is where the gap lies, which effect causes it, and how far it shrinks on
+left-out frames.
 
 For example::
 

@@ -2,9 +2,10 @@
 r"""
 Polarimetric efficiency over wavelength, derotator angle and pointing.
 
-It is the share of the linear polarization that an observation measures; and the derotator offset
-that loses least of it. Without a calibration the published values are taken. Without a half-wave
-plate, the efficiencies of I, Q, U and V in the frames that were calibrated.
+It is the share of the linear polarization that an observation measures; and
+the derotator offset that loses least of it. Without a calibration the
+published values are taken. Without a half-wave plate, the efficiencies of I,
+Q, U and V in the frames that were calibrated.
 
 For example::
 
