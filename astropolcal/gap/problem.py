@@ -58,14 +58,21 @@ def _exact(chain):
     return Train(found)
 
 
-def _mounted(chains):
-    """Return mean and standard deviation, radian, of the angles of what is mounted with care."""
+def _expected(chains):
+    """Return mean and standard deviation, canonical, of each value that a prior holds.
+
+    The zero of a stage may be anywhere.
+    """
     found = {}
     for leaf in (leaf for chain in chains for leaf in chain):
-        angle, name = leaf.theta, f"{leaf.name}.theta"
-        if angle.prior is not None and leaf.mount is None and not angle.fixed:
-            prior = bind_prior(angle.prior, name, angle.unit, angle.bounds)
-            found[name] = prior.mode * prior.factor, prior.width
+        for key in leaf.param_names if leaf.name else ():
+            value, name = getattr(leaf, key), f"{leaf.name}.{key}"
+            if value.prior is None or value.fixed or (key == "theta" and leaf.mount is not None):
+                continue
+            prior = bind_prior(value.prior, name, value.unit, value.bounds)
+            if not prior.is_flat:
+                known = prior.mode * prior.factor, prior.width
+                found |= {(name, k): known for k in range(np.size(value.value))}
     return found
 
 
@@ -98,10 +105,10 @@ class GapProblem:
         self.neutral, self.limits = dict(neutral or {}), dict(limits or {})
         # what the model holds is held; an effect is what frees it
         chains, observations = [_exact(chain) for chain in chains], list(observations)
-        mounted = _mounted(chains)
+        expected = _expected(chains)
         #: Angles of what is mounted with care, mean and standard deviation (radian): one datum
         #: each, also where an effect lets go of them.
-        self.known = mounted if like is None else like.known
+        self.known = expected if like is None else like.known
         #: Expected fluxes of each dataset, (2, W, F), without and with the flicker of its lamp.
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         self.flickering = self.fluxes if like is None else like.flickering
@@ -126,7 +133,7 @@ class GapProblem:
         #: Slice of the rows that belongs to each dataset.
         self.segments = [slice(a, b) for a, b in pairwise(edges)]
         self.n_rows = int(edges[-1]) + len(self.known)
-        self._hold(mounted)
+        self._hold(expected)
         self.start = self.coefficients(self.free.start())
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
@@ -145,14 +152,16 @@ class GapProblem:
         new._place(chain, dataset.frames.T.ravel())
         return new
 
-    def _hold(self, mounted):
-        """Note the rows of what is known of mountings: targets and derivatives."""
+    def _hold(self, expected):
+        """Note the rows of what is known beforehand: targets and derivatives."""
         self._targets = np.zeros(len(self.known))
         self._holds = np.zeros((len(self.known), self.size))
-        for i, (name, (middle, spread)) in enumerate(self.known.items()):
-            if name in mounted and name in self.slices:
-                self._holds[i, self.slices[name]] = 1 / spread
-                self._targets[i] = middle / spread
+        blocks = dict(zip(self.slices, self._blocks, strict=True))
+        for i, ((name, k), (middle, spread)) in enumerate(self.known.items()):
+            if (name, k) in expected and name in self.slices:
+                beside = self._rest[self.free.by_name[name].start + k]
+                self._holds[i, self.slices[name]] = blocks[name][k] / spread
+                self._targets[i] = (middle - beside) / spread
                 self.neutral.setdefault(name, middle)
 
     def _absent(self):
