@@ -106,8 +106,8 @@ class GapProblem:
         # what the model holds is held; an effect is what frees it
         chains, observations = [_exact(chain) for chain in chains], list(observations)
         expected = _expected(chains)
-        #: Angles of what is mounted with care, mean and standard deviation (radian): one datum
-        #: each, also where an effect lets go of them.
+        #: Mean and standard deviation of each value that a prior holds: one datum each, also where
+        #: an effect lets go of it.
         self.known = expected if like is None else like.known
         #: Expected fluxes of each dataset, (2, W, F), without and with the flicker of its lamp.
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
