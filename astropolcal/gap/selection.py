@@ -851,7 +851,7 @@ def _members(chosen, beside, loss):
     weights = {own.name: (own, 1.0)}
     promised, known = max(chosen.statistic, own.statistic), {}
     where = attrgetter("cell.place", "cell.dependence")
-    # what a diagnosis lets go of priors may go far, and beside that another kind does the same
+    # phases may go far from their priors, and beside that another kind does the same
     free = beside.probes.problem.free.priors if beside.probes else ()
     is_loose = any(slot.per_wavelength and not prior.is_flat for slot, prior in free)
     for one in rivals:
