@@ -282,11 +282,12 @@ def test_text_of_the_challenges_is_that_of_their_tables():
     words = f"Of the {count[doubtful].sum():.0f} between 50 and 80 %, {right:.0f} % are right"
     assert f"{words}, and their mean probability is {mean:.0f} %" in text
     wrong = {row[0]: round(row["Number"] * row["Wrong (%)"] / 100) for row in rates}
-    assert [kind for kind, n in wrong.items() if n] == ["all", "listed", "SNR 40 to 80"]
-    assert wrong["all"] == 1
+    where = ["all", "mechanism", "pair", "SNR 10 to 20", "SNR 40 to 80"]
+    assert [kind for kind, n in wrong.items() if n] == where
+    assert wrong["all"] == 3
     none = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["none"]
     assert f"nothing in all {none} challenges without a fault" in text
-    assert "The one wrong answer is *I do not know*" in text
+    assert "Three answers are wrong: a course of a depolarization as two steps" in text
     absorbed = dict(zip(rates[rates.colnames[0]], rates["Number"], strict=True))["absorbed"]
     assert f"nor in the {absorbed} whose fault" in text
     seeds = Table.read(PAGE.with_name("challenge_seeds.csv"), format="csv")
