@@ -618,12 +618,12 @@ class IRDIS(Instrument):
         --------
         >>> from astropolcal import instruments
         >>> header = {"ESO INS1 FILT ID": "FILT_BBF_H", "ESO INS4 DROT3 BEGIN": 152.15,
-        ...           "ESO INS4 DROT3 END": 152.15, "ESO INS4 DROT2 BEGIN": 359.0,
-        ...           "ESO INS4 DROT2 END": 3.0, "MJD-OBS": 57900.0, "EXPTIME": 2.0,
+        ...           "ESO INS4 DROT3 END": 152.15, "ESO INS4 DROT2 BEGIN": 359.5,
+        ...           "ESO INS4 DROT2 END": 0.3, "MJD-OBS": 57900.0, "EXPTIME": 2.0,
         ...           "ESO DET NDIT": 4}
         >>> table = instruments.get("irdis").frame_table([header])
         >>> table["derotator"].round(6), table.meta["filter"]
-        (<Quantity [1.] deg>, 'H')
+        (<Quantity [-0.1] deg>, 'H')
         """
         table = frame_table(list(headers), self.files.site, self.sky_law)
         days = {self.coating_on(time) for time in table["time"]}

@@ -248,7 +248,8 @@ def _check_parameter(effect, parameter, problem, nominal):
         new = ", ".join(sorted(set(free) - set(there)))
         raise _failed(effect, f"{name} is not free in its chains; new and free: {new or '-'}")
     # a lifted bound, or prior, frees nothing that was not free: it gives room
-    if name in there and name not in nominal.known and effect.kind != "bound":
+    known = {one for one, _ in nominal.known}
+    if name in there and name not in known and effect.kind != "bound":
         raise _failed(effect, f"{name} is free in the chains without it already")
     slot = free[name]
     if parameter.basis is not None and len(parameter.basis) != slot.size:
