@@ -474,6 +474,8 @@ def frame_time(header, layout):
 # these state the start of an exposure; others the middle, or it is not known
 _STARTS = ("MJD-OBS", "MJD-STR", "MJD-BEG", "EXPSTART", "DATE-OBS", "DATE-BEG")
 _DAY = 86400.0
+# what tells how long an exposure is
+_LENGTH = ("exposure_time", "exposures")
 # in which the times and the places of targets are understood
 _SYSTEMS = {"TIMESYS": r"None|UTC?(\(.*)?", "EQUINOX": r"None|J?2000(\.0*)?"}
 
@@ -498,12 +500,17 @@ def middle_time(header, layout):
     mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
     if mjd is None and clock is None and ":" not in str(date):
         return None
-    time, length = time_of(mjd, date, clock), {"exposure_time": 0.0, "exposures": 1.0}
-    for column in length if states_start([header], layout) else ():
+    time, values = time_of(mjd, date, clock), {}
+    for column in _LENGTH if states_start([header], layout) else ():
         keyword, value = look_up([header], column, layout)
         if value is not None:
-            length[column] = frame_value(column, keyword, value, layout)
-    half = length["exposure_time"] * length["exposures"] / 2 / _DAY
+            values[column] = frame_value(column, keyword, value, layout)
+    return middle_of(time, values)
+
+
+def middle_of(time, values):
+    """Return the middle of an exposure that starts at a time, with its ``values`` of a header."""
+    half = values.get("exposure_time", 0.0) * values.get("exposures", 1.0) / 2 / _DAY
     return Time(time.mjd + half, format="mjd", scale="utc") if half else time
 
 

@@ -35,6 +35,7 @@ from astropolcal.instruments.layout import (
     convert,
     frame_value,
     look_up,
+    middle_of,
     other_system,
     stated,
     states_start,
@@ -326,8 +327,7 @@ def _target(values, site):
         raise ObservationError(values["system"])
     time = observation_time(values)
     # the angles are those of the middle of the exposure
-    length = values.get("exposure_time", 0.0) * values.get("exposures", 1.0)
-    mjd = time.mjd + (length / 2 / 86400 if values.get("starts") else 0.0)
+    mjd = (middle_of(time, values) if values.get("starts") else time).mjd
     try:
         ra, dec = (sky_angle(key, values[key]) for key in ("right_ascension", "declination"))
         SkyCoord(ra, dec, unit=u.deg)  # refuses what is beyond the poles
