@@ -850,10 +850,6 @@ def _members(chosen, beside, loss):
     own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
     promised, known = max(chosen.statistic, own.statistic), {}
-    where = attrgetter("cell.place", "cell.dependence")
-    # phases may go far from their priors, and beside that another kind does the same
-    free = beside.probes.problem.free.priors if beside.probes else ()
-    is_loose = any(slot.per_wavelength and not prior.is_flat for slot, prior in free)
     for one in rivals:
         if one.name == own.name or len(weights) > _MOST_ALIASES:
             continue
@@ -862,11 +858,10 @@ def _members(chosen, beside, loss):
         is_same = one.rank <= own.rank and one.statistic >= (1 - _SAME) * promised
         is_bent = weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT
         is_far = (is_same or weight >= _ALIAS) and one.size > farthest
-        is_kin = is_loose and own.cell and not one.is_named and where(one) == where(own)
-        if loss is not None and (is_bent or is_far or is_kin):
+        if loss is not None and (is_bent or is_far):
             # of a strong signal, or at a size far from usual, derivatives do not tell what is alike
             key = round(one.statistic, 3)
-            if key not in known and (is_kin or len(known) < _FITTED[0]):
+            if key not in known and len(known) < _FITTED[0]:
                 known[key] = loss(one)
             lost, behind = known.get(key, (np.inf, np.inf))
             fitted = np.exp(min(-behind, 0.0))

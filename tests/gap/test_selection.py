@@ -5,7 +5,6 @@ import dataclasses
 import importlib
 import runpy
 from pathlib import Path
-from types import SimpleNamespace
 
 import astropy.units as u
 import gap_data as data
@@ -186,23 +185,6 @@ def test_what_is_alike_with_a_law_is_alike_without_one():
     seen += [candidate("after:hwp", 2e3 + 1e-4, 799.0), candidate("telescope", 2.4e3, 990.0)]
     members = _members(candidate("source", 2.8e3, 1100.0, 4), Scan(seen), None)
     assert [one.cell.place for one, _ in members] == ["source", "telescope", "after:hwp"]
-
-
-def test_another_kind_at_the_same_place_is_asked_for_beside_loose_optics():
-    """With other phases of a liquid crystal a retarder and a rotation may do the same."""
-
-    def candidate(place, kind, statistic, evidence):
-        cell, spectrum = Cell(place, kind, "step:9"), (np.ones(1), np.ones(1), 1.0)
-        return Candidate(None, cell, statistic, 4, evidence, 0.0, spectrum, 4)
-
-    best = candidate("after:relay", "rotation", 769.0, 362.0)
-    alike = candidate("after:relay", "retardance_d", 294.0, 124.0)
-    rivals = [best, candidate("source", "rotation", 723.0, 339.0), alike]
-    crystal = SimpleNamespace(per_wavelength=True), SimpleNamespace(is_flat=False)
-    for priors, expected in (((), [best]), ((crystal,), [best, alike])):
-        probes = SimpleNamespace(problem=SimpleNamespace(free=SimpleNamespace(priors=priors)))
-        members = _members(best, Scan(rivals, probes), lambda one: (2.0, 5.0))
-        assert [one.name for one, _ in members] == [one.name for one in expected]
 
 
 @pytest.mark.slow
