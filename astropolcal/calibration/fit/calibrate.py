@@ -264,8 +264,14 @@ def fitted(
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin, (strategy, loss) = measurement.vector(), (chosen[k] for k in ("strategy", "loss"))
-    given = weights if strategy == "sequential" else weighting
-    outcome, weighting, stages = _by_strategy(strategy, measurement, given, fitter, search, options)
+    given, stages = weights if strategy == "sequential" else weighting, []
+    how = measurement, given, fitter, search, options
+    if strategy == "joint":
+        outcome, weighting = joint(*how)
+    else:
+        outcomes, weighting, stages = (two_step if strategy == "two-step" else sequential)(*how)
+        # the first step that did not converge makes the next ones useless
+        outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1])
     if loss != "linear":
         outcome, weighting = _robust(measurement, loss, fitter)
     if not outcome["converged"]:
@@ -275,15 +281,6 @@ def fitted(
     settings = {"instrument": instrument, "fitter": type(fitter).__name__, **chosen, "gauge": gauge}
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
     return FittedMeasurement(measurement, whitened, settings, outcome, stages)
-
-
-def _by_strategy(strategy, *how):
-    """Return the outcome of a fit, with its weighting and stages."""
-    if strategy == "joint":
-        return *joint(*how), []
-    outcomes, weighting, stages = (two_step if strategy == "two-step" else sequential)(*how)
-    # the first step that did not converge makes the next ones useless
-    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), weighting, stages
 
 
 def _robust(measurement, loss, fitter):

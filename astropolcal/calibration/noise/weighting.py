@@ -127,7 +127,12 @@ def outlying_data(calibration, limit=_FAR):
         bright = brightness(part.observations)
         # few data of a wavelength may have a small scatter by chance
         size = np.abs(residuals) / np.maximum(scales, np.median(scales[where]))
-        for i, whole in enumerate(_departures(scaled, members)):
+        # by how many robust standard deviations each pair departs at all its wavelengths
+        common = np.array([np.median(scaled[own]) for own in members])
+        off = np.abs(common - np.median(common))
+        # what noise alone gives a median of so many wavelengths
+        least = np.array([1.25 / np.sqrt(own.size) for own in members])
+        for i, whole in enumerate(off / np.maximum(MAD_TO_SIGMA * np.median(off), least)):
             alone = members[i][np.argmax(size[members[i]])]
             times = size[alone] * tells
             if max(whole, times / _ALONE) > limit:
@@ -144,15 +149,6 @@ def outlying_data(calibration, limit=_FAR):
     units = {"wavelength": u.nm, "residual": u.percent}
     kinds, meta = (str, str, *[float] * 4), {"data": data}
     return QTable(rows=rows or None, names=names, dtype=kinds, units=units, meta=meta)
-
-
-def _departures(scaled, members):
-    """Return by how many robust standard deviations each pair departs at all its wavelengths."""
-    common = np.array([np.median(scaled[own]) for own in members])
-    off = np.abs(common - np.median(common))
-    # what noise alone gives a median of so many wavelengths
-    least = np.array([1.25 / np.sqrt(own.size) for own in members])
-    return off / np.maximum(MAD_TO_SIGMA * np.median(off), least)
 
 
 # ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----

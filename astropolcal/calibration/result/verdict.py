@@ -159,7 +159,11 @@ def _reasons(calibration, known, free, on_sky=((), ())):
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [_nothing(calibration), _angles(calibration, free)]
     wrong += [*_mirrors(calibration, known), _misfit(calibration), _carried_off(calibration)]
-    unknown = [*_absurd(_without_laws(calibration, free)), *on_sky[0], _hanging(free)]
+    # the constants of laws are where inputs are zero, far from all frames
+    trains = map(leaves, calibration.chains)
+    laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
+    usual = {name: entry for name, entry in free.items() if name not in laws}
+    unknown = [*_absurd(usual), *on_sky[0], _hanging(free)]
     held = calibration.settings.get("restarted", {}).get("open")
     unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
     unknown += on_sky[1]
@@ -305,13 +309,6 @@ def _suspected(calibration):
     return "why" if calibration.settings.get("observable") == "intensity" else "beams exchanged?"
 
 
-def _without_laws(calibration, free):
-    """Leave out the constants of laws: they are where inputs are zero, far from all frames."""
-    trains = map(leaves, calibration.chains)
-    laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
-    return {name: entry for name, entry in free.items() if name not in laws}
-
-
 def _absurd(free):
     """Name orientations and other parameters whose errors say that nothing is known."""
     told = []
@@ -444,7 +441,10 @@ def _next(calibration, free, wrong, sky):
     offered = {kind_of_source(source) for source in instrument.sources} if instrument else set()
     missing = (offered or set(_KINDS)) - kinds
     turning = {stage for chain in calibration.chains for stage in stages(chain)}
-    derotator = "derotator" in turning
+    angles = {s for s in turning if s not in COORDINATES} - {"parallactic", "altitude"}
+    derotator, named = "derotator" in turning, {"derotator": "derotator", "hwp": "half-wave plate"}
+    moved = [words for stage, words in named.items() if stage in angles]
+    moved += sorted(angles - set(named))
     published = instrument and instrument.has_telescope
     telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
@@ -460,7 +460,7 @@ def _next(calibration, free, wrong, sky):
         ),
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
-        (unknown or not calibration.converged, _more_angles(turning)),
+        (unknown or not calibration.converged, f"more angles of {listed(moved or ['the sky'])}"),
         (_excess(calibration) > _CLEARLY and at_odds, mask),
         ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
@@ -472,15 +472,6 @@ def _next(calibration, free, wrong, sky):
         (True, "a dataset that no fit saw, as a test (--standard FILE)"),
     )
     return next(words for applies, words in advice if applies)
-
-
-def _more_angles(turning):
-    """Say which stages should stand at more angles, of all whose position the chains need."""
-    angles = {s for s in turning if s not in COORDINATES} - {"parallactic", "altitude"}
-    known = {"derotator": "derotator", "hwp": "half-wave plate"}
-    names = [words for stage, words in known.items() if stage in angles]
-    names += sorted(angles - set(known))
-    return f"more angles of {listed(names) if names else 'the sky'}"
 
 
 def _mount(calibration, free, sky):

@@ -527,27 +527,9 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 
 
 def predicted_measurement(calibration, chain, observations, positions=None, sources=False):
-    """Return the measurement of a standard with the values of a calibration."""
-    predicted = _predicted_chain(calibration, chain, observations, sources)
-    return measurement_with(calibration, predicted, observations, positions)
+    """Return the measurement of a standard with the values of a calibration where it has the optic.
 
-
-def measurement_with(calibration, chain, observations, positions=None, wavelength=None):
-    """Return the measurement of new observations as a calibration observes, of a chain as it is."""
-    return Measurement(
-        chain,
-        observations,
-        observable=calibration.settings["observable"],
-        positions=None if positions is None else [positions],
-        ties=ties_among(calibration.ties, parameter_table([chain])),
-        wavelength=wavelength,
-    )
-
-
-def _predicted_chain(calibration, chain, observations, sources):
-    """Return the chain with the calibration's values where it has the optic, and its flags.
-
-    At the wavelengths of the observations; polarized sources stay free if ``sources``.
+    Polarized sources stay free if ``sources``.
     """
     rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     # reversed, so that of optics in several chains the first dataset's counts
@@ -585,7 +567,19 @@ def _predicted_chain(calibration, chain, observations, sources):
             f"{observations.name}: nothing determines {', '.join(unknown)}: the calibration has no "
             "such optics; hold them at known values"
         )
-    return join(train)
+    return measurement_with(calibration, join(train), observations, positions)
+
+
+def measurement_with(calibration, chain, observations, positions=None, wavelength=None):
+    """Return the measurement of new observations as a calibration observes, of a chain as it is."""
+    return Measurement(
+        chain,
+        observations,
+        observable=calibration.settings["observable"],
+        positions=None if positions is None else [positions],
+        ties=ties_among(calibration.ties, parameter_table([chain])),
+        wavelength=wavelength,
+    )
 
 
 def _errors(measurement):
