@@ -167,7 +167,11 @@ class Bench:
         meta = {"instrument": instrument.name, **instrument.meta_without(out)}
         self.clean = []
         for chain, source in zip(self.chains, setup.sources, strict=True):
-            light = {"flux": flux, "lamp": self._lamp(len(frames)), "noise": False}
+            # drift in the logarithm: higher orders fall as one over the degree
+            n, orders = len(frames), [0, *rng.normal(0, 1, 3) / (1, 2, 3)]
+            drift, flicker = legval(np.linspace(-1, 1, n), orders), rng.normal(0, self.flicker, n)
+            lamp = np.exp(rng.uniform(0, 2 * setup.drift) * drift + flicker)
+            light = {"flux": flux, "lamp": lamp, "noise": False}
             named = {"name": source, "meta": meta | {"source": source}}
             self.clean.append(simulate(chain, wavelength, frames, **light, **named))
         self.optics = [self.split(chain) for chain in self.chains]
@@ -181,12 +185,6 @@ class Bench:
             for o, f in zip(self.clean, ideal, strict=True)
         ]
         self._settle_noise(ideal)
-
-    def _lamp(self, n_frames):
-        # drift in the logarithm: higher orders fall as one over the degree
-        drift = legval(np.linspace(-1, 1, n_frames), [0, *self.rng.normal(0, 1, 3) / (1, 2, 3)])
-        flicker = self.rng.normal(0, self.flicker, n_frames)
-        return np.exp(self.rng.uniform(0, 2 * self.setup.drift) * drift + flicker)
 
     @staticmethod
     def split(chain):

@@ -71,7 +71,13 @@ class Look:
         )
         rows = self.problem.rows([~o for o in out])
         #: Of each dataset what the lamp takes up of its sums, (n_rows, k); nothing of groups.
-        self.lamps = [self._of_lamp(*each) for each in self._datasets]
+        self.lamps = []
+        for _, channel, own in self._datasets:
+            count = channel.nuisance.shape[1] if channel.groups is None else 0
+            self.lamps.append(np.zeros((self.problem.n_rows, count)))
+            # the sums are the second half of the rows of a dataset
+            sums = slice((own.start + own.stop) // 2, own.stop)
+            self.lamps[-1][sums] = channel.nuisance[:, :count]
         slopes = self.problem.open_slopes(coefficients)
         columns = np.concatenate([slopes, self._of_flux(), *self.lamps], axis=1)
         #: Share of each datum, (2, W, F), that goes to the brightness of the group of a single
@@ -118,13 +124,6 @@ class Look:
             # the only frame of its group that takes part says nothing, nor does any other of it
             self.shares[i][1] = np.where(total > 0, np.square(unit) / known, _UNKNOWN)
         return columns
-
-    def _of_lamp(self, i, channel, rows):
-        count = channel.nuisance.shape[1] if channel.groups is None else 0
-        found = np.zeros((self.problem.n_rows, count))
-        # the sums are the second half of the rows of a dataset
-        found[rows][len(found[rows]) // 2 :] = channel.nuisance[:, :count]
-        return found
 
     def _of_flux(self):
         """Return what background and nonlinearity do to the differences, or sums, (n_rows, k).
@@ -391,19 +390,17 @@ class Frame:
 
     def as_told(self):
         """Return the trial in which nothing is wrong."""
-        return Trial("none", float(self.with_positions_of(self.frames)[0]), self._of_tails())
-
-    def _of_tails(self):
-        """Return by how much less than their squares data cost that the tails of the noise hold."""
+        chi2, cost = float(self.with_positions_of(self.frames)[0]), 0.0
         freedom, width = self.look.tails
-        if freedom == _NORMAL or len(self.frames) > 1:
-            return 0.0
-        left = self._root @ ((self.observed - self._plain + self._offset) * self.weight)
-        # what is off in one beam is off in its difference and in its sum
-        off = np.array([left, self._sums[0] * (not self.single)])[: 2 - self.single]
-        square = np.sum(off**2, axis=0)
-        cost = (freedom + len(off)) * np.log1p(square / (freedom * width**2))
-        return float(np.minimum(cost - square, 0.0).sum())
+        # by how much less than their squares data cost that the tails of the noise hold
+        if freedom != _NORMAL and len(self.frames) == 1:
+            left = self._root @ ((self.observed - self._plain + self._offset) * self.weight)
+            # what is off in one beam is off in its difference and in its sum
+            off = np.array([left, self._sums[0] * (not self.single)])[: 2 - self.single]
+            square = np.sum(off**2, axis=0)
+            cost = (freedom + len(off)) * np.log1p(square / (freedom * width**2))
+            cost = float(np.minimum(cost - square, 0.0).sum())
+        return Trial("none", chi2, cost)
 
     def trials(self):
         """Return all trials that need no other frame."""

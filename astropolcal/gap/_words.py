@@ -213,12 +213,6 @@ def title(entry):
     return _title(_alike(entry))
 
 
-def _one_or_like(entry):
-    """Return the title of a cause, and that other things look the same where some do."""
-    like = own_share(entry) < ONE and others(entry, {})
-    return f"{title(entry)}{' or what looks the same' if like else ''}"
-
-
 def own_share(entry):
     """Return how probable a cause is among its aliases, regardless of its place and name."""
     return entry["share"] + sum(one["probability"] for one in _same(entry))
@@ -371,7 +365,10 @@ def _what(content):
         return "The model agrees with the measurements: it lacks nothing that these data show."
     # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])
-    names = [f"{_one_or_like(entry)} ({share(entry['probability'])})" for entry in largest]
+    names = []
+    for one in largest:
+        like = " or what looks the same" if own_share(one) < ONE and others(one, {}) else ""
+        names.append(f"{title(one)}{like} ({share(one['probability'])})")
     if verdict != "unexplained":
         nameless = "" if verdict == "named" else ", not all of which have a name"
         many = f"The model lacks {len(causes)} things{nameless}: "

@@ -241,14 +241,11 @@ def places(chain):
             out.append(Place(f"in:{optic.name}", None, optic.name, optic.mount, theta))
             out.append(Place(f"after:{optic.name}", None, optic.name))
         # one that does not turn and mixes what it gets makes the place downstream another one
-        elif optic in between and _mixes(optic):
+        elif optic in between and (
+            isinstance(optic, _MODULATES) or (optic.stage is None and not isinstance(optic, _KEEPS))
+        ):
             out.append(Place(f"after:{optic.name}", None, optic.name))
     return out
-
-
-def _mixes(optic):
-    is_static = optic.stage is None and not isinstance(optic, _KEEPS)
-    return is_static or isinstance(optic, _MODULATES)
 
 
 # ---- dependences -------------------------------------------------------------------------------

@@ -109,13 +109,17 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
     kinds = {"none": [], "pair": [bench.rng.choice(("cell", "listed")) for _ in range(2)]}
     known, faults, told = fault or {}, [], []
     for one in kinds.get(kind, [kind]):
+        # the effects that contain, or are part of, what there is already
+        there = {one.told["effect"] for one in faults if one.told.get("effect")}
+        windows = {getattr(get_effect(name), "thickness", None) for name in there} - {None}
+        there |= {name for name, e in EFFECTS.items() if getattr(e, "thickness", None) in windows}
         for _ in range(_DRAWS):
             drawn = Fault(bench, {"type": str(one), **known})
             residual, fit = bench.scale(drawn, 1.0 if kind == "absorbed" else snr)
             absorbed = drawn.snr < _INVISIBLE
             # an effect that is there already is not another fault, and what cannot be seen alone
             # may show through another one, by how much is not known
-            other = "effect" in known or drawn.told.get("effect") not in _effects(faults)
+            other = "effect" in known or drawn.told.get("effect") not in there
             if kind != "pair" or (other and not absorbed):
                 break
         faults.append(drawn)
@@ -133,14 +137,6 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
         "faults": told,
     }
     return bench.record(bench.expose(faults)), setup.chains(), case
-
-
-def _effects(faults):
-    """Return the effects that contain, or are part of, what there is already."""
-    there = {one.told["effect"] for one in faults if one.told.get("effect")}
-    windows = {getattr(get_effect(name), "thickness", None) for name in there} - {None}
-    same = {name for name, e in EFFECTS.items() if getattr(e, "thickness", None) in windows}
-    return there | same
 
 
 # ---- an answer is scored ----------------------------------------------------------------------

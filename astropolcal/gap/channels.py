@@ -197,22 +197,19 @@ class _Lamp:
         scatter = slow if slow > _WANDERS * scatter else scatter
         #: Standard deviation of the flicker, in the logarithm of the flux.
         self.flicker = float(np.sqrt(max(scatter - np.mean(var[seen]), 0.0)))
-        self.color = self._best_color(centred - common, weight)
-
-    def _curve(self, degree):
-        return np.polynomial.legendre.legvander(self.sequence, degree)
-
-    def _best_color(self, residual, weight):
-        """Return the degree of a drift of its own for each wavelength, 0 for none."""
-        scores, n = [], (weight > 0).sum()
+        rest, scores, n = centred - common, [], (weight > 0).sum()
         for degree in range(_LARGEST_COLOR + 1):
             curve = self._curve(degree)
             fits = (
-                _left_over(curve * w[:, None], r * w) for r, w in zip(residual, weight, strict=True)
+                _left_over(curve * w[:, None], r * w) for r, w in zip(rest, weight, strict=True)
             )
             freedom = len(weight) * (degree + 1)
             scores.append(sum(square for square, _ in fits) + freedom * np.log(max(n, 2)))
-        return int(np.argmin(scores))
+        #: Degree of a drift of its own for each wavelength, 0 for none.
+        self.color = int(np.argmin(scores))
+
+    def _curve(self, degree):
+        return np.polynomial.legendre.legvander(self.sequence, degree)
 
     def shrink(self, weight):
         """Return, for each frame, the direction of the flicker and how much it is shrunk."""

@@ -265,7 +265,11 @@ def _fitted(model, absent, without):
     slopes = probes.slopes | _of_one_beam(probes)
     for (place, kind), slope in slopes.items():
         reduced = Reduced(probes, slope, basis)
-        found.append(Course(place, kind, reduced, _first_law(reduced)))
+        # first the law along which most frames are off, against their noise
+        target, gram = np.concatenate(reduced.target), np.concatenate(reduced.gram).sum(axis=0)
+        noise = gram + _ABSORBED * (np.trace(gram) or 1.0) * np.eye(len(gram))
+        law = eigh(target.T @ target, noise)[1][:, -1]
+        found.append(Course(place, kind, reduced, law / np.linalg.norm(law)))
         found[-1].fit(_ROUNDS)
     found = [one for one in found if one.lowered > 0]
     found.sort(key=lambda one: one.freedom - one.lowered)
@@ -298,11 +302,3 @@ def _of_one_beam(probes):
             both = np.stack([slope[0], slope[1] + sign * channel.valid]) / 2
             found.setdefault(("detector", f"gain_of_{beam}_beam"), {})[i] = both
     return found
-
-
-def _first_law(reduced):
-    """Return the law along which most frames are off, against their noise."""
-    target, gram = np.concatenate(reduced.target), np.concatenate(reduced.gram).sum(axis=0)
-    noise = gram + _ABSORBED * (np.trace(gram) or 1.0) * np.eye(len(gram))
-    law = eigh(target.T @ target, noise)[1][:, -1]
-    return law / np.linalg.norm(law)

@@ -415,7 +415,16 @@ def _selected(chosen, whole, models, single, wrong, say):
     left, (nominal, base) = selection.model, models
     if nominal is base and left.mean_square < _TOO_QUIET and left.p_value > _TOO_PROBABLE:
         say("looking for causes again: they leave less than what was taken for noise")
-        nominal = base = _with_noise_of(base, selection)
+        # fitted with the noise that the residuals beside the causes show
+        problem = GapProblem(base.chains, base.observations)
+        problem.settle_noise(base.fit.coefficients)
+        fresh = Model(problem, base.fit, base.added)
+        recipes = [group.best.recipe for group in selection.groups]
+        beside = fresh.with_effects(recipes, like=selection.model, steps=0)
+        beside.problem.settle_noise(beside.fit.coefficients)
+        # the noise is that of the channels, which both share
+        problem.fluxes, problem.flickering = beside.problem.fluxes, beside.problem.flickering
+        nominal = base = Model(problem, problem.fit(base.fit.coefficients), base.added)
         selection = chosen(base)
     return (nominal, base), selection, single
 
@@ -451,19 +460,6 @@ def _share_of(effect, nominal, base, selection, chosen, say):
         return unlisted - cost - 0.5 * one.model.fit.chi2 / temper
 
     return float(expit(evidence(selection) - ENOUGH - evidence(other)))
-
-
-def _with_noise_of(base, selection):
-    """Return a nominal model, fitted with the noise that the residuals beside its causes show."""
-    problem = GapProblem(base.chains, base.observations)
-    problem.settle_noise(base.fit.coefficients)
-    fresh = Model(problem, base.fit, base.added)
-    recipes = [group.best.recipe for group in selection.groups]
-    beside = fresh.with_effects(recipes, like=selection.model, steps=0)
-    beside.problem.settle_noise(beside.fit.coefficients)
-    # the noise is that of the channels, which both share
-    problem.fluxes, problem.flickering = beside.problem.fluxes, beside.problem.flickering
-    return Model(problem, problem.fit(base.fit.coefficients), base.added)
 
 
 def _nested(base, smooth, say, cells):

@@ -496,7 +496,16 @@ class Search:
         if not places:
             return [], self.first
         self.worst = set(places)
-        self._start_again(places, look)
+        # the noise is measured without them, and a start found for the fit that has them not
+        old, chains, out = self.problem, self.model.chains, _marked(self.problem, places)
+        if not look.is_noise and not self.model.added:
+            seen = zip(self.model.observations, out, strict=True)
+            left = [o.with_mask(mask, "accused") for o, mask in seen]
+            chains = nominal_calibration(chains, left).chains
+        known = {key: getattr(old, key) for key in _KNOWN}
+        problem = GapProblem(chains, self.model.observations, **known)
+        problem.settle_noise(look.coefficients if look.is_noise else problem.start, out)
+        self.model, self.problem = Model(problem, self.model.fit), problem
         self.first = Look(self.model, look.coefficients, _marked(self.problem, []))
         few = places, self._look(places, look.coefficients)
         *_, (places, look) = self._trail(*few)
@@ -530,18 +539,6 @@ class Search:
         # from where bad frames had bent it a fit need not find back
         other = self.problem.fit(self.problem.start, rows=rows, steps=_STEPS, share=_SHARE)
         return Look(self.model, other.coefficients, out) if other.chi2 < fit.chi2 else look
-
-    def _start_again(self, places, look):
-        """Measure the noise without some frames, and find a start for the fit that has them not."""
-        old, chains, out = self.problem, self.model.chains, _marked(self.problem, places)
-        if not look.is_noise and not self.model.added:
-            seen = zip(self.model.observations, out, strict=True)
-            left = [o.with_mask(mask, "accused") for o, mask in seen]
-            chains = nominal_calibration(chains, left).chains
-        known = {key: getattr(old, key) for key in _KNOWN}
-        problem = GapProblem(chains, self.model.observations, **known)
-        problem.settle_noise(look.coefficients if look.is_noise else problem.start, out)
-        self.model, self.problem = Model(problem, self.model.fit), problem
 
     def is_settled(self, places, look):
         """Return whether what was wrong is removed without some frames."""

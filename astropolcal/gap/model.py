@@ -524,7 +524,15 @@ def starting_model(calibration, observations, library, say):
         found, read, where = _alternatives(chains, observations, made, discrete, say)
         best = _best_alternative(*read, found, say)
         if best is not None:
-            return *_with_alternative(*best, read[-1]), where
+            best, asked, effects = best
+            effects[0] = effects[0].changed(left=_left(best, read[-1]))
+            model = nominal_model(*asked, best)
+            # what fits badly need not converge to be left behind
+            problem = GapProblem(read[-1].chains, asked[1], like=model.problem)
+            residual = problem.residual(problem.start)
+            nominal = Model(problem, Fit(problem.start, float(residual @ residual), False))
+            model.added[effects[0].name] = []
+            return nominal, model, effects, where
     nominal = nominal_model(chains, observations, made)
     return nominal, nominal, [], where
 
@@ -776,18 +784,6 @@ def _best_alternative(chains, observations, made, found, say):
         alike = (other for left, other in found if left < _ALIKE * misfit)
         return *best, [effect, *(other for other in alike if other is not effect)]
     return None
-
-
-def _with_alternative(best, asked, effects, given):
-    """Return the nominal model, the model of an alternative, and this with its aliases."""
-    effect = effects[0].changed(left=_left(best, given))
-    model = nominal_model(*asked, best)
-    # what fits badly need not converge to be left behind
-    problem = GapProblem(given.chains, asked[1], like=model.problem)
-    residual = problem.residual(problem.start)
-    nominal = Model(problem, Fit(problem.start, float(residual @ residual), False))
-    model.added[effect.name] = []
-    return nominal, model, [effect, *effects[1:]]
 
 
 def thinned(chains, observations, count):

@@ -274,7 +274,22 @@ class _Equations:
 
     def test(self, k, total, freedom):
         """Return the test of a term."""
-        return _test(self.own[k], self.target[self.slices[k]], total, freedom)
+        # columns had unit length before model and lamp were taken out: an eigenvalue is what is
+        # left of it
+        values, vectors = np.linalg.eigh(self.own[k])
+        keep = values > _ABSORBED
+        root = vectors[:, keep] / np.sqrt(values[keep])
+        statistic = float(np.sum((root.T @ self.target[self.slices[k]]) ** 2))
+        rank = int(keep.sum())
+        if not rank or freedom <= rank:
+            return _Tested(0.0, 0, root, 0.0, -np.inf)
+        # what the others leave is no noise either where a gap is large
+        scatter = max(1.0, (total - statistic) / (freedom - rank))
+        # far out the chance is no number any more
+        with np.errstate(divide="ignore"):
+            log_p = np.log(chi2_above(statistic / scatter, rank))
+        evidence = statistic / scatter - rank * np.log(max(freedom, 2))
+        return _Tested(statistic, rank, root, log_p, evidence)
 
     def take(self, k, root):
         """Take a term in: the equations of the others beside it; ``root`` whitens its columns."""
@@ -314,24 +329,6 @@ class _Tested:
     @property
     def excess(self):
         return self.statistic - self.rank
-
-
-def _test(gram, target, total, freedom):
-    # columns had unit length before model and lamp were taken out: an eigenvalue is what is left
-    # of it
-    values, vectors = np.linalg.eigh(gram)
-    keep = values > _ABSORBED
-    root = vectors[:, keep] / np.sqrt(values[keep])
-    statistic, rank = float(np.sum((root.T @ target) ** 2)), int(keep.sum())
-    if not rank or freedom <= rank:
-        return _Tested(0.0, 0, root, 0.0, -np.inf)
-    # what the others leave is no noise either where a gap is large
-    scatter = max(1.0, (total - statistic) / (freedom - rank))
-    # far out the chance is no number any more
-    with np.errstate(divide="ignore"):
-        log_p = np.log(chi2_above(statistic / scatter, rank))
-    evidence = statistic / scatter - rank * np.log(max(freedom, 2))
-    return _Tested(statistic, rank, root, log_p, evidence)
 
 
 def frame_patterns(observations):

@@ -78,7 +78,11 @@ def changes(diagnosis, causes):
             brought = _brought(cell, run, names, chains) if cell else []
             same = {key: cause[key] for key in ("cell", "size", "probability", "significance")}
             entry = same | {"dataset": run, "brought_by": brought}
-            of = "" if _is_told(cell, cause, names) else " of this or what looks the same"
+            beside = [a for a in cause["aliases"] if cell and a["cell"] and len(names) == 2]
+            # of two runs, the opposite of the other one is the same change
+            twins = (a for a in beside if _in_any_run(Cell(**a["cell"])) == _in_any_run(cell))
+            told = cause["share"] + sum(a["probability"] for a in twins) >= ONE
+            of = "" if told else " of this or what looks the same"
             # what has a name of its own in each run
             is_named = str(cause.get("effect")).endswith(f"/dataset:{run}")
             named = cause["title"].removesuffix(f' in "{run}"') if is_named else ""
@@ -100,14 +104,6 @@ def _run_of(cell, names, chains):
 
 def _in_any_run(cell):
     return Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
-
-
-def _is_told(cell, cause, names):
-    """Return whether nothing looks like a change but, of two runs, the opposite of the other."""
-    there = [(Cell(**one["cell"]), one["probability"]) for one in cause["aliases"] if one["cell"]]
-    there = there if len(names) == 2 else []
-    same = sum(chance for one, chance in there if cell and _in_any_run(one) == _in_any_run(cell))
-    return cause["share"] + same >= ONE
 
 
 def _brought(cell, run, names, chains):

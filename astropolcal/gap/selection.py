@@ -222,11 +222,15 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     task.say("one perturbation of any course")
     rivals = _real_courses(best.model, base)
     # what changed between runs has two causes, and one course in all of them: that is no evidence
-    count = 1 if runs > 1 else len(best.chosen)
-    chances = [_of_course(count, one.behind) for one in rivals]
-    unlisted = _unlisted(base, best, stable, max(chances, default=0.0))
+    of_several = _ONE_COURSE * (runs < 2 and len(best.chosen) > 1)
+    behind = np.array([one.behind for one in rivals])
+    chances = np.maximum(
+        _BETTER_COURSE * expit(3 * (_BETTER - behind)), of_several * expit(_AS_WELL - behind)
+    )
+    chance = chances.max(initial=0.0)
+    unlisted = _unlisted(base, best, stable, chance)
     found = _grouped(task, best, steps, scans, unlisted, stable)
-    told = rivals if max(chances, default=0.0) > _MAY_BE else []
+    told = rivals if chance > _MAY_BE else []
     return Selection(found, best.model, first, unlisted, history, _alike_courses(base, told))
 
 
@@ -774,12 +778,6 @@ def _unlisted(base, best, stable, instead):
     return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
-def _of_course(count, behind):
-    """Return the probability that so many causes are one of a course that no table has."""
-    better = _BETTER_COURSE * expit(3 * (_BETTER - behind))
-    return max(better, _ONE_COURSE * expit(_AS_WELL - behind) if count > 1 else 0.0)
-
-
 def _grouped(task, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
@@ -810,12 +808,6 @@ def _refits(task, best, chosen):
         return lost, best.evidence(temper) - new.evidence(temper)
 
     return loss
-
-
-def _is_twin(one, other):
-    """Return whether two cells do the same to these data."""
-    near = abs(one.statistic - other.statistic) <= _SAME * other.statistic
-    return near and one.rank == other.rank and not (one.is_named or other.is_named)
 
 
 def _as_free(chosen, beside):
@@ -870,7 +862,9 @@ def _members(chosen, beside, loss):
             is_same = is_same and lost < 1
         if is_same:
             weight = max(weight, _ALIAS)
-        if chosen.degree != seen.degree == one.degree and _is_twin(one, seen):
+        is_twin = one.rank == seen.rank and not (one.is_named or seen.is_named)
+        is_twin &= abs(one.statistic - seen.statistic) <= _SAME * seen.statistic
+        if is_twin and chosen.degree != seen.degree == one.degree:
             # what cannot be told apart with a law cannot be without one either
             weight = max(weight, np.exp(min(one.evidence - seen.evidence, 0.0)))
         if weight >= _ALIAS:
