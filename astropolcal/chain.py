@@ -318,17 +318,13 @@ def follow(chain, name, model, of, *, since=None):
     law, found = law_of(name, old._declared(key).unit, model, of, since)
     new._follow(key, law, found.values())
     constant = getattr(new, key)
-    if "wavelength" in law.of and _goes_round(constant):
-        # turns may be counted from any data, not from the wavelength zero
+    unit, bounds = constant.unit, constant.bounds
+    is_angle = unit is not None and unit.is_equivalent(u.deg) and None not in bounds
+    # bounds a whole turn apart leave no value out; turns may be counted from any data, not from the
+    # wavelength zero
+    if "wavelength" in law.of and is_angle and np.diff(bounds)[0] * unit > 359.9 * u.deg:
         constant.bounds = None, None
     return replace_optic(chain, optic, new)
-
-
-def _goes_round(parameter):
-    """Whether the bounds of an angle are a whole turn apart, and so leave no value out."""
-    unit, bounds = parameter.unit, parameter.bounds
-    is_angle = unit is not None and unit.is_equivalent(u.deg) and None not in bounds
-    return bool(is_angle and np.diff(bounds)[0] * unit > 359.9 * u.deg)
 
 
 def stages(chain):

@@ -347,23 +347,6 @@ def diattenuation_vector(matrix):
     return matrix[..., 0, 1:] / matrix[..., 0, :1]
 
 
-def _rotation_vector(block):
-    """Return the retardance vectors of rotation blocks of shape (..., 3, 3)."""
-    # a retarder of vector d is the rotation exp(-[d]x), hence the sign
-    # slow to import, and only this function needs it
-    from scipy.spatial.transform import Rotation
-
-    flat = -Rotation.from_matrix(block.reshape(-1, 3, 3)).as_rotvec()
-    # at half a wave both signs are the same retarder: take the first
-    # component that is not zero as positive
-    half_wave = np.pi - np.linalg.norm(flat, axis=-1) < _SINGULAR
-    leading = np.argmax(np.abs(flat) > 1e-9, axis=-1)[..., None]
-    negative = np.take_along_axis(flat, leading, axis=-1)[..., 0] < 0
-    flat = np.where((half_wave & negative)[..., None], -flat, flat)
-    # adding zero turns -0 into 0
-    return flat.reshape(block.shape[:-1]) + 0.0
-
-
 def _unit(vector, fallback):
     """Return unit vectors, and the fallback for vectors of no length."""
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -413,6 +396,9 @@ def retardance_vector(matrix):
     retardance that fits, one that leaves no state is given none. A negative determinant belongs
     to the depolarizer.
     """
+    # slow to import, and only this function needs it
+    from scipy.spatial.transform import Rotation
+
     matrix = _transmitting(matrix)
     matrix = matrix / matrix[..., :1, :1]
     row, column = matrix[..., 0, 1:], matrix[..., 1:, 0]
@@ -431,7 +417,17 @@ def retardance_vector(matrix):
     across = across / np.sqrt((1 - attenuation) * (1 + attenuation))[..., None]
     block = across + (best - worst)[..., :, None] * axis[..., None, :] / 2
     turn = _smallest_rotation(axis, _unit(column, axis))
-    return _rotation_vector(np.where(pure[..., None], turn, _polar_rotation(block))) * u.rad
+    block = np.where(pure[..., None], turn, _polar_rotation(block))
+    # a retarder of vector d is the rotation exp(-[d]x), hence the sign
+    flat = -Rotation.from_matrix(block.reshape(-1, 3, 3)).as_rotvec()
+    # at half a wave both signs are the same retarder: take the first
+    # component that is not zero as positive
+    half_wave = np.pi - np.linalg.norm(flat, axis=-1) < _SINGULAR
+    leading = np.argmax(np.abs(flat) > 1e-9, axis=-1)[..., None]
+    negative = np.take_along_axis(flat, leading, axis=-1)[..., 0] < 0
+    flat = np.where((half_wave & negative)[..., None], -flat, flat)
+    # adding zero turns -0 into 0
+    return (flat.reshape(block.shape[:-1]) + 0.0) * u.rad
 
 
 # the Pauli matrices in the order of the Stokes parameters

@@ -48,7 +48,18 @@ def write_product(corrected, path, *, overwrite=False):
     frames = corrected.provenance.get("frames", [])
     path = check_new(path, overwrite, ObservationError, frames)
     hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
-    hdus += [*_errors(corrected), *_maps(corrected)]
+    hdus += _errors(corrected)
+    # what follows from the rest, for those who read FITS only
+    found = corrected.polarization()
+    order = ("dolp", "dolp_debiased", "s_p_statistical", "s_p_systematic")
+    hdus.append(_image("DOLP", np.stack([found[name] for name in order]), *order))
+    order = ("aolp", "s_chi_statistical", "s_chi_systematic")
+    hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order, unit=u.deg))
+    if corrected.stokes.ndim == 4:
+        found = corrected.azimuthal()
+        hdus.append(_image("QPHI", np.stack(list(found.values())), *found, unit=corrected.unit))
+        if not corrected.north_up:
+            hdus[-1].header["COMMENT"] = "as if north were up, which is not known (NORTHUP = F)"
     if corrected.star is not None:
         hdus.append(fits.BinTableHDU(corrected.star, name="STAR"))
     names = [_printable(name) for name in frames] or ["unknown"]
@@ -166,21 +177,6 @@ def _errors(corrected):
         planes = np.stack([known[pair] for pair in covariance_index(len(known))])
         hdus += [hdu, _image("SYSOPEN", systematic.open.astype(np.uint8))]
         hdus.append(_image("COVSYST", planes, *names, unit=unit))
-    return hdus
-
-
-def _maps(corrected):
-    """Return what follows from the rest, for those who read FITS only."""
-    found = corrected.polarization()
-    order = ("dolp", "dolp_debiased", "s_p_statistical", "s_p_systematic")
-    hdus = [_image("DOLP", np.stack([found[name] for name in order]), *order)]
-    order = ("aolp", "s_chi_statistical", "s_chi_systematic")
-    hdus.append(_image("AOLP", np.stack([found[name] for name in order]), *order, unit=u.deg))
-    if corrected.stokes.ndim == 4:
-        found = corrected.azimuthal()
-        hdus.append(_image("QPHI", np.stack(list(found.values())), *found, unit=corrected.unit))
-        if not corrected.north_up:
-            hdus[-1].header["COMMENT"] = "as if north were up, which is not known (NORTHUP = F)"
     return hdus
 
 

@@ -144,25 +144,20 @@ def _systematic(known, star, change, back, measured):
         moved = change @ known.factor @ light[..., None]
         factor[..., 1:3, 0] -= moved[..., 1:3, 0]
         is_open[:, 1:3, 0] &= n > 3
-    return replace(known, factor=np.concatenate([factor, _noise(star, measured)]), open=is_open)
-
-
-def _noise(star, measured):
-    """Return the errors of q and u of the star as directions, the same for all pixels."""
-    size, n = star.stokes.shape[1], len(star.components)
-    if star.covariance is None:
-        return np.zeros((0, size, n, n))
-    errors = star.fractional_errors()
-    q, u_, cross = (np.nan_to_num(errors[key]) for key in ("q", "u", "covariance_qu"))
-    # columns of a triangular root of the covariance of q and u
-    slope = np.divide(cross, q, out=np.zeros(size), where=q > 0)
-    roots = np.array([[q, slope], [0 * q, np.sqrt(np.maximum(u_**2 - slope**2, 0.0))]])
-    # noise of one wavelength is not that of another; a value that is stated is one for all
-    parts = np.eye(size) if measured else np.ones((1, size))
-    found = np.zeros((2, len(parts), size, n, n))
-    # d: directions, r: rows of q and u, p: parts, w: wavelengths
-    found[..., 1:3, 0] = -np.einsum("pw,drw->dpwr", parts, roots)
-    return found.reshape(-1, size, n, n)
+    if star.covariance is not None:
+        # the errors of q and u of the star as directions, the same for all pixels
+        errors = star.fractional_errors()
+        q, u_, cross = (np.nan_to_num(errors[key]) for key in ("q", "u", "covariance_qu"))
+        # columns of a triangular root of the covariance of q and u
+        slope = np.divide(cross, q, out=np.zeros(size), where=q > 0)
+        roots = np.array([[q, slope], [0 * q, np.sqrt(np.maximum(u_**2 - slope**2, 0.0))]])
+        # noise of one wavelength is not that of another; a value that is stated is one for all
+        parts = np.eye(size) if measured else np.ones((1, size))
+        found = np.zeros((2, len(parts), size, n, n))
+        # d: directions, r: rows of q and u, p: parts, w: wavelengths
+        found[..., 1:3, 0] = -np.einsum("pw,drw->dpwr", parts, roots)
+        factor = np.concatenate([factor, found.reshape(-1, size, n, n)])
+    return replace(known, factor=factor, open=is_open)
 
 
 def star_words(table):

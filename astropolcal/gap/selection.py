@@ -216,7 +216,13 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
         shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
         own = [one for one in best.chosen if one not in shared]
         best = replace(best, chosen=[*own, *shared])
-    best = _possible(task, best, scans)
+    # what is possible in place of causes of impossible size
+    for one in best.chosen:
+        other = None if best.model.is_physical(one.name) else _in_place(task, one, best)
+        if other is not None:
+            fresh = [new.name for new in other.chosen if new.name not in scans]
+            scans |= dict.fromkeys(fresh, scans[one.name])
+            best = other
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
@@ -304,17 +310,6 @@ def _with_axes(task, best):
 def _best_of(found, most):
     best = _distinct(found.candidates, most)
     return [found.freer(one, best) for one in best]
-
-
-def _possible(task, best, scans):
-    """Return the set with what is possible in place of causes of impossible size."""
-    for one in best.chosen:
-        other = None if best.model.is_physical(one.name) else _in_place(task, one, best)
-        if other is not None:
-            fresh = [new.name for new in other.chosen if new.name not in scans]
-            scans |= dict.fromkeys(fresh, scans[one.name])
-            best = other
-    return best
 
 
 def _checked(task, best):

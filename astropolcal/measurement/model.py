@@ -207,7 +207,9 @@ class Measurement(ScalarParameters):
         new = with_own_scalars(self, self._param_names)
         new._chains_are_shared = True
         new._factors = np.ones_like(self._factors)
-        new._drop_units(_bounds(*self.free.bounds()))
+        for name, bound in zip(new._param_names, _bounds(*self.free.bounds()), strict=True):
+            parameter = new.__dict__[name]
+            parameter._unit, parameter.bounds = None, bound
         new.stand_at(self.vector())
         return new
 

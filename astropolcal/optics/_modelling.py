@@ -226,12 +226,6 @@ class ScalarParameters(OwnUnits, FittableModel):
         self._param_metrics = defaultdict(dict)
         self._initialize_slices()
 
-    def _drop_units(self, bounds):
-        """Take the units from the parameters, and give them other bounds."""
-        for name, bound in zip(self._param_names, bounds, strict=True):
-            parameter = self.__dict__[name]
-            parameter._unit, parameter.bounds = None, bound
-
     @property
     def has_tied(self):
         """Whether a parameter is tied; a fitter asks before every evaluation."""

@@ -373,7 +373,10 @@ class EllipticalRetarder(Optic):
         # over x of each factor, plus what d_i itself does
         vector = np.stack(np.broadcast_arrays(horizontal, diagonal, circular), axis=-1)
         total = np.sqrt(np.sum(vector**2, axis=-1))
-        sinc, versine, sinc_slope, versine_slope = (f[..., None, None] for f in _functions(total))
+        sinc, half = np.sinc(total / np.pi), np.sinc(total / (2 * np.pi))
+        # versine, (1 - cos x)/x^2, is the square of sin(x / 2)/(x / 2) over 2
+        factors = sinc, half**2 / 2, _sinc_slope(total), half * _sinc_slope(total / 2) / 4
+        sinc, versine, sinc_slope, versine_slope = (f[..., None, None] for f in factors)
         outer = vector[..., :, None] * vector[..., None, :]
         cross = (vector @ _CROSS).reshape(*total.shape, 3, 3)
         common = sinc_slope * cross + versine_slope * outer - sinc * np.eye(3)
@@ -399,13 +402,6 @@ _CROSS = np.array(
     ],
     dtype=float,
 ).reshape(3, 9)
-
-
-def _functions(x):
-    """Return sin(x)/x, (1 - cos x)/x^2 and their derivatives over x, for any x >= 0."""
-    sinc, half = np.sinc(x / np.pi), np.sinc(x / (2 * np.pi))
-    # (1 - cos x)/x^2 is the square of sin(x / 2)/(x / 2) over 2
-    return sinc, half**2 / 2, _sinc_slope(x), half * _sinc_slope(x / 2) / 4
 
 
 def _sinc_slope(x):

@@ -54,6 +54,9 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
     ...
     astropolcal.exceptions.ParameterError: the reduction has no frames
     """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
     chosen = _chosen(reduction, frames)
     k, at = _slice(reduction, wavelength)
     columns = min(4, len(chosen))
@@ -67,7 +70,14 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
             panel.set_ylabel("y (pixel)")
         count = f"{len(chosen)} of {len(reduction.frames)} frames"
         figure.suptitle(f"Apertures at {at} ({count}; square-root scale)")
-        st.legend_outside(figure, _handles(reduction.source, any(gaps)), columns=4)
+        handles = [
+            Line2D([], [], color=_COLORS[b], ls=_LINES[b], lw=1.8, label=f"{b} beam") for b in BEAMS
+        ]
+        if reduction.source == "star":
+            handles.append(Line2D([], [], color="0.35", ls=":", lw=1.4, label="background ring"))
+        if any(gaps):
+            handles.append(Patch(fc=_GAP, ec="0.5", label="no value"))
+        st.legend_outside(figure, handles, columns=4)
     return figure
 
 
@@ -90,20 +100,6 @@ def _slice(reduction, wavelength):
     if not 0 <= k < len(grid):
         raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
     return k, f"{grid[k].to_value('nm'):.0f} nm"
-
-
-def _handles(source, gaps):
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles = [
-        Line2D([], [], color=_COLORS[b], ls=_LINES[b], lw=1.8, label=f"{b} beam") for b in BEAMS
-    ]
-    if source == "star":
-        handles.append(Line2D([], [], color="0.35", ls=":", lw=1.4, label="background ring"))
-    if gaps:
-        handles.append(Patch(fc=_GAP, ec="0.5", label="no value"))
-    return handles
 
 
 def _draw_frame(panel, index, reduction, k):

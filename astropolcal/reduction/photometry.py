@@ -324,11 +324,7 @@ def evenly_lit(cube, good, layout):
     The median pixel of the brighter beam has at least half of the light of the mean pixel.
     """
     beams = []
-    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
-        known = good[:, rows, columns]
-        # in the precision of the cube a damaged pixel would overflow
-        total = np.sum(cube[:, rows, columns], axis=0, dtype=float, where=known)
-        number = known.sum(axis=0)
+    for weights, total, number in _over_slices(cube, good, layout):
         whole = (weights >= 1.0) & (number > 0)
         pixels = total[whole] / number[whole]
         beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
@@ -336,6 +332,15 @@ def evenly_lit(cube, good, layout):
     mean, median = max(beams)
     # a rectangle whose median pixel has less than this part of the mean one holds a star
     return bool(median >= 0.5 * mean)
+
+
+def _over_slices(cube, good, layout):
+    """Yield the weights of the pixels of each rectangle, and sum and number of known values."""
+    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
+        known = good[:, rows, columns]
+        # in the precision of the cube a damaged pixel would overflow
+        total = np.sum(cube[:, rows, columns], axis=0, dtype=float, where=known)
+        yield weights, total, known.sum(axis=0)
 
 
 # a rectangle is looked at in so many parts along each of its sides
@@ -348,10 +353,7 @@ def light_in_parts(cube, good, layout):
     All slices together.
     """
     found, (*_, width, height, angle) = [], layout.internal_apertures
-    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
-        known = good[:, rows, columns]
-        total = np.sum(cube[:, rows, columns], axis=0, dtype=float, where=known)
-        number = known.sum(axis=0)
+    for weights, total, number in _over_slices(cube, good, layout):
         middle = (weights.shape[1] - 1) / 2, (weights.shape[0] - 1) / 2
         sides = zip(turned(weights.shape, middle, angle), (width, height), strict=True)
         along, across = (np.clip(_PARTS * (0.5 + x / side), 0, _PARTS - 1) for x, side in sides)

@@ -320,7 +320,9 @@ def reduce_run(
         raise ObservationError(_nothing(len(files), task, reduction.problems))
     reduction.frames = frames
     settings = masters.settings(layout)
-    wrong = _wrong_source(frames, instrument, {"source": source} | (meta or {}))
+    seen, stated, wrong = _seen_source(frames, instrument), (meta or {}).get("source", source), []
+    if {seen, stated} == {"polarized", "unpolarized"}:
+        wrong = [f"source {stated!r} is stated, but the fluxes change with the plate as if {seen}"]
     _doubt(frames, layout, lambda frame: [*wrong, *masters.doubts(frame.values, settings)])
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
@@ -512,14 +514,6 @@ def _unlike_others(frames, layout):
     error = error * max(1.0, MAD_TO_SIGMA * np.ma.median(off / error))
     bad = (off > np.maximum(_UNLIKE[0], _UNLIKE[1] * error)).filled(False).any(axis=1)
     return [frame for frame, unlike in zip(frames, bad, strict=True) if unlike]
-
-
-def _wrong_source(frames, instrument, told):
-    """Say that the fluxes contradict what is stated of an internal source."""
-    seen, stated = _seen_source(frames, instrument), told["source"]
-    if seen is None or {seen, stated} != {"polarized", "unpolarized"}:
-        return []
-    return [f"source {stated!r} is stated, but the fluxes change with the plate as if {seen}"]
 
 
 def _seen_source(frames, instrument):

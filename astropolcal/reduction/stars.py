@@ -56,8 +56,7 @@ def measure_stars(
     like polarization. Pixels without a value are filled with the Gaussian and what the pixels
     around them have beyond it. The options are described in `reduce_run`.
     """
-    _check(radius, factor, max_radius, annulus, companion, max_masked)
-    _check_correction(aperture_correction, layout)
+    _check(radius, factor, max_radius, annulus, companion, max_masked, aperture_correction, layout)
     result = Photometry.empty(len(cube), len(layout.beams))
     good = np.isfinite(cube) if good is None else good
     result.flag(~good.any(axis=(1, 2)), "empty slice")
@@ -104,7 +103,7 @@ def measure_stars(
     return result
 
 
-def _check(radius, factor, max_radius, annulus, companion, max_masked):
+def _check(radius, factor, max_radius, annulus, companion, max_masked, correction, layout):
     if isinstance(radius, str):
         if radius not in ("fwhm", "growth"):
             raise ParameterError(f"radius = {radius!r}; allowed are 'fwhm', 'growth' and pixels")
@@ -116,12 +115,8 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
-
-
-def _check_correction(aperture_correction, layout):
-    corrections = (False, True, "growth")
-    check_choice("aperture_correction", aperture_correction, corrections, ParameterError)
-    if aperture_correction is True and not layout.two_beams:
+    check_choice("aperture_correction", correction, (False, True, "growth"), ParameterError)
+    if correction is True and not layout.two_beams:
         raise ParameterError(
             f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
             "the wings is that of two beams, allowed are False and 'growth'"

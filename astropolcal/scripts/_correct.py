@@ -119,7 +119,9 @@ def _star(text):
     try:
         if text.startswith("annulus="):
             return {"annulus": tuple(common.numbers(text.removeprefix("annulus="), 2))}
-        (dolp, s_dolp), (aolp, s_aolp) = (_with_error(part) for part in text.split(","))
+        parts = (part.partition("+-") for part in text.split(","))
+        pairs = [(plain_number(value), plain_number(error or "0")) for value, _, error in parts]
+        (dolp, s_dolp), (aolp, s_aolp) = pairs
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{text!r} is neither annulus=IN,OUT nor DOLP,AOLP such as 0.8+-0.1,45+-3"
@@ -127,11 +129,6 @@ def _star(text):
     if not 0 <= dolp <= 100:
         raise argparse.ArgumentTypeError(f"{text!r}: {dolp:g} %; allowed are 0 to 100 %")
     return {"dolp": dolp / 100, "aolp": aolp * u.deg, "errors": (s_dolp / 100, s_aolp * u.deg)}
-
-
-def _with_error(text):
-    value, _, error = text.partition("+-")
-    return plain_number(value), plain_number(error or "0")
 
 
 TYPES = {

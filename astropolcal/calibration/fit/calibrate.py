@@ -273,7 +273,10 @@ def fitted(
         # the first step that did not converge makes the next ones useless
         outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1])
     if loss != "linear":
-        outcome, weighting = _robust(measurement, loss, fitter)
+        # iteratively reweighted least squares
+        first, what = robust_weighting(measurement, loss), "the weights of the robust fit"
+        how = fitter, lambda _: robust_weighting(measurement, loss), _ROBUST_ROUNDS, what
+        outcome, weighting = until_settled(measurement, first, *how)
     if not outcome["converged"]:
         warn(f"the fit did not converge: {outcome['message']}", stacklevel=3)
     taken, whitened = _at_gauge(measurement, weighting, origin, chosen["gauge"])
@@ -281,16 +284,6 @@ def fitted(
     settings = {"instrument": instrument, "fitter": type(fitter).__name__, **chosen, "gauge": gauge}
     outcome |= {"seconds": time.perf_counter() - started, "n_data": measurement.n_data}
     return FittedMeasurement(measurement, whitened, settings, outcome, stages)
-
-
-def _robust(measurement, loss, fitter):
-    """Return the outcome of iteratively reweighted least squares, and the weighting."""
-
-    def updated(_):
-        return robust_weighting(measurement, loss)
-
-    first, what = updated(None), "the weights of the robust fit"
-    return until_settled(measurement, first, fitter, updated, _ROBUST_ROUNDS, what)
 
 
 def _fixed(chain, fix):

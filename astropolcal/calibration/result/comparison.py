@@ -195,10 +195,14 @@ class _Optics:
         """Return an array of shape (quantities, n_wavelengths), retardances in degree."""
         path = self.path(chain)
         parts = self.parts(path)
-        retardances = [
-            _retardance(_quaternions(optic, self.wavelength), about)
-            for optic, about in zip(parts, self.quaternions, strict=False)
-        ]
+        retardances = []
+        for optic, about in zip(parts, self.quaternions, strict=False):
+            turn = _quaternions(optic, self.wavelength)
+            # a quaternion and its negative are the same turn; the one nearer to that of the chain
+            # continues the angle beyond 180 deg, where half a wave has neither a sign nor a kink
+            turn = np.sign(np.sum(turn * about, axis=-1, keepdims=True)) * turn
+            half = np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), turn[..., 0])
+            retardances.append(2 * np.rad2deg(half))
         plate, derotator, whole = (
             np.sum(_diattenuation_vectors(optic, self.wavelength) * axes, axis=-1)
             for optic, axes in zip(parts, self.axes, strict=True)
@@ -238,16 +242,6 @@ def _quaternions(optic, wavelength):
     # sinc(x) is sin(pi x) / (pi x), which holds at no retardance
     parts = [np.cos(length / 2), vector * np.sinc(length / (2 * np.pi)) / 2]
     return np.broadcast_to(np.concatenate(parts, axis=-1), (wavelength.size, 4))
-
-
-def _retardance(quaternions, about):
-    """Return angles of turn in degree, from 0 to 180 deg at the quaternions ``about``.
-
-    A quaternion and its negative are the same turn; the one nearer to ``about`` continues the angle
-    beyond 180 deg, where half a wave has neither a sign nor a kink.
-    """
-    near = np.sign(np.sum(quaternions * about, axis=-1, keepdims=True)) * quaternions
-    return 2 * np.rad2deg(np.arctan2(np.linalg.norm(near[..., 1:], axis=-1), near[..., 0]))
 
 
 def _diattenuation_vectors(optic, wavelength):

@@ -617,13 +617,10 @@ def mirror_names(calibration):
 
     What delays by less than a quarter wave, a mirror by half a wave, is a window or a relay.
     """
-    found = _diattenuators(calibration).items()
-    return [name for name, leaf in found if leaf.mount is None and not _is_window(leaf)]
-
-
-def _is_window(leaf):
-    retards = isinstance(leaf, DiattenuatorRetarder)
-    return retards and np.median(np.cos(leaf.retardance.quantity)) > 0
+    found = {n: leaf for n, leaf in _diattenuators(calibration).items() if leaf.mount is None}
+    both = ((n, leaf) for n, leaf in found.items() if isinstance(leaf, DiattenuatorRetarder))
+    turns = {n: leaf.retardance.quantity for n, leaf in both}
+    return [n for n in found if n not in turns or not np.median(np.cos(turns[n])) > 0]
 
 
 def _diattenuators(calibration):

@@ -160,9 +160,18 @@ def _accuracies(calibration, targets, view, ignore=False):
     wanted = [_target(*target) for target in targets]
     if view is None:
         return []
-    tables, count = [], view.good.shape[1]
+    tables, count, known = [], view.good.shape[1], calibration.fit.get("model_error")
+    # which errors of the model there are; what no dataset tells counts as zero
+    missing = known.get("missing", []) if known else _OF_SOURCES
+    none = [source for key, source in _OF_SOURCES.items() if key in missing]
+    words = "and an error of the model" + "".join(f", but none from {one} sources" for one in none)
+    words = "without an error of the model" if len(none) == len(_OF_SOURCES) else words
+    words += ", and those of what was held" if "held_absolute_percent" in (known or {}) else ""
+    # where the data leave two signs of a retardance open
+    signs = np.count_nonzero((known or {}).get("sign_relative_percent", ()))
+    words += f", with signs that nothing tells at {signs} wavelengths" if signs else ""
     words = (
-        f"from the covariance of the fit {_of_model(calibration)}; {view.telescope}; "
+        f"from the covariance of the fit {words}; {view.telescope}; "
         + ("one cycle of the half-wave plate" if view.has_plate else "one sequence of frames")
         + (f", rms over {count} settings" if count > 1 else "")
     )
@@ -179,19 +188,6 @@ def _accuracies(calibration, targets, view, ignore=False):
         table.meta |= {"dolp": dolp, "aolp": aolp, "words": words}
         tables.append(table)
     return tables
-
-
-def _of_model(calibration):
-    """Say which errors of the model there are; what no dataset tells counts as zero."""
-    known = calibration.fit.get("model_error")
-    missing = known.get("missing", []) if known else _OF_SOURCES
-    none = [source for key, source in _OF_SOURCES.items() if key in missing]
-    words = "and an error of the model" + "".join(f", but none from {one} sources" for one in none)
-    words = "without an error of the model" if len(none) == len(_OF_SOURCES) else words
-    # where the data leave two signs of a retardance open
-    signs = np.count_nonzero((known or {}).get("sign_relative_percent", ()))
-    words += ", and those of what was held" if "held_absolute_percent" in (known or {}) else ""
-    return words + (f", with signs that nothing tells at {signs} wavelengths" if signs else "")
 
 
 def _target(dolp, aolp):
