@@ -165,8 +165,7 @@ def sampled_systematic(
         # the samples have walked along all directions
         along, is_open = along[:0], np.zeros_like(is_open)
         if narrow := model.calibration.posterior.scatter:
-            words = f"systematic errors are too small: {narrow}"
-            warn(words, stacklevel=4)
+            warn(f"systematic errors are too small: {narrow}", stacklevel=4)
     return _with_model_error(factor, along, is_open, "sampled", model, light)
 
 

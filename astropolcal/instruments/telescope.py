@@ -230,8 +230,7 @@ def _standard(source, target):
                 f"{target} as a polarized standard star: {error}; with the source 'star' its "
                 "polarization is fitted without a prior"
             ) from error
-        words = f"{error}; it is unpolarized according to the table"
-        warn(words)
+        warn(f"{error}; it is unpolarized according to the table")
         return None
     if not source.startswith(known.kind):
         raise InstrumentError(

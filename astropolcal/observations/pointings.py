@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import Angle
+from astropy.coordinates import Angle, EarthLocation, HADec, SkyCoord
 from astropy.time import Time
 from astropy.utils import iers
 from astropy.utils.data import download_file
@@ -169,8 +169,6 @@ def pointing(coord, time, location):
     >>> altitude.round(1), parallactic.round(0)
     (<Quantity 69.1 deg>, <Quantity 6. deg>)
     """
-    from astropy.coordinates import EarthLocation, HADec
-
     wanted = "the site of the telescope is needed, an EarthLocation"
     check_type("location", location, EarthLocation, wanted, ParameterError)
     with offline():
@@ -266,8 +264,6 @@ def _times(frames):
 
 
 def _target(observations):
-    from astropy.coordinates import SkyCoord
-
     found = []
     for key in ("right_ascension", "declination"):
         if key in observations.frame_columns:
@@ -390,8 +386,6 @@ def location_of(site):
     >>> location_of((-155.4761, 19.8255, 4139.0)).lat.deg.round(4)
     np.float64(19.8255)
     """
-    from astropy.coordinates import EarthLocation
-
     if not len(site):
         return None
     longitude, latitude, height = site

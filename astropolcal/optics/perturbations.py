@@ -317,5 +317,4 @@ class MuellerElement(_LinearOptic):
             raise ParameterError(
                 f"a Mueller matrix has shape (4, 4) or (n, 4, 4), not {matrix.shape}"
             )
-        values = {f"m{i}{j}": matrix[..., i, j] for i, j in _ELEMENTS}
-        return cls(**values, **kwargs)
+        return cls(**{f"m{i}{j}": matrix[..., i, j] for i, j in _ELEMENTS}, **kwargs)

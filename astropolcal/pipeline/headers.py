@@ -294,8 +294,7 @@ def faults_of(calibration, name):
     """Return why a calibration is not usable, with a warning; what is open, the errors tell."""
     found = faults(calibration)
     if found:
-        words = f"{name}: NOT USABLE AS IT IS: {'; '.join(found)}"
-        warn(words, stacklevel=3)
+        warn(f"{name}: NOT USABLE AS IT IS: {'; '.join(found)}", stacklevel=3)
     return found
 
 

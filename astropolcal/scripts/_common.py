@@ -544,8 +544,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             parameter.fixed = True
         # zero is the same in all units
         if parameter.unit and re.fullmatch(r"[-+.\deE\s]+", value) and float(value):
-            message = f"--fix {text}: no unit is given, {parameter.unit} is taken"
-            warn(message)
+            warn(f"--fix {text}: no unit is given, {parameter.unit} is taken")
     for text in prior:
         name, _, value = text.partition("=")
         for parameter in _parameters(chains, name, f"--prior {text}"):
