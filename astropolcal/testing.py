@@ -360,6 +360,8 @@ class Probe:
 
     def check_calibrates(self):
         """A calibration of simulated frames predicts frames that it did not see."""
+        from astropolcal.calibration import calibrate
+
         # a lamp needs no pointing, so that less can go wrong that is not of the chain
         internal = [source for source in self.sources if not is_star(source)]
         source = (internal or self.sources)[0]
