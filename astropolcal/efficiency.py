@@ -179,7 +179,17 @@ def polarimetric_efficiency(
             f"{shape} angles at {lam.size} wavelengths are too many; allowed are {_MOST_CELLS}"
         )
     flat = {stage: np.broadcast_to(a, shape).ravel() * u.rad for stage, a in positions.items()}
-    return _measured(_cycle(path, lam, flat), aolp).reshape(*shape, lam.size)
+    cycles = [(_CYCLE, flat)]
+    if "flc_state" in stages(path):
+        count = len(flat["hwp"])
+        states = (flat | {"flc_state": np.full(count, state)} for state in (0.0, 1.0))
+        cycles = zip((_CYCLE, _EXCHANGED), states, strict=True)
+    # rows I and Q at the four angles of the plate, mean over the states of a modulator
+    found = []
+    for angles, at in cycles:
+        turned = (at | {"hwp": at["hwp"] + further} for further in angles)
+        found.append([system_mueller(path, lam, one)[..., :2, :] for one in turned])
+    return _measured(np.mean(found, axis=0), aolp).reshape(*shape, lam.size)
 
 
 def _check_shapes(**angles):
@@ -189,20 +199,6 @@ def _check_shapes(**angles):
     except ValueError:
         words = ", ".join(f"{name} has shape {shape}" for name, shape in shapes.items())
         raise ParameterError(f"{words}; they must broadcast against each other") from None
-
-
-def _cycle(path, lam, positions):
-    """Return rows I and Q at the four angles of the plate, mean over the states of a modulator."""
-    cycles = [(_CYCLE, positions)]
-    if "flc_state" in stages(path):
-        count = len(positions["hwp"])
-        states = (positions | {"flc_state": np.full(count, state)} for state in (0.0, 1.0))
-        cycles = zip((_CYCLE, _EXCHANGED), states, strict=True)
-    found = []
-    for angles, at in cycles:
-        turned = (at | {"hwp": at["hwp"] + further} for further in angles)
-        found.append([system_mueller(path, lam, one)[..., :2, :] for one in turned])
-    return np.mean(found, axis=0)
 
 
 def _law_of(instrument):

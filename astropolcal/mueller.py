@@ -347,7 +347,7 @@ def diattenuation_vector(matrix):
     return matrix[..., 0, 1:] / matrix[..., 0, :1]
 
 
-def _unit(vector, fallback):
+def unit_vectors(vector, fallback):
     """Return unit vectors, and the fallback for vectors of no length."""
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.where(length > 0, vector / np.where(length > 0, length, 1.0), fallback)
@@ -358,9 +358,9 @@ def _smallest_rotation(start, end):
     cosine = np.sum(start * end, axis=-1)[..., None, None]
     # two reflections make the rotation; opposite vectors leave the plane open
     least = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
-    aside = _unit(np.cross(start, least), least)
+    aside = unit_vectors(np.cross(start, least), least)
     bisector = np.where(cosine[..., 0] > -1 + _SINGULAR, start + end, aside)
-    bisector = _unit(bisector, aside)
+    bisector = unit_vectors(bisector, aside)
     halfway = 2 * bisector[..., :, None] * bisector[..., None, :] - np.eye(3)
     along = 2 * start[..., :, None] * start[..., None, :] - np.eye(3)
     return halfway @ along
@@ -405,7 +405,7 @@ def retardance_vector(matrix):
     strength = np.linalg.norm(row, axis=-1, keepdims=True)
     if (strength > 1 + _EXCESS).any():
         raise ParameterError(f"diattenuation = {strength.max()} must be at most 1")
-    axis, pure = _unit(row, np.array([1.0, 0.0, 0.0])), strength >= 1 - _POLARIZER
+    axis, pure = unit_vectors(row, np.array([1.0, 0.0, 0.0])), strength >= 1 - _POLARIZER
     attenuation = np.where(pure, 0.0, strength)
     # the block without the diattenuator, written for the two states that this passes best and
     # worst, so that nothing cancels however close to a polarizer it is
@@ -416,7 +416,7 @@ def retardance_vector(matrix):
     across = block - image[..., :, None] * axis[..., None, :]
     across = across / np.sqrt((1 - attenuation) * (1 + attenuation))[..., None]
     block = across + (best - worst)[..., :, None] * axis[..., None, :] / 2
-    turn = _smallest_rotation(axis, _unit(column, axis))
+    turn = _smallest_rotation(axis, unit_vectors(column, axis))
     block = np.where(pure[..., None], turn, _polar_rotation(block))
     # a retarder of vector d is the rotation exp(-[d]x), hence the sign
     flat = -Rotation.from_matrix(block.reshape(-1, 3, 3)).as_rotvec()

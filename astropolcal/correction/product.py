@@ -47,8 +47,13 @@ def write_product(corrected, path, *, overwrite=False):
     """Write a `Corrected` to a FITS file, which appears complete or not at all."""
     frames = corrected.provenance.get("frames", [])
     path = check_new(path, overwrite, ObservationError, frames)
-    hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
-    hdus += _errors(corrected)
+    table = QTable({"wavelength": corrected.wavelength.to(u.um)})
+    for name in ("condition", "determined", "leakage"):
+        table[name] = getattr(corrected, name)
+    # FITS has no columns of width zero
+    table["weak"] = np.array([words or " " for words in corrected.weak], dtype=str)
+    hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected))]
+    hdus += [fits.BinTableHDU(table, name="WAVELENGTH"), *_errors(corrected)]
     # what follows from the rest, for those who read FITS only
     found = corrected.polarization()
     order = ("dolp", "dolp_debiased", "s_p_statistical", "s_p_systematic")
@@ -141,15 +146,6 @@ def _axes(header, corrected):
         header["STARY"] = (corrected.centre[1], "place of the star, 0-based pixel")
     if corrected.pixel_scale is not None:
         header["PIXSCALE"] = (corrected.pixel_scale, "milliarcsecond")
-
-
-def _wavelengths(corrected):
-    table = QTable({"wavelength": corrected.wavelength.to(u.um)})
-    for name in ("condition", "determined", "leakage"):
-        table[name] = getattr(corrected, name)
-    # FITS has no columns of width zero
-    table["weak"] = np.array([words or " " for words in corrected.weak], dtype=str)
-    return fits.BinTableHDU(table, name="WAVELENGTH")
 
 
 def _image(name, values, *lines, unit=None):

@@ -278,8 +278,16 @@ def plan(diagnosis, candidates=None):
             if error.argument != "chain":
                 raise
     lines += [_telling_apart(forecast, group, foreseen) for group in groups]
-    if directions[2].shape[1]:
-        lines += _fixing(forecast, directions, foreseen)
+    if n_open := directions[2].shape[1]:
+        found = [(one, *forecast.fixes(directions, columns)) for one, columns in foreseen]
+        worth = [gain / (1 + one.effort) for one, _, gain, _ in found]
+        if max(worth, default=0.0) > LEAST_GAIN:
+            exposure, names, gain, count = found[int(np.argmax(worth))]
+            purpose = (
+                f"fixes {count} of {n_open} open directions of the parameters, the clearest that "
+                f"of {' with '.join(names)}, at {_sigmas(gain)} standard deviations"
+            )
+            lines.append(_line(exposure.words, purpose, "parameters", names, gain))
     return _merged(lines)[:_MOST_LINES]
 
 
@@ -403,20 +411,6 @@ def _moved(diagnosis):
 
 def _grown(after):
     return "over 99%" if after > 0.99 else f"{after:.0%}"
-
-
-def _fixing(forecast, directions, foreseen):
-    """Return the line on the exposure that fixes what is open among the parameters."""
-    found = [(one, *forecast.fixes(directions, columns)) for one, columns in foreseen]
-    worth = [gain / (1 + one.effort) for one, _, gain, _ in found]
-    if max(worth, default=0.0) <= LEAST_GAIN:
-        return []
-    (exposure, names, gain, count), n_open = found[int(np.argmax(worth))], directions[2].shape[1]
-    purpose = (
-        f"fixes {count} of {n_open} open directions of the parameters, the clearest that of "
-        f"{' with '.join(names)}, at {_sigmas(gain)} standard deviations"
-    )
-    return [_line(exposure.words, purpose, "parameters", names, gain)]
 
 
 def _merged(lines):

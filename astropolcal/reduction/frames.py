@@ -545,18 +545,14 @@ def survey_frames(files, layout, *, raw=None, centre=None, exposed=False, ways=N
         warn(f"{counted(len(of), 'file')}: {words}; the first is {of[0]}", stacklevel=3)
     if centre is None and not layout.centred:
         # (beam, x and y): the star moves over the slices by less than a fraction of a pixel
-        centre = [_place(f.photometry) for f in found]
+        seen = ((f.photometry, ~f.photometry.failed) for f in found)
+        centre = [np.median(np.stack([p.x, p.y])[:, :, good], axis=2).T for p, good in seen]
         seen = np.isfinite(np.asarray(centre)).all(axis=(1, 2))
         if not seen.all():
             bad = files[int(np.argmin(seen))]
             raise ObservationError(f"{bad}: the star was not found{ways['centre']}")
     detectors = [_detectors(*both, layout) for both in zip(files, found, strict=True)]
     return _angles(found), centre, _brightness(files, found, detectors), detectors
-
-
-def _place(photometry):
-    """Return the place of the star in each beam, (n_beams, 2), of the slices that show it."""
-    return np.median(np.stack([photometry.x, photometry.y])[:, :, ~photometry.failed], axis=2).T
 
 
 def _detectors(file, frame, layout):

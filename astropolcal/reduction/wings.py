@@ -145,7 +145,13 @@ def _fit(star, rings, detector, halo_radius):
     freedom = max(weights.size - len(star.x) - len(c) - len(p), 1)
     found = (p, c, background)
     covariance = _covariance(profile, weights, found) * max(1.0, cost / freedom)
-    return _shares(profile, found, covariance)
+    measured = star.flux.sum(axis=0)
+    known = profile.sums - background * profile.pixels
+    total = known + np.tensordot(c, profile.lacking(p), 1)
+    slopes = np.concatenate([_slopes(profile.lacking, found), np.diag(-profile.pixels)])
+    noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
+    relative = measured / total**2
+    return measured / total, noise * np.outer(relative, relative)
 
 
 def _least_squares(profile, weights, start):
@@ -197,17 +203,6 @@ def _slopes(columns, found):
         high, low = (np.tensordot(c, columns(p + sign * step), 1) for sign in (0.5, -0.5))
         moved.append((high - low) / _STEP)
     return np.concatenate([moved, columns(p)])
-
-
-def _shares(profile, found, covariance):
-    star, (_, c, background) = profile.star, found
-    measured = star.flux.sum(axis=0)
-    known = profile.sums - background * profile.pixels
-    total = known + np.tensordot(c, profile.lacking(found[0]), 1)
-    slopes = np.concatenate([_slopes(profile.lacking, found), np.diag(-profile.pixels)])
-    noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
-    relative = measured / total**2
-    return measured / total, noise * np.outer(relative, relative)
 
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------

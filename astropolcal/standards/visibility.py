@@ -221,7 +221,13 @@ def telescope_information(
         # a star known beforehand is two more measurements, of its q and u
         known = np.eye(2, columns.shape[1]) / positive_number(star_error, "star_error")
         columns = np.vstack([columns, known])
-    return TelescopeInformation(_NAMES[: columns.shape[1]], _covariance(columns))
+    inverse = np.linalg.pinv(columns, rcond=_RANK)
+    covariance = inverse @ inverse.T
+    # a parameter that takes part in an open direction has an infinite error, not that of a
+    # pseudo-inverse: the projector on what is determined shortens it
+    lost = np.diagonal(inverse @ columns) < 1 - _RANK
+    covariance[lost, :] = covariance[:, lost] = np.inf
+    return TelescopeInformation(_NAMES[: columns.shape[1]], covariance)
 
 
 def _design(psi, turn, offset):
@@ -233,17 +239,6 @@ def _design(psi, turn, offset):
     if offset:
         parts.append(np.broadcast_to(np.eye(2), star.shape))
     return np.concatenate(parts, axis=-1).reshape(2 * len(psi), -1)
-
-
-def _covariance(columns):
-    """Return the covariance of least squares; infinite where nothing is determined."""
-    inverse = np.linalg.pinv(columns, rcond=_RANK)
-    covariance = inverse @ inverse.T
-    # a parameter that takes part in an open direction has an infinite error, not that of a
-    # pseudo-inverse: the projector on what is determined shortens it
-    lost = np.diagonal(inverse @ columns) < 1 - _RANK
-    covariance[lost, :] = covariance[:, lost] = np.inf
-    return covariance
 
 
 def _angles(value, name):

@@ -367,10 +367,12 @@ class Model:
         new._take([other for other in self.terms if other is not term])
         found, now = new.weighed(), self.weighed()
         odds = {what: one.odds_of(COURSES[1:]) for what, one in found.items()}
+        # neither of two optics or parameters that are rivals holds the other
         rivals = [
             what
             for what in found
-            if _differ(what, term.what)
+            if what not in (term.what, optic(term.what))
+            and term.what != optic(what)
             and odds[what] > odds[term.what] - _RIVAL
             and now[what].odds_of(COURSES[1:]) < 0
         ]
@@ -416,11 +418,6 @@ def stem(name):
 def optic(name):
     """Return the optic of a parameter, or of an element."""
     return name.partition(".")[0]
-
-
-def _differ(one, other):
-    """Whether neither of two optics or parameters holds the other."""
-    return one not in (other, optic(other)) and other != optic(one)
 
 
 def _is_of(name, wanted):

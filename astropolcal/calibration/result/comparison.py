@@ -13,7 +13,7 @@ from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.efficiency import has_derotator, has_plate, polarimetric_efficiency, sky_path
 from astropolcal.exceptions import ParameterError
 from astropolcal.instruments import Instrument
-from astropolcal.mueller import diattenuation_vector, retardance_vector
+from astropolcal.mueller import diattenuation_vector, retardance_vector, unit_vectors
 from astropolcal.optics import COORDINATES
 
 __all__ = ["compare"]
@@ -166,7 +166,9 @@ class _Optics:
         self.wavelength = wavelength
         path = self.path(chain)
         self.quaternions = [_quaternions(optic, wavelength) for optic in self.parts(path)[:2]]
-        self.axes = [_axes(_diattenuation_vectors(optic, wavelength)) for optic in self.parts(path)]
+        vectors = (_diattenuation_vectors(optic, wavelength) for optic in self.parts(path))
+        # along Q where there is no diattenuation, whose length has no slope
+        self.axes = [unit_vectors(each, [1.0, 0.0, 0.0]) for each in vectors]
         self.turns = has_derotator(path)
         efficiency = self.efficiency(path, _TURN)
         # the extreme over the angles stays at its angle, to first order (envelope theorem)
@@ -248,13 +250,6 @@ def _diattenuation_vectors(optic, wavelength):
     if optic is None:
         return np.full((wavelength.size, 3), np.nan)
     return np.broadcast_to(diattenuation_vector(_matrix(optic, wavelength)), (wavelength.size, 3))
-
-
-def _axes(vectors):
-    """Return unit vectors; along Q where there is no diattenuation, whose length has no slope."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    along = vectors / np.where(length > 0, length, 1.0)
-    return np.where(length == 0, [1.0, 0.0, 0.0], along)
 
 
 def _filters(instrument, wavelength):

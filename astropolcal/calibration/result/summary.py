@@ -262,7 +262,13 @@ def _target_row(table):
 def _wavelength_blocks(calibration, known):
     """Return tables with one row per wavelength, and in each as many parameters as fit."""
     several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
-    s_mean, blocks = _by_wavelength(calibration.datasets), []
+    s_mean, blocks = {}, []
+    # at each wavelength that of the first dataset that has it
+    for accuracy in (record.accuracy for record in calibration.datasets):
+        nm = accuracy["wavelength"].to_value(u.nm)
+        for w, s in zip(nm, accuracy["s_mean"].value, strict=True):
+            if np.isfinite(s):
+                s_mean.setdefault(round(w, 2), s)
     for start in range(0, len(several), _N_COLUMNS):
         names, shown = zip(*several[start : start + _N_COLUMNS], strict=True)
         optics, keys = zip(*(name.split(".") for name in names), strict=True)
@@ -290,17 +296,6 @@ def _cell(entry, i):
         return f"{value} +- {error}".ljust(20) + _MARKS.get(status, " ")
     # what follows another parameter has no error of its own
     return f"{value} {_SAID.get(status, '')}".ljust(21)
-
-
-def _by_wavelength(datasets):
-    """Return s_mean at each wavelength, of the first dataset that has it."""
-    found = {}
-    for accuracy in (record.accuracy for record in datasets):
-        nm = accuracy["wavelength"].to_value(u.nm)
-        for w, s in zip(nm, accuracy["s_mean"].value, strict=True):
-            if np.isfinite(s):
-                found.setdefault(round(w, 2), s)
-    return found
 
 
 def _goodness_lines(calibration):
