@@ -430,10 +430,24 @@ def _journal(path, settings):
 
 
 def _entry(content):
-    """Return what a line of a checkpoint holds: "settings", or the index of a record; and it."""
+    """Return what a line of a checkpoint holds: "settings", or the index of a record; and it.
+
+    Or raise where the record lacks what a record has.
+    """
     if "settings" in content:
         return "settings", dict(content["settings"])
-    return content["index"], _checked(content)
+    texts = ("kind", "verdict", "result")
+    good = type(content["index"]) is int and content["result"] in RESULTS
+    good &= all(isinstance(content[key], str) for key in texts)
+    good &= isinstance(content["snr"], int | float) and np.isfinite(content["snr"])
+    for probability, right in content["claims"]:
+        good &= isinstance(probability, int | float) and 0 <= probability <= 1
+        good &= isinstance(right, bool)
+    for key in ("faults", "causes"):
+        good &= isinstance(content[key], list) and all(isinstance(x, str) for x in content[key])
+    if not good:
+        raise TypeError("no record of a challenge")
+    return content["index"], content
 
 
 def _append(path, content):
@@ -653,19 +667,3 @@ def _wilson(right, n):
     if not n:
         return np.nan, np.nan, np.nan
     return right / n, *map(float, binom_conf_interval(right, n, interval="wilson"))
-
-
-def _checked(record):
-    """Return a record of a file, or raise where it lacks what a record has."""
-    texts = ("kind", "verdict", "result")
-    good = type(record["index"]) is int and record["result"] in RESULTS
-    good &= all(isinstance(record[key], str) for key in texts)
-    good &= isinstance(record["snr"], int | float) and np.isfinite(record["snr"])
-    for probability, right in record["claims"]:
-        good &= isinstance(probability, int | float) and 0 <= probability <= 1
-        good &= isinstance(right, bool)
-    for key in ("faults", "causes"):
-        good &= isinstance(record[key], list) and all(isinstance(x, str) for x in record[key])
-    if not good:
-        raise TypeError("no record of a challenge")
-    return record

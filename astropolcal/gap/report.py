@@ -182,25 +182,13 @@ def _nominal(model):
 
 def _where(diagnosis):
     """Return where the gap lies, after what may be it unless one wavelength has nearly all."""
-    alone, rest = _located(diagnosis.nominal)
+    model = diagnosis.nominal
+    alone, rest = _located(model)
     # what is at one wavelength is no perturbation with a law in wavelength
     is_there = alone and diagnosis.verdict == "unexplained"
-    return [*alone, *rest] if is_there else [*_courses(diagnosis), *alone, *rest]
-
-
-def _located(model):
-    """Return where the gap lies: a single wavelength that has nearly all of it, and the rest."""
-    nm = [f"{nm:.0f} nm" for nm in 1000 * model.problem.wavelength]
-    found = locate(model)
-    alone = [one for one in found if one["detail"] in nm and one["share"] > _ALONE]
-    return alone, [one for one in found if one not in alone]
-
-
-def _courses(diagnosis):
-    """Return what may be in place of all causes, as places where the gap lies."""
-    model = diagnosis.nominal
     excess = max(model.fit.chi2 - model.linear.freedom, 1e-300)
-    return [
+    # what may be in place of all causes
+    courses = [
         {
             "axis": "course",
             "detail": f"{one.words}: {one.shape}" if one.shape else one.words,
@@ -209,8 +197,17 @@ def _courses(diagnosis):
             "kind": "place",
             "cell": {"place": one.place, "kind": one.kind, "dependence": None},
         }
-        for one in diagnosis.courses
+        for one in ([] if is_there else diagnosis.courses)
     ]
+    return [*courses, *alone, *rest]
+
+
+def _located(model):
+    """Return where the gap lies: a single wavelength that has nearly all of it, and the rest."""
+    nm = [f"{nm:.0f} nm" for nm in 1000 * model.problem.wavelength]
+    found = locate(model)
+    alone = [one for one in found if one["detail"] in nm and one["share"] > _ALONE]
+    return alone, [one for one in found if one not in alone]
 
 
 def _double(fitted, before, after):
@@ -695,16 +692,15 @@ def _prepared(observations):
 
 
 def _images(figures):
-    drawn = list((figures or {}).items())
-    return {name: _image(figure) for name, figure in progress.steps(drawn, "figures")}
-
-
-def _image(figure):
-    """Return a figure as data URIs, wide and narrow, with its width and height in CSS pixels."""
-    width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
-    found = {"width": width, "height": height, "source": figure_source(figure, _DPI)}
-    with _narrow(figure):
-        return found | {"narrow": figure_source(figure, _FINE)}
+    """Return figures as data URIs, wide and narrow, with their width and height in CSS pixels."""
+    found = {}
+    for name, figure in progress.steps(list((figures or {}).items()), "figures"):
+        width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
+        source = figure_source(figure, _DPI)
+        found[name] = {"width": width, "height": height, "source": source}
+        with _narrow(figure):
+            found[name]["narrow"] = figure_source(figure, _FINE)
+    return found
 
 
 def figure_source(figure, dpi):

@@ -115,13 +115,9 @@ def frame_groups(observations):
             labels = [f"derotator at {value:g} deg" for value in np.round(middle, 1)]
             ends = np.cumsum([o.n_frames for o in observations])[:-1]
             return labels, np.split(number, ends)
-    return _blocks(observations)
-
-
-def _blocks(observations, count=8):
-    """Return blocks of frames that were taken one after the other."""
+    # blocks of frames that were taken one after the other, no more than eight
     shortest = min(observations, key=lambda o: o.n_frames)
-    count = min(count, shortest.n_frames // 4)
+    count = min(8, shortest.n_frames // 4)
     if count < 3:
         least = f"twelve frames of {shortest.name}"
         if any("derotator" in o.frame_columns for o in observations):

@@ -168,6 +168,7 @@ def _is_known(observations):
 def _fitted(arguments, chains, datasets, positions, instrument):
     """Return the fit of all that is free, or of what changed since another calibration."""
     from astropolcal.calibration import Calibration, calibrate
+    from astropolcal.measurement import parameter_table
     from astropolcal.pipeline import restart
 
     options = {key: getattr(arguments, key) for key in ("weights", "loss", "errors", "gauge")}
@@ -177,7 +178,12 @@ def _fitted(arguments, chains, datasets, positions, instrument):
         old = Calibration.read(arguments.start)
         return restart(old, datasets, arguments.free, chain=chains, **options)
     options |= {"strategy": arguments.strategy, "observable": arguments.observable}
-    options |= {"fix": _held(arguments, chains), "instrument": instrument.name}
+    # what was fixed by name, as the gauge is to name it; a --prior frees one parameter of an optic
+    # that --fix holds
+    held, loose = ({t.partition("=")[0] for t in a} for a in (arguments.fix, arguments.prior))
+    known = {name: {name, name.partition(".")[0]} for name in parameter_table(chains)}
+    found = [name for name, names in known.items() if names & held and not names & loose]
+    options |= {"fix": dict.fromkeys(found) or None, "instrument": instrument.name}
     return calibrate(chains, datasets, own=_own(arguments.own), **options)
 
 
@@ -206,18 +212,6 @@ def _check_start(arguments):
         raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")
     if not arguments.free:
         raise AstropolcalError("--start holds everything: say with --free NAME what may change")
-
-
-def _held(arguments, chains):
-    """Return the parameters that were fixed by name, as the gauge is to name them."""
-    from astropolcal.measurement import parameter_table
-
-    # a --prior frees one parameter of an optic that --fix holds
-    held = {text.partition("=")[0] for text in arguments.fix}
-    loose = {text.partition("=")[0] for text in arguments.prior}
-    own = {name: {name, name.partition(".")[0]} for name in parameter_table(chains)}
-    found = [name for name, names in own.items() if names & held and not names & loose]
-    return dict.fromkeys(found) or None
 
 
 def _target(text):

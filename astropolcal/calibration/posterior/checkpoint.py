@@ -32,23 +32,6 @@ _LEAST_BLOCK = 512  # of HDF5, before its structures; larger ones are twice, fou
 _LONGEST = 2**29  # bytes that may say of which run the steps are
 
 
-def _step(n_walkers, n_parameters):
-    """Return how a step is kept: little-endian on any machine, so that a run may move."""
-    fields = [
-        ("coords", "<f8", (n_walkers, n_parameters)),
-        ("log_prob", "<f8", n_walkers),
-        # how often each walker has moved so far
-        ("accepted", "<i8", n_walkers),
-        # what else the state of the generator holds
-        ("generator", "<f8", 3),
-        ("keys", "<u4", _KEYS),
-        # counted from 1: what was never written is no step
-        ("number", "<u4"),
-        ("crc", "<u4"),
-    ]
-    return np.dtype(fields)
-
-
 def _crc(step, before):
     """Return the CRC of a step, which goes on from that of the step before."""
     return zlib.crc32(step.tobytes()[:-4], before)
@@ -61,7 +44,21 @@ class Chain:
     """
 
     def __init__(self, shape, every):
-        self._steps = np.zeros(shape[0], _step(*shape[1:]))
+        n_kept, n_walkers, n_parameters = shape
+        # how a step is kept: little-endian on any machine, so that a run may move
+        fields = [
+            ("coords", "<f8", (n_walkers, n_parameters)),
+            ("log_prob", "<f8", n_walkers),
+            # how often each walker has moved so far
+            ("accepted", "<i8", n_walkers),
+            # what else the state of the generator holds
+            ("generator", "<f8", 3),
+            ("keys", "<u4", _KEYS),
+            # counted from 1: what was never written is no step
+            ("number", "<u4"),
+            ("crc", "<u4"),
+        ]
+        self._steps = np.zeros(n_kept, fields)
         self.coords, self.log_prob = self._steps["coords"], self._steps["log_prob"]
         self.every = every
         self.count = self.saved = 0
