@@ -315,7 +315,12 @@ def _estimated(model, frames, brightness, how, mode):
     # raises where the frames determine too little, whatever their brightness
     estimator(rows, scale=frames.scale, **how)
     frames, doubts = _with_brightness(frames, rows, brightness, how)
-    solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
+    if mode != "stokes":
+        ideal = ideal_chain(model.chain, frames.wavelength)
+        ideal = RowModel(ideal, frames.positions, frames.wavelength, chain=ideal).rows()
+        # what I adds to each flux is that of the real instrument: the instrumental polarization
+        rows = np.concatenate([rows[..., :1], ideal[..., 1:]], axis=-1)
+    solution = estimator(rows, scale=frames.scale, **how)
     weak = [w for w, words in enumerate(solution.weak) if words]
     if weak:
         doubts += [
@@ -446,15 +451,6 @@ def _beyond(what, names, off, noise, free, own, known, least=0.0):
                 f"{usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too small"
             ]
     return []
-
-
-def _rows(model, rows, frames, mode):
-    if mode == "stokes":
-        return rows
-    ideal = ideal_chain(model.chain, frames.wavelength)
-    ideal_rows = RowModel(ideal, frames.positions, frames.wavelength, chain=ideal).rows()
-    # what I adds to each flux is that of the real instrument: the instrumental polarization
-    return np.concatenate([rows[..., :1], ideal_rows[..., 1:]], axis=-1)
 
 
 def _provenance(calibration, frames, systematic, given):
