@@ -27,6 +27,7 @@ from astropolcal.optics._modelling import (
     add_parameters,
     deep_copied,
     values_text,
+    with_values,
 )
 from astropolcal.optics.curves import curve_of
 from astropolcal.optics.positions import COORDINATES, PLACES, finite_position
@@ -167,11 +168,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             raise ParameterError(
                 f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
             )
-        values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
-        spectra = {key: x for key, x in values.items() if hasattr(x, "spectral_axis")}
-        spectra = {key: _of_spectrum(spectrum) for key, spectrum in spectra.items()}
-        values |= {key: value for key, (_, value, _) in spectra.items()}
-        values = {key: self._at_the_door(key, value) for key, value in values.items()}
+        given = {key: _given(kwargs.pop(key)) for key in self.param_names if key in kwargs}
+        values = {key: self._at_the_door(key, value) for key, (_, value, _) in given.items()}
         settings = {
             key: kwargs.pop(key, setting.default)
             for key, setting in self._declared_settings.items()
@@ -190,9 +188,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in self.param_names if wavelength is not None else ():
             if getattr(self, key).size > 1:
                 getattr(self, key).wavelength = wavelength
-        for key, (grid, _, std) in spectra.items():
+        self._note_spectra(given)
+
+    def _note_spectra(self, given):
+        """Keep wavelengths and standard deviations of what was given as a spectrum."""
+        for key, (grid, _, std) in given.items():
             parameter = getattr(self, key)
-            parameter.wavelength = grid if parameter.shape else None
+            if grid is not None:
+                parameter.wavelength = grid if parameter.shape else None
             parameter.std = None if std is None else to_unit(std, parameter.unit, f"{key}.std")
 
     def _check_names(self, kwargs):
@@ -695,18 +698,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in set(self.param_names) - set(values):
             self._check_unit(key, getattr(self, key).unit)
             current[key] = getattr(self, key).value * (self._declared(key).unit or 1)
-        values = current | values
-        own = {key: values.pop(key) for key in type(self).param_names}
-        new = type(self)(**own, **self._settings())
-        for key, law in self._follows.items():
-            new._follow(key, law, [with_value(getattr(self, k), values[k]) for k in law.names(key)])
-        for key in self.param_names:
-            old, fresh = getattr(self, key), getattr(new, key)
-            fresh.fixed, fresh.bounds = old.fixed, old.bounds
-            fresh.tied, fresh.prior = old.tied, old.prior
-            if fresh.shape == old.shape and fresh.grid is None:
-                fresh.grid = old.grid
-        new._position, new._places = self._position, self._places
+        given = {key: _given((current | values)[key]) for key in self.param_names}
+        checked = (self._at_the_door(key, value) for key, (_, value, _) in given.items())
+        units = [self._declared(key).unit for key in given]
+        # a copy, which keeps all else that the class of a user may hold
+        new = with_values(self, [getattr(x, "value", x) for x in checked], units)
+        for key in given:
+            if getattr(new, key).shape != getattr(self, key).shape:
+                getattr(new, key).grid = None
+        new._note_spectra({key: given[key] for key in values})
         return new
 
     def resampled(self, wavelength):
@@ -816,10 +816,16 @@ class Inverse(FittableModel):
 Inverse.__or__ = joined
 
 
-def _of_spectrum(spectrum):
-    """Return wavelengths, increasing, values and standard deviations (or None) of a spectrum."""
+def _given(value):
+    """Return wavelengths, increasing, values and standard deviations of a spectrum.
+
+    Of anything else it is the value, between None and None.
+    """
+    if not hasattr(value, "spectral_axis"):
+        return None, value, None
     from astropy.nddata import StdDevUncertainty
 
+    spectrum = value
     wavelength = u.Quantity(spectrum.spectral_axis).to(u.um, u.spectral())
     order, std = np.argsort(wavelength), spectrum.uncertainty
     if spectrum.mask is not None and np.any(spectrum.mask):
