@@ -137,11 +137,16 @@ class OpticParameter(Parameter):
 
     @Parameter.bounds.setter
     def bounds(self, value):
-        unit = u.one if self.unit is None else self.unit
-        plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
+        label = f"bounds of {self.name}"
+        plain = [to_unit(b, self.unit, label) if isinstance(b, u.Quantity) else b for b in value]
         if any(b != b for b in plain):
-            raise ParameterError(f"bounds of {self.name} = {value}; allowed are numbers and None")
-        Parameter.bounds.fset(self, plain)
+            raise ParameterError(f"{label} = {value}; allowed are numbers and None")
+        Parameter.bounds.fset(self, [float(b) if isinstance(b, np.ndarray) else b for b in plain])
+
+    @Parameter.quantity.setter
+    def quantity(self, value):
+        # astropy would adopt its unit and leave the bounds behind
+        self.value = to_unit(value, self.unit, self.name)
 
 
 class _Ties(_ConstraintsDict):

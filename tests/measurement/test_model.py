@@ -386,6 +386,24 @@ def test_bounds_are_converted(chain, observations):
     assert measurement.wollaston_efficiency_1.bounds == (0.0, 1.0)
 
 
+def test_the_quantity_of_a_parameter_may_be_set_in_any_unit(chain, observations):
+    measurement, curve = Measurement(chain, observations), chain["hwp"].curve("retardance")
+    for model, name in (
+        (measurement, "hwp_w_sio2"),
+        (chain["hwp"], "w_sio2"),
+        (chain, "w_sio2_1"),
+        (curve, "w_sio2"),
+    ):
+        parameter = getattr(model, name)
+        parameter.quantity = 1640 * u.um
+        assert parameter.value == pytest.approx(1.64), name
+        assert parameter.unit == u.mm, name
+        with pytest.raises(ParameterError, match="unit deg, which is not convertible to mm"):
+            parameter.quantity = 1 * u.deg
+    expected = Measurement(chain, observations).predict(measurement.vector())
+    np.testing.assert_allclose(measurement(measurement.index), expected, rtol=0, atol=1e-12)
+
+
 def test_fixed_parameters_are_left_out(chain, observations):
     free = set(Measurement(chain, observations).param_names)
     chain["hwp"].w_sio2.fixed = True
