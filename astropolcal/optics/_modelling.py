@@ -20,6 +20,7 @@ from astropy.modeling.utils import _ConstraintsDict
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import check_range, length_to_um, to_unit
+from astropolcal.words import did_you_mean
 
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
@@ -180,6 +181,16 @@ class LinearlyTied(OpticParameter):
         Parameter.tied.fset(self, value)
 
 
+def refuse_misspelt(model, attr, names):
+    """Refuse to set what is no attribute of a model, but nearly the name of a parameter."""
+    if attr[0] == "_" or attr in model.__dict__ or hasattr(type(model), attr):
+        return
+    # the parameter that was meant would keep its value without a word
+    near = did_you_mean(attr, names, cutoff=0.8)
+    if near:
+        raise ParameterError(f"{type(model).__name__}: no parameter {attr!r}{near}")
+
+
 def values_text(model):
     """Return the parameters of a model with their values and units."""
     parameters = ((key, getattr(model, key)) for key in model.param_names)
@@ -222,6 +233,10 @@ class ScalarParameters(OwnUnits, FittableModel):
     def param_names(self):
         """Names of the parameters."""
         return self._param_names
+
+    def __setattr__(self, attr, value):
+        refuse_misspelt(self, attr, self._param_names)
+        super().__setattr__(attr, value)
 
     def _hold(self, parameters):
         """Take on parameters by name, once astropy has set those it knows to their defaults."""

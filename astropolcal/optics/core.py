@@ -26,6 +26,7 @@ from astropolcal.optics._modelling import (
     Setting,
     add_parameters,
     deep_copied,
+    refuse_misspelt,
     values_text,
     with_values,
 )
@@ -236,11 +237,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"{self.__dict__[attr].shape}, not {np.shape(value)}; "
                     f"optic.with_parameters({attr}=...) returns a copy of another shape"
                 )
-        # a parameter whose name is misspelt would keep its value without a word
-        elif attr[0] != "_" and not hasattr(type(self), attr) and attr not in self.__dict__:
-            near = did_you_mean(attr, self.param_names, cutoff=0.8)
-            if near:
-                raise ParameterError(f"{type(self).__name__}: no parameter {attr!r}{near}")
+        else:
+            refuse_misspelt(self, attr, self.param_names)
         super().__setattr__(attr, value)
 
     __deepcopy__ = deep_copied
@@ -879,11 +877,13 @@ class Chain(OwnUnits, CompoundModel):
         return self
 
     def __setattr__(self, attr, value):
-        if attr in (self.__dict__.get("_param_names") or ()):
+        names = self.__dict__.get("_param_names") or ()
+        if attr in names:
             # the optic checks value and unit
             index, key = self._param_map[attr]
             setattr(self._leaflist[index], key, value)
         else:
+            refuse_misspelt(self, attr, names)
             super().__setattr__(attr, value)
 
     def __iter__(self):
