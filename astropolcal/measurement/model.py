@@ -197,6 +197,7 @@ class Measurement(ScalarParameters):
 
     def without_units_for_data(self, **data):
         """Return the measurement as a fitter takes it: itself, with numbers in its units."""
+        self.check_start()
         unit = getattr(data[self.outputs[0]], "unit", u.one)
         if unit != u.one:
             raise ParameterError(f"the data are in {unit}; observables are plain numbers")

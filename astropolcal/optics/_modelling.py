@@ -219,6 +219,16 @@ class OwnUnits:
         """Return the fitted model: itself."""
         return self
 
+    def check_start(self):
+        """Refuse values and bounds of which some fitters make others without a word."""
+        for key in self.param_names:
+            parameter = getattr(self, key)
+            value, (low, high) = parameter.value, parameter.bounds
+            if not np.isfinite(value).all():
+                raise ParameterError(f"{key} = {value}; a fit starts at finite numbers")
+            if not (parameter.fixed or low is None or high is None or low < high):
+                raise ParameterError(f"bounds of {key} = {low}, {high}; the lower one is first")
+
 
 class ScalarParameters(OwnUnits, FittableModel):
     """A model of one input and one output that is given its parameters one by one, all scalars."""

@@ -863,6 +863,12 @@ class Chain(OwnUnits, CompoundModel):
                     f"{key} has one value per wavelength, and no fitter of astropy takes a model "
                     "with such a parameter, not even a fixed one; astropolcal.calibrate does"
                 )
+        if (self.n_inputs, self.n_outputs) != (1, 1):
+            raise ParameterError(
+                f"a chain of {self.n_inputs} inputs and {self.n_outputs} outputs; fitters take one "
+                "of 1 and 1, such as Light(Q=1) | optic | Mapping((2,), n_inputs=5)"
+            )
+        self.check_start()
         inputs = [
             data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
             for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()

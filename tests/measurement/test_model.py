@@ -596,6 +596,9 @@ def test_what_a_fit_does_not_take_is_refused(chain, observations):
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="the data are in %; observables are plain numbers"):
         TRFLSQFitter()(measurement, measurement.index, measurement.observed * u.percent)
+    measurement.polarizer_theta.value = np.nan
+    with pytest.raises(ParameterError, match="polarizer_theta = nan; a fit starts at finite"):
+        LevMarLSQFitter()(measurement, measurement.index, measurement.observed)
     # a callable tie, when it is set
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="hwp_w_sio2: a measurement takes no callable tie"):

@@ -337,6 +337,7 @@ def _check(measurement):
         # fitters tell neither name nor value
         allowed = f"{low:.7g} to {high:.7g} {unit}".strip()
         raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
+    measurement.check_start()
     # fitters refuse a start that is outside by a rounding error, too
     measurement.stand_at(np.clip(measurement.vector(), *measurement.free.bounds()))
     _check_derivatives(measurement)
