@@ -21,7 +21,7 @@ from importlib.metadata import version as installed
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
-from astropy.modeling.fitting import TRFLSQFitter
+from astropy.modeling.fitting import LinearLSQFitter, TRFLSQFitter
 
 from astropolcal.calibration.fit.branches import ROUNDED, BinProblem, bent_valleys, undecided_signs
 from astropolcal.calibration.fit.strategies import (
@@ -258,8 +258,11 @@ def fitted(
     """Fit a measurement as `calibrate` does; ``held`` are the names of what was fixed for it."""
     started, chosen = time.perf_counter(), DEFAULTS if chosen is None else chosen
     fitter = TRFLSQFitter() if fitter is None else fitter
-    if isinstance(fitter, type) or not callable(fitter):
-        raise FitError(f"fitter = {fitter!r}; allowed are astropy's, such as TRFLSQFitter()")
+    # a linear one takes no steps
+    if isinstance(fitter, (type, LinearLSQFitter)) or not callable(fitter):
+        raise FitError(
+            f"fitter = {fitter!r}; allowed are astropy's non-linear ones, such as TRFLSQFitter()"
+        )
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
