@@ -111,7 +111,7 @@ class Measurement(ScalarParameters):
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
         self.free = FreeParameters(self._chains, len(self.wavelength), ties)
-        self.free.check_wavelengths(self.wavelength)
+        self.free.check_data(self.wavelength)
         self.datasets = [
             Dataset(item, obs, self.observable, self.free, self.wavelength, position)
             for item, obs, position in pairs

@@ -201,6 +201,16 @@ def test_two_datasets_share_their_optics(make_chain, frames):
     np.testing.assert_allclose(measurement.jacobian(measurement.vector()), both, atol=1e-14)
 
 
+def test_what_is_fixed_has_one_value_in_all_datasets(make_chain, observations):
+    pair = [make_chain(), make_chain()]
+    # by rounding alone, as values in another unit
+    pair[1]["hwp"].theta = 1e-15 * u.deg
+    Measurement(pair, [observations, observations])
+    pair[1]["hwp"].theta = 2 * u.deg
+    with pytest.raises(ParameterError, match=r"hwp.theta is fixed and differs between datasets"):
+        Measurement(pair, [observations, observations])
+
+
 def test_two_datasets_with_one_chain(chain, observations):
     double = Measurement(chain, [observations, observations])
     single = Measurement(chain, observations)
