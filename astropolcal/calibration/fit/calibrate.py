@@ -74,6 +74,8 @@ DEFAULTS = {key: next(iter(allowed)) for key, allowed in _CHOICES.items()}
 _ROBUST_ROUNDS = 50
 # the optics of this package are tested; step, in degrees, micrometres or percent, for others
 _OWN, _DIFFERENCE, _DIFFERS = __name__.partition(".")[0], 1e-4, 1e-2
+# and how many of them away from bounds
+_INSIDE = 100
 
 
 @in_one_thread
@@ -350,10 +352,13 @@ def _check_derivatives(measurement):
     """Hold derivatives of optics from elsewhere against differences: all errors stand on them."""
     found = (leaf for chain in measurement.chains for leaf in leaves(chain))
     foreign = {leaf.name for leaf in found if type(leaf).__module__.partition(".")[0] != _OWN}
-    free, vector = measurement.free, measurement.vector()
+    free, (low, high) = measurement.free, measurement.free.bounds()
     for slot in (s for s in free.slots if s.name.partition(".")[0] in foreign):
-        step = np.zeros(free.size)
+        step, vector = np.zeros(free.size), measurement.vector()
         step[slot.slice] = _DIFFERENCE * free.steps[slot.slice]
+        # beyond a bound there may be no matrix, and at it no derivative
+        room = np.minimum(_INSIDE * step, (high - low) / 2)
+        vector = np.clip(vector, low + room, high - room)
         change = (measurement.predict(vector + step) - measurement.predict(vector - step)) / 2
         told = step @ measurement.jacobian(vector)
         worst = int(np.argmax(np.abs(change - told)))
