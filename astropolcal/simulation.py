@@ -189,8 +189,11 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     shape = (len(wavelength), len(frames))
     right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
     # a beam that is extinguished may be below zero by a rounding error
-    if min(right.min(), left.min()) < -_ROUNDING:
-        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
+    least = np.min([right, left])
+    # written so that NaN is refused
+    if not least >= -_ROUNDING:
+        what = "flux that is no number" if np.isnan(least) else "negative flux"
+        raise ParameterError(f"the chain gives {what}: it is not physical", argument="chain")
     return right.clip(0.0), left.clip(0.0)
 
 

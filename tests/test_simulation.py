@@ -194,6 +194,19 @@ def test_unphysical_chain_is_refused(frames):
     with pytest.raises(ParameterError, match="negative flux"):
         simulate(chain, 1.6 * u.um, frames)
 
+    class Broken(optics.Optic):
+        """Of a user, with a mistake."""
+
+        def _matrix(self, dispersion):
+            return np.nan * np.eye(4)
+
+        def _derivatives(self, dispersion):
+            return ()
+
+    for noise in (True, False):
+        with pytest.raises(ParameterError, match="flux that is no number"):
+            simulate(Broken() | optics.WollastonPrism(), 1.6 * u.um, frames, noise=noise)
+
 
 def test_values_per_wavelength_are_those_of_ascending_wavelengths(chain, frames):
     """As a calibration takes them, whatever the order of the rows."""
