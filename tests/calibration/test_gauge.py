@@ -290,6 +290,7 @@ def test_nonsense_is_refused(observations):
         ({"ties": {"hwp.theta": "derotator.theta"}}, ParameterError, "of type str; a Tie is"),
         ({"ties": {"hwp.theta": "x"}, "own": "derotator.theta"}, ParameterError, "a Tie is"),
         ({"fitter": "TRF"}, FitError, "fitter = 'TRF'; allowed are astropy's"),
+        ({"instrument": CHARIS}, FitError, "instrument is of type CHARIS; its name is needed"),
         ({"fitter": LinearLSQFitter()}, FitError, "allowed are astropy's non-linear ones"),
         ({"fitter": TRFLSQFitter}, FitError, "fitter = .*TRFLSQFitter.*; allowed are astropy's"),
     ]:

@@ -62,7 +62,7 @@ from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import parameters_named, with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, check_type
 
 __all__ = ["calibrate"]
 
@@ -259,6 +259,7 @@ def fitted(
 ):
     """Fit a measurement as `calibrate` does; ``held`` are the names of what was fixed for it."""
     started, chosen = time.perf_counter(), DEFAULTS if chosen is None else chosen
+    check_type("instrument", instrument, str | None, "its name is needed", FitError)
     fitter = TRFLSQFitter() if fitter is None else fitter
     # a linear one takes no steps
     if isinstance(fitter, (type, LinearLSQFitter)) or not callable(fitter):
