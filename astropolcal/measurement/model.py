@@ -45,7 +45,7 @@ class Measurement(ScalarParameters):
         differences, of tables without a column ``hwp`` single ones, and of single beams the
         intensity.
     positions : sequence of dict, optional
-        For each dataset the position of every stage in radian, shape
+        For each dataset the position of every stage, a Quantity or in radian, shape
         (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of each
         exposure; by default as the instrument that the table names reads it
         (of a star with the tracking of the half-wave plate), or the columns.

@@ -302,6 +302,23 @@ def test_given_positions_replace_the_columns(chain, observations):
     np.testing.assert_allclose(
         by_position.predict(by_position.vector()), by_theta.predict(by_theta.vector()), atol=1e-13
     )
+    units = {stage: (angle * u.rad).to(u.deg) for stage, angle in moved.items()}
+    by_unit = Measurement(
+        chain, observations, positions=[units | {"hwp": units["hwp"] - 2 * u.deg}]
+    )
+    np.testing.assert_allclose(
+        by_unit.predict(by_unit.vector()), by_theta.predict(by_theta.vector()), atol=1e-13
+    )
+    for wrong, error, words in (
+        (units["hwp"].value * u.m, ParameterError, "position of hwp has unit m, which is not conv"),
+        (
+            units["hwp"][:3],
+            ObservationError,
+            r"hwp has positions of shape \(3,\); allowed are \(40",
+        ),
+    ):
+        with pytest.raises(error, match=words):
+            Measurement(chain, observations, positions=[units | {"hwp": wrong}])
 
 
 def test_observable_may_be_an_object(chain, observations):
