@@ -349,7 +349,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if np.any(length > 1 + _ROUNDING):
             what = self._components[0] if len(where) == 1 else "diattenuation"
             raise ParameterError(
-                f"{self._label}: the {what} is {np.max(length):.4g}; allowed is 1 at most"
+                f"{self._label}: the {what} is {np.max(length):.10g}; allowed is 1 at most"
             )
         return values
 
