@@ -194,7 +194,7 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     least = np.min([right, left])
     # written so that NaN is refused
     if not least >= -_ROUNDING:
-        what = "flux that is no number" if np.isnan(least) else "negative flux"
+        what = "flux that is not a number" if np.isnan(least) else "negative flux"
         raise ParameterError(f"the chain gives {what}: it is not physical", argument="chain")
     return right.clip(0.0), left.clip(0.0)
 

@@ -218,7 +218,7 @@ def test_unphysical_chain_is_refused(frames):
             return ()
 
     for noise in (True, False):
-        with pytest.raises(ParameterError, match="flux that is no number"):
+        with pytest.raises(ParameterError, match="flux that is not a number"):
             simulate(Broken() | optics.WollastonPrism(), 1.6 * u.um, frames, noise=noise)
 
 

@@ -182,7 +182,7 @@ class LinearlyTied(OpticParameter):
 
 
 def refuse_misspelt(model, attr, names):
-    """Refuse to set what is no attribute of a model, but nearly the name of a parameter."""
+    """Refuse to set what is not an attribute of a model, but nearly a parameter of it."""
     if attr[0] == "_" or attr in model.__dict__ or hasattr(type(model), attr):
         return
     # the parameter that was meant would keep its value without a word
