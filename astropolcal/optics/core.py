@@ -566,6 +566,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # for compound models of astropy; a `Chain` has its own way
         return {key: unit for key in self.param_names if (unit := self._declared(key).unit)}
 
+    def without_units_for_data(self, **data):
+        """Raise, as no optic alone is what a fitter takes."""
+        refuse_light(self)
+
     def prepare_inputs(self, wavelength, *light, **kwargs):
         """Return what `evaluate` takes, as astropy does; refuse a wavelength without unit."""
         length_to_um(wavelength)
@@ -840,6 +844,15 @@ def with_value(parameter, value):
     return new
 
 
+def refuse_light(model):
+    """Refuse to fit a model that takes or gives light; astropy would mix data and wavelengths."""
+    if (model.n_inputs, model.n_outputs) != (1, 1):
+        raise ParameterError(
+            f"a model of {model.n_inputs} inputs and {model.n_outputs} outputs; fitters take one "
+            "of 1 and 1, such as Light(Q=1) | optic | Mapping((2,), n_inputs=5)"
+        )
+
+
 def _singular(matrix):
     return np.any(np.linalg.cond(matrix) > 1e12)
 
@@ -863,11 +876,7 @@ class Chain(OwnUnits, CompoundModel):
                     f"{key} has one value per wavelength, and no fitter of astropy takes a model "
                     "with such a parameter, not even a fixed one; astropolcal.calibrate does"
                 )
-        if (self.n_inputs, self.n_outputs) != (1, 1):
-            raise ParameterError(
-                f"a chain of {self.n_inputs} inputs and {self.n_outputs} outputs; fitters take one "
-                "of 1 and 1, such as Light(Q=1) | optic | Mapping((2,), n_inputs=5)"
-            )
+        refuse_light(self)
         self.check_start()
         inputs = [
             data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)

@@ -111,6 +111,8 @@ def test_what_no_fit_can_start_from_is_refused_by_every_fitter():
                     fitter(model, WAVELENGTH, data)
         with pytest.raises(ParameterError, match="of 1 inputs and 5 outputs; fitters take one of"):
             fitter(optics.Light(Q=1) | plate(), WAVELENGTH, flux)
+        with pytest.raises(ParameterError, match="of 5 inputs and 5 outputs; fitters take one of"):
+            fitter(plate(), WAVELENGTH, flux)
 
 
 def test_ties_are_in_the_unit_of_the_parameter():
