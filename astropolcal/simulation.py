@@ -11,7 +11,7 @@ from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state, modulator_states
 from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator, splits
-from astropolcal.units import check_seed, length_to_um, wavelengths_of
+from astropolcal.units import check_seed, length_to_um, to_unit, wavelengths_of
 from astropolcal.words import check_type
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
@@ -89,7 +89,7 @@ def simulate(
     frames : `~astropy.table.QTable`
         One row per frame: the position of every stage (``hwp``, ``derotator``,
         ...) and any other column of the table.
-    flux : float or array_like
+    flux : float, array_like or `~astropy.units.Quantity`
         Flux that enters the chain, in adu; scalar or one value per wavelength.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
@@ -143,10 +143,12 @@ def simulate(
     fluxes = expected_fluxes(chain, wavelength, frames, source)[: len(names)]
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # photons arrive in electrons, whatever a camera counts in
-    electrons = np.stack([flux.T * scale for flux in fluxes]) * _positive("gain", gain)
+    gain = _positive("gain", gain, u.electron / u.adu)
+    read_noise = _positive("read_noise", read_noise, u.electron, zero=True)
+    electrons = np.stack([flux.T * scale for flux in fluxes]) * gain
     check_electrons(electrons)
     # of the expectation: an error from the drawn flux would be too small where that is low
-    variance = electrons + _positive("read_noise", read_noise, zero=True) ** 2
+    variance = electrons + read_noise**2
     if noise:
         rng = np.random.default_rng(seed)
         # one read noise a beam and frame, not a pixel
@@ -189,8 +191,11 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     shape = (len(wavelength), len(frames))
     right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
     # a beam that is extinguished may be below zero by a rounding error
-    if min(right.min(), left.min()) < -_ROUNDING:
-        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
+    least = np.min([right, left])
+    # written so that NaN is refused
+    if not least >= -_ROUNDING:
+        what = "flux that is not a number" if np.isnan(least) else "negative flux"
+        raise ParameterError(f"the chain gives {what}: it is not physical", argument="chain")
     return right.clip(0.0), left.clip(0.0)
 
 
@@ -211,8 +216,9 @@ def stage_positions(chain, frames):
     return positions | {s: in_state(frames, s, "frames") for s in known if "=" in s}
 
 
-def _positive(name, value, zero=False):
-    value = np.asarray(value, dtype=float)
+def _positive(name, value, unit=u.one, zero=False):
+    # a plain number is in that unit
+    value = to_unit(value, unit if hasattr(value, "unit") else u.one, name)
     if not np.all(np.isfinite(value)) or np.any(value < 0) or (not zero and np.any(value == 0)):
         raise ParameterError(
             f"{name} = {value} must be finite and {'not negative' if zero else 'positive'}"
@@ -240,7 +246,7 @@ def entering_flux(flux, lamp, n_frames, n_wavelengths):
     The flux is a scalar or one value per wavelength, the brightness of the lamp is relative, one
     per frame or None.
     """
-    flux = _positive("flux", flux)
+    flux = _positive("flux", flux, u.adu)
     lamp = _positive("lamp", np.ones(n_frames) if lamp is None else lamp)
     if flux.shape not in ((), (n_wavelengths,)) or lamp.shape != (n_frames,):
         raise ParameterError(

@@ -94,6 +94,20 @@ def test_errors_hold_photon_and_read_noise(chain, frames):
     np.testing.assert_allclose(observations.variance_right, expected, rtol=1e-12)
 
 
+def test_what_a_simulation_is_given_may_have_units(chain, frames):
+    one, count = {"seed": 1, "flux": 2e6, "gain": 2.0, "read_noise": 30.0}, len(frames)
+    plain = simulate(chain, WAVELENGTH, frames, **one, lamp=np.full(count, 0.5))
+    units = {"flux": u.adu, "gain": u.electron / u.adu, "read_noise": u.electron}
+    given = {key: one[key] * unit for key, unit in units.items()}
+    lamp = np.full(count, 50) * u.percent
+    found = simulate(chain, WAVELENGTH, frames, **given, seed=1, lamp=lamp)
+    np.testing.assert_allclose(found.flux_right, plain.flux_right, rtol=1e-12)
+    np.testing.assert_allclose(found.variance_right, plain.variance_right, rtol=1e-12)
+    for key in units:
+        with pytest.raises(ParameterError, match=f"{key} has unit s, which is not convertible"):
+            simulate(chain, WAVELENGTH, frames, **given | {key: 1 * u.s})
+
+
 def test_table_keeps_frames_meta_and_name(chain, frames):
     frames["time"] = np.arange(len(frames)) * u.s
     meta = {"source": "polarized", "instrument": "CHARIS"}
@@ -193,6 +207,19 @@ def test_unphysical_chain_is_refused(frames):
     chain = optics.LinearPolarizer(theta=90 * u.deg) | amplifier | optics.WollastonPrism()
     with pytest.raises(ParameterError, match="negative flux"):
         simulate(chain, 1.6 * u.um, frames)
+
+    class Broken(optics.Optic):
+        """Of a user, with a mistake."""
+
+        def _matrix(self, dispersion):
+            return np.nan * np.eye(4)
+
+        def _derivatives(self, dispersion):
+            return ()
+
+    for noise in (True, False):
+        with pytest.raises(ParameterError, match="flux that is not a number"):
+            simulate(Broken() | optics.WollastonPrism(), 1.6 * u.um, frames, noise=noise)
 
 
 def test_values_per_wavelength_are_those_of_ascending_wavelengths(chain, frames):

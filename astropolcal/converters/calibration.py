@@ -40,6 +40,14 @@ _PLAIN = ("at_bound", "settings", "fit", "provenance")
 
 def node_from_calibration(calibration):
     """Return the node of a calibration, as the newest schema describes it."""
+    node = _spelled(calibration)
+    for optic in (optic for chain in node["chains"] for optic in chain["optics"]):
+        nodes.refuse_foreign(optic)
+    return node
+
+
+def _spelled(calibration):
+    """Return the node of a calibration, of any optics."""
     check_calibration(calibration)
     chains, posterior = calibration.chains, calibration.posterior
     covariance = calibration.covariance
@@ -375,5 +383,8 @@ def _check_accuracy(table, name):
 
 
 def content_hash(calibration):
-    """Return the SHA-256 of all that a calibration file keeps, the ``checksum`` of the file."""
-    return node_from_calibration(calibration)["checksum"]
+    """Return the SHA-256 of all that a calibration file keeps, the ``checksum`` of the file.
+
+    A calibration in memory has one as well if its optics are of classes that files cannot hold.
+    """
+    return _spelled(calibration)["checksum"]

@@ -99,6 +99,11 @@ class ChainConverter(Converter):
     def to_yaml_tree(self, obj, tag, ctx):
         from astropy.modeling import CompoundModel
 
+        from astropolcal.converters.nodes import refuse_foreign
+        from astropolcal.optics import Optic
+
+        for optic in (model for model in obj if isinstance(model, Optic)):
+            refuse_foreign(optic)
         return CompoundModel(obj.op, obj.left, obj.right, name=obj.name)
 
     def from_yaml_tree(self, node, tag, ctx):

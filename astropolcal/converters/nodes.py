@@ -154,7 +154,7 @@ def _spelled(node):
             array.shape
         )
         return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
-    return _spelled(node_from_optic(node) if isinstance(node, Optic) else spelled_model(node))
+    return _spelled(spelled_optic(node) if isinstance(node, Optic) else spelled_model(node))
 
 
 # ---- priors in a calibration file ----
@@ -316,17 +316,33 @@ def check_posterior(posterior, covariance):
 
 def node_from_optic(optic):
     """Return the node of an optic, of a class in `astropolcal.optics.OPTICS`."""
-    cls = type(optic)
+    refuse_foreign(optic)
+    return spelled_optic(optic)
+
+
+def _is_foreign(optic):
     # a class of the same name from elsewhere would be read back as ours
-    if OPTICS.get(cls.__name__) is not cls:
+    return OPTICS.get(type(optic).__name__) is not type(optic)
+
+
+def refuse_foreign(optic):
+    """Raise for an optic of a class that files cannot hold."""
+    if _is_foreign(optic):
+        cls = type(optic)
         raise CalibrationFileError(
             f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
             f"which files cannot hold; allowed are {', '.join(OPTICS)}"
         )
-    settings = {key: value for key, value in optic._settings().items() if value is not None}
-    return settings | {
-        "parameters": {key: _parameter_node(optic, key) for key in type(optic).param_names}
-    }
+
+
+def spelled_optic(optic):
+    """Return what a checksum says of an optic, which is its node if files can hold it."""
+    cls = type(optic)
+    if _is_foreign(optic):
+        settings = {"class": f"{cls.__module__}.{cls.__qualname__}", "text": optic.fingerprint()}
+    else:
+        settings = {key: value for key, value in optic._settings().items() if value is not None}
+    return settings | {"parameters": {key: _parameter_node(optic, key) for key in cls.param_names}}
 
 
 def spelled_model(model):

@@ -20,7 +20,9 @@ from astropolcal.observations import Observations
 from astropolcal.observations.pointings import frame_names
 from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
+from astropolcal.optics.positions import PLACES
 from astropolcal.propagation import Propagator, splits
+from astropolcal.units import to_unit
 from astropolcal.words import check_type
 
 __all__ = []
@@ -261,9 +263,17 @@ def _positions(chain, observations, positions):
             with suppress(InstrumentError):
                 read = instruments.get(observations.instrument).positions
         positions = read(observations, chain)
-    found = {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}
-    used = ~observations.mask.all(axis=1)
-    for stage, angle in found.items():
+    found, used = {}, ~observations.mask.all(axis=1)
+    for stage, angle in positions.items():
+        unit = PLACES.get(stage) if stage in COORDINATES else u.rad
+        # a plain number is in that unit
+        angle = to_unit(angle, unit if hasattr(angle, "unit") else None, f"position of {stage}")
+        if angle.shape[-1:] != (observations.n_frames,):
+            raise ObservationError(
+                f"{observations.name}: {stage} has positions of shape {angle.shape}; allowed are "
+                f"({observations.n_frames},) and (nodes, {observations.n_frames})"
+            )
+        found[stage] = angle
         lost = used & ~np.isfinite(angle).reshape(-1, observations.n_frames).all(axis=0)
         if lost.any():
             frame = frame_names(observations.frames)[np.argmax(lost)]

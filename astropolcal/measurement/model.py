@@ -45,7 +45,7 @@ class Measurement(ScalarParameters):
         differences, of tables without a column ``hwp`` single ones, and of single beams the
         intensity.
     positions : sequence of dict, optional
-        For each dataset the position of every stage in radian, shape
+        For each dataset the position of every stage, a Quantity or in radian, shape
         (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of each
         exposure; by default as the instrument that the table names reads it
         (of a star with the tracking of the half-wave plate), or the columns.
@@ -111,7 +111,7 @@ class Measurement(ScalarParameters):
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
         self.free = FreeParameters(self._chains, len(self.wavelength), ties)
-        self.free.check_wavelengths(self.wavelength)
+        self.free.check_data(self.wavelength)
         self.datasets = [
             Dataset(item, obs, self.observable, self.free, self.wavelength, position)
             for item, obs, position in pairs
@@ -197,6 +197,7 @@ class Measurement(ScalarParameters):
 
     def without_units_for_data(self, **data):
         """Return the measurement as a fitter takes it: itself, with numbers in its units."""
+        self.check_start()
         unit = getattr(data[self.outputs[0]], "unit", u.one)
         if unit != u.one:
             raise ParameterError(f"the data are in {unit}; observables are plain numbers")

@@ -504,9 +504,15 @@ class FreeParameters:
             for parameter in self._table[slot.name]:
                 parameter.std = several if several is None or slot.size > 1 else float(several[0])
 
-    def check_wavelengths(self, wavelength):
-        """Refuse parameters that are known at other wavelengths (um) than those of the data."""
+    def check_data(self, wavelength):
+        """Refuse parameters of other wavelengths (um) than the data, or held at several values."""
         for name, parameters in self._table.items():
+            others = parameters[1:] if parameters[0].fixed else ()
+            if any(np.any(np.abs(p.value - parameters[0].value) > _ROUNDING) for p in others):
+                raise ParameterError(
+                    f"{name} is fixed and differs between datasets in its value; give all chains "
+                    "the same, or the optics different names"
+                )
             for parameter in parameters:
                 grid = parameter.grid
                 if grid is not None and not (

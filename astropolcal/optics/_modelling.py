@@ -20,6 +20,7 @@ from astropy.modeling.utils import _ConstraintsDict
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import check_range, length_to_um, to_unit
+from astropolcal.words import did_you_mean
 
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
@@ -137,11 +138,16 @@ class OpticParameter(Parameter):
 
     @Parameter.bounds.setter
     def bounds(self, value):
-        unit = u.one if self.unit is None else self.unit
-        plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
+        label = f"bounds of {self.name}"
+        plain = [to_unit(b, self.unit, label) if isinstance(b, u.Quantity) else b for b in value]
         if any(b != b for b in plain):
-            raise ParameterError(f"bounds of {self.name} = {value}; allowed are numbers and None")
-        Parameter.bounds.fset(self, plain)
+            raise ParameterError(f"{label} = {value}; allowed are numbers and None")
+        Parameter.bounds.fset(self, [float(b) if isinstance(b, np.ndarray) else b for b in plain])
+
+    @Parameter.quantity.setter
+    def quantity(self, value):
+        # astropy would adopt its unit and leave the bounds behind
+        self.value = to_unit(value, self.unit, self.name)
 
 
 class _Ties(_ConstraintsDict):
@@ -175,6 +181,16 @@ class LinearlyTied(OpticParameter):
         Parameter.tied.fset(self, value)
 
 
+def refuse_misspelt(model, attr, names):
+    """Refuse to set what is not an attribute of a model, but nearly a parameter of it."""
+    if attr[0] == "_" or attr in model.__dict__ or hasattr(type(model), attr):
+        return
+    # the parameter that was meant would keep its value without a word
+    near = did_you_mean(attr, names, cutoff=0.8)
+    if near:
+        raise ParameterError(f"{type(model).__name__}: no parameter {attr!r}{near}")
+
+
 def values_text(model):
     """Return the parameters of a model with their values and units."""
     parameters = ((key, getattr(model, key)) for key in model.param_names)
@@ -203,6 +219,16 @@ class OwnUnits:
         """Return the fitted model: itself."""
         return self
 
+    def check_start(self):
+        """Refuse values and bounds of which some fitters make others without a word."""
+        for key in self.param_names:
+            parameter = getattr(self, key)
+            value, (low, high) = parameter.value, parameter.bounds
+            if not np.isfinite(value).all():
+                raise ParameterError(f"{key} = {value}; a fit starts at finite numbers")
+            if not (parameter.fixed or low is None or high is None or low < high):
+                raise ParameterError(f"bounds of {key} = {low}, {high}; the lower one is first")
+
 
 class ScalarParameters(OwnUnits, FittableModel):
     """A model of one input and one output that is given its parameters one by one, all scalars."""
@@ -217,6 +243,10 @@ class ScalarParameters(OwnUnits, FittableModel):
     def param_names(self):
         """Names of the parameters."""
         return self._param_names
+
+    def __setattr__(self, attr, value):
+        refuse_misspelt(self, attr, self._param_names)
+        super().__setattr__(attr, value)
 
     def _hold(self, parameters):
         """Take on parameters by name, once astropy has set those it knows to their defaults."""

@@ -26,7 +26,9 @@ from astropolcal.optics._modelling import (
     Setting,
     add_parameters,
     deep_copied,
+    refuse_misspelt,
     values_text,
+    with_values,
 )
 from astropolcal.optics.curves import curve_of
 from astropolcal.optics.positions import COORDINATES, PLACES, finite_position
@@ -167,11 +169,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             raise ParameterError(
                 f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
             )
-        values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
-        spectra = {key: x for key, x in values.items() if hasattr(x, "spectral_axis")}
-        spectra = {key: _of_spectrum(spectrum) for key, spectrum in spectra.items()}
-        values |= {key: value for key, (_, value, _) in spectra.items()}
-        values = {key: self._at_the_door(key, value) for key, value in values.items()}
+        given = {key: _given(kwargs.pop(key)) for key in self.param_names if key in kwargs}
+        values = {key: self._at_the_door(key, value) for key, (_, value, _) in given.items()}
         settings = {
             key: kwargs.pop(key, setting.default)
             for key, setting in self._declared_settings.items()
@@ -190,9 +189,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in self.param_names if wavelength is not None else ():
             if getattr(self, key).size > 1:
                 getattr(self, key).wavelength = wavelength
-        for key, (grid, _, std) in spectra.items():
+        self._note_spectra(given)
+
+    def _note_spectra(self, given):
+        """Keep wavelengths and standard deviations of what was given as a spectrum."""
+        for key, (grid, _, std) in given.items():
             parameter = getattr(self, key)
-            parameter.wavelength = grid if parameter.shape else None
+            if grid is not None:
+                parameter.wavelength = grid if parameter.shape else None
             parameter.std = None if std is None else to_unit(std, parameter.unit, f"{key}.std")
 
     def _check_names(self, kwargs):
@@ -233,11 +237,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                     f"{self.__dict__[attr].shape}, not {np.shape(value)}; "
                     f"optic.with_parameters({attr}=...) returns a copy of another shape"
                 )
-        # a parameter whose name is misspelt would keep its value without a word
-        elif attr[0] != "_" and not hasattr(type(self), attr) and attr not in self.__dict__:
-            near = did_you_mean(attr, self.param_names, cutoff=0.8)
-            if near:
-                raise ParameterError(f"{type(self).__name__}: no parameter {attr!r}{near}")
+        else:
+            refuse_misspelt(self, attr, self.param_names)
         super().__setattr__(attr, value)
 
     __deepcopy__ = deep_copied
@@ -348,7 +349,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if np.any(length > 1 + _ROUNDING):
             what = self._components[0] if len(where) == 1 else "diattenuation"
             raise ParameterError(
-                f"{self._label}: the {what} is {np.max(length):.4g}; allowed is 1 at most"
+                f"{self._label}: the {what} is {np.max(length):.10g}; allowed is 1 at most"
             )
         return values
 
@@ -565,6 +566,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # for compound models of astropy; a `Chain` has its own way
         return {key: unit for key in self.param_names if (unit := self._declared(key).unit)}
 
+    def without_units_for_data(self, **data):
+        """Raise, as no optic alone is what a fitter takes."""
+        refuse_light(self)
+
     def prepare_inputs(self, wavelength, *light, **kwargs):
         """Return what `evaluate` takes, as astropy does; refuse a wavelength without unit."""
         length_to_um(wavelength)
@@ -695,18 +700,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in set(self.param_names) - set(values):
             self._check_unit(key, getattr(self, key).unit)
             current[key] = getattr(self, key).value * (self._declared(key).unit or 1)
-        values = current | values
-        own = {key: values.pop(key) for key in type(self).param_names}
-        new = type(self)(**own, **self._settings())
-        for key, law in self._follows.items():
-            new._follow(key, law, [with_value(getattr(self, k), values[k]) for k in law.names(key)])
-        for key in self.param_names:
-            old, fresh = getattr(self, key), getattr(new, key)
-            fresh.fixed, fresh.bounds = old.fixed, old.bounds
-            fresh.tied, fresh.prior = old.tied, old.prior
-            if fresh.shape == old.shape and fresh.grid is None:
-                fresh.grid = old.grid
-        new._position, new._places = self._position, self._places
+        given = {key: _given((current | values)[key]) for key in self.param_names}
+        checked = (self._at_the_door(key, value) for key, (_, value, _) in given.items())
+        units = [self._declared(key).unit for key in given]
+        # a copy, which keeps all else that the class of a user may hold
+        new = with_values(self, [getattr(x, "value", x) for x in checked], units)
+        for key in given:
+            if getattr(new, key).shape != getattr(self, key).shape:
+                getattr(new, key).grid = None
+        new._note_spectra({key: given[key] for key in values})
         return new
 
     def resampled(self, wavelength):
@@ -816,10 +818,16 @@ class Inverse(FittableModel):
 Inverse.__or__ = joined
 
 
-def _of_spectrum(spectrum):
-    """Return wavelengths, increasing, values and standard deviations (or None) of a spectrum."""
+def _given(value):
+    """Return wavelengths, increasing, values and standard deviations of a spectrum.
+
+    Of anything else it is the value, between None and None.
+    """
+    if not hasattr(value, "spectral_axis"):
+        return None, value, None
     from astropy.nddata import StdDevUncertainty
 
+    spectrum = value
     wavelength = u.Quantity(spectrum.spectral_axis).to(u.um, u.spectral())
     order, std = np.argsort(wavelength), spectrum.uncertainty
     if spectrum.mask is not None and np.any(spectrum.mask):
@@ -834,6 +842,15 @@ def with_value(parameter, value):
     new = copy(parameter)
     new._default = new.value = to_unit(value, parameter.unit, parameter.name)
     return new
+
+
+def refuse_light(model):
+    """Refuse to fit a model that takes or gives light; astropy would mix data and wavelengths."""
+    if (model.n_inputs, model.n_outputs) != (1, 1):
+        raise ParameterError(
+            f"a model of {model.n_inputs} inputs and {model.n_outputs} outputs; fitters take one "
+            "of 1 and 1, such as Light(Q=1) | optic | Mapping((2,), n_inputs=5)"
+        )
 
 
 def _singular(matrix):
@@ -859,6 +876,8 @@ class Chain(OwnUnits, CompoundModel):
                     f"{key} has one value per wavelength, and no fitter of astropy takes a model "
                     "with such a parameter, not even a fixed one; astropolcal.calibrate does"
                 )
+        refuse_light(self)
+        self.check_start()
         inputs = [
             data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
             for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()
@@ -873,11 +892,13 @@ class Chain(OwnUnits, CompoundModel):
         return self
 
     def __setattr__(self, attr, value):
-        if attr in (self.__dict__.get("_param_names") or ()):
+        names = self.__dict__.get("_param_names") or ()
+        if attr in names:
             # the optic checks value and unit
             index, key = self._param_map[attr]
             setattr(self._leaflist[index], key, value)
         else:
+            refuse_misspelt(self, attr, names)
             super().__setattr__(attr, value)
 
     def __iter__(self):

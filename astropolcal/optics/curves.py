@@ -105,6 +105,7 @@ class Curve(ScalarParameters):
 
     def without_units_for_data(self, **data):
         """Return the model as a fitter takes it: with values in the unit of the data."""
+        self.check_start()
         values = data[self.outputs[0]]
         if not isinstance(values, u.Quantity):
             return self

@@ -559,6 +559,31 @@ def test_wrong_derivatives_of_an_optic_of_a_user_are_refused(few):
             calibrate(chain, data, cross_validate=False)
 
 
+class Leaking(Fading):
+    """One that has no matrix beyond its bound, where it starts."""
+
+    share = Parameter(default=0.0, bounds=(0, 1), description="what leaks")
+
+    def _matrix(self, dispersion, share):
+        return super()._matrix(dispersion, 1 - np.sqrt(share))
+
+    def _derivatives(self, dispersion, share):
+        return (-0.5 / np.sqrt(max(share, 1e-8)) * super()._derivatives(dispersion, share)[0],)
+
+
+def test_derivatives_of_an_optic_that_starts_at_its_bound_are_held_against_differences(few):
+    chain, truth, data = few
+    chain = insert_optic(chain, Leaking(name="leaking"), before="wollaston")
+    chain["wollaston"].efficiency = truth["wollaston"].efficiency.value
+    chain["wollaston"].efficiency.fixed = True
+    found = calibrate(chain, data, cross_validate=False)
+    assert found.converged
+    assert found.chain["leaking"].share.value < 1e-6
+    chain["leaking"].wrong = 1.5
+    with pytest.raises(FitError, match=r"leaking.share: the derivative .* by up to \d.*, not \d"):
+        calibrate(chain, data, cross_validate=False)
+
+
 @pytest.mark.slow
 def test_names_alone_hold_parameters_where_they_start():
     chain = (

@@ -4,7 +4,12 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
+from astropy.modeling.fitting import (
+    DogBoxLSQFitter,
+    LevMarLSQFitter,
+    LinearLSQFitter,
+    TRFLSQFitter,
+)
 
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.calibration.fit.branches import BinProblem
@@ -285,6 +290,8 @@ def test_nonsense_is_refused(observations):
         ({"ties": {"hwp.theta": "derotator.theta"}}, ParameterError, "of type str; a Tie is"),
         ({"ties": {"hwp.theta": "x"}, "own": "derotator.theta"}, ParameterError, "a Tie is"),
         ({"fitter": "TRF"}, FitError, "fitter = 'TRF'; allowed are astropy's"),
+        ({"instrument": CHARIS}, FitError, "instrument is of type CHARIS; its name is needed"),
+        ({"fitter": LinearLSQFitter()}, FitError, "allowed are astropy's non-linear ones"),
         ({"fitter": TRFLSQFitter}, FitError, "fitter = .*TRFLSQFitter.*; allowed are astropy's"),
     ]:
         with pytest.raises(error, match=complaint):

@@ -19,6 +19,7 @@ from astropolcal.calibration import propagate
 from astropolcal.calibration.result.calibration import with_validity
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
+    insert_optic,
     join,
     leaves,
     system_mueller,
@@ -35,6 +36,7 @@ from astropolcal.exceptions import (
     ParameterError,
     WavelengthRangeError,
 )
+from astropolcal.optics import LinearRetarder
 from astropolcal.pipeline.library import Library
 from astropolcal.pipeline.loading import load
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -287,6 +289,21 @@ def test_calibration_in_memory(calibration, loaded):
     )
     with pytest.raises(CalibrationFileError, match="calibration in memory"):
         load(calibration, HEADER | {"MJD": 60400.0})
+
+
+def test_calibration_in_memory_has_optics_that_files_cannot_hold(calibration):
+    class Homemade(LinearRetarder):
+        """A retarder of a user."""
+
+    window = Homemade(retardance=20 * u.deg, fixed={"retardance": True}, name="window")
+    chains = [insert_optic(chain, window, before="wollaston") for chain in calibration.chains]
+    own = dataclasses.replace(calibration, chains=chains)
+    found = own.system_mueller(positions=POSITIONS, light="internal").value
+    expected = system_mueller(chains[0][1:], WAVELENGTH, POSITIONS)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    assert load(own).content_hash != load(calibration).content_hash
+    with pytest.raises(CalibrationFileError, match="Homemade, which files cannot hold"):
+        own.write("homemade.asdf")
 
 
 @pytest.mark.slow

@@ -236,6 +236,9 @@ class Homemade(optics.LinearRetarder):
 def test_optic_outside_the_registry_is_refused():
     with pytest.raises(CalibrationFileError, match=r"'mine' is a .*Homemade, which files cannot"):
         node_from_optic(Homemade(name="mine"))
+    chain = optics.Rotator(name="first") | Homemade(name="mine") | optics.WollastonPrism()
+    with pytest.raises(CalibrationFileError, match=r"'mine' is a .*Homemade, which files cannot"):
+        written(chain)
     # namesake of an optic is refused
     impostor = type("Rotator", (optics.LinearRetarder,), {})
     with pytest.raises(CalibrationFileError, match="which files cannot hold"):

@@ -698,6 +698,16 @@ def test_declarations_that_are_refused():
         Effect.insert(optics.LinearRetarder(retardance=9 * u.deg, name="x"), after="hwp")
     with pytest.raises(GapError, match="no parameter of ParityFlip is free"):
         Effect.insert(optics.ParityFlip(name="x"), after="hwp")
+    with pytest.raises(GapError, match="optic is of type Chain; a single Optic is needed"):
+        Effect.insert(film | optics.Rotator(name="x"), after="hwp")
+    for one, words in (
+        (Effect("a", "a", "after:hwp"), "effect a lacks kind"),
+        (Effect("a", "a", kind="gain"), "effect a lacks place"),
+        (Effect.insert(optics.Diattenuator(), after="hwp"), "lacks name"),
+    ):
+        for use in (register_effect, get_effect):
+            with pytest.raises(GapError, match=words):
+                use(one)
     with pytest.raises(GapError, match="give one of after=, before= and inside="):
         Effect.insert(optics.Diattenuator(name="x"))
 
@@ -725,6 +735,7 @@ def test_effects_of_ones_own():
         Effect.insert(optics.Diattenuator(name="a"), before="wollaston", limit=0.1),
         Effect.insert(optics.LinearRetarder(retardance=0 * u.deg, name="a"), inside="derotator"),
         Effect.insert(optics.BeamGain(name="a"), after="wollaston", degree="number"),
+        Effect.insert(optics.DiattenuatorRetarder(theta=20 * u.deg, name="a"), before="wollaston"),
     ]
     film = optics.Diattenuator(theta=30 * u.deg, name="a")
     some.append(Effect.insert(film, inside="derotator", limit=0.1))
@@ -732,6 +743,17 @@ def test_effects_of_ones_own():
         check_effect(effect, chains, data)
         if effect.kinds:
             assert len(effect.cells(chains)) == len(effect.kinds) * (1 + effect.around)
+    # sizes are by unit, and by name where they are given
+    given = {"limit": {"retardance": 40 * u.deg}, "scale": {"diattenuation": 0.001}}
+    for settings, expected in (
+        ({}, {"diattenuation": (0.02, 0.5), "retardance": (0.02 * u.rad, 0.5 * u.rad)}),
+        (given, {"diattenuation": (0.001, 0.5), "retardance": (4 * u.deg, 40 * u.deg)}),
+    ):
+        mirror = Effect.insert(
+            optics.DiattenuatorRetarder(name="a"), before="wollaston", **settings
+        )
+        found = mirror.edit(chains, context_of(data)).parameters
+        assert {p.name.partition(".")[2]: (p.scale, p.limit) for p in found} == expected
     # its axis is relative to that of the optic, also where that is free
     for fixed in (True, False):
         chain = chains[0].copy()

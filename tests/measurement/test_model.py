@@ -201,6 +201,16 @@ def test_two_datasets_share_their_optics(make_chain, frames):
     np.testing.assert_allclose(measurement.jacobian(measurement.vector()), both, atol=1e-14)
 
 
+def test_what_is_fixed_has_one_value_in_all_datasets(make_chain, observations):
+    pair = [make_chain(), make_chain()]
+    # by rounding alone, as values in another unit
+    pair[1]["hwp"].theta = 1e-15 * u.deg
+    Measurement(pair, [observations, observations])
+    pair[1]["hwp"].theta = 2 * u.deg
+    with pytest.raises(ParameterError, match=r"hwp.theta is fixed and differs between datasets"):
+        Measurement(pair, [observations, observations])
+
+
 def test_two_datasets_with_one_chain(chain, observations):
     double = Measurement(chain, [observations, observations])
     single = Measurement(chain, observations)
@@ -292,6 +302,23 @@ def test_given_positions_replace_the_columns(chain, observations):
     np.testing.assert_allclose(
         by_position.predict(by_position.vector()), by_theta.predict(by_theta.vector()), atol=1e-13
     )
+    units = {stage: (angle * u.rad).to(u.deg) for stage, angle in moved.items()}
+    by_unit = Measurement(
+        chain, observations, positions=[units | {"hwp": units["hwp"] - 2 * u.deg}]
+    )
+    np.testing.assert_allclose(
+        by_unit.predict(by_unit.vector()), by_theta.predict(by_theta.vector()), atol=1e-13
+    )
+    for wrong, error, words in (
+        (units["hwp"].value * u.m, ParameterError, "position of hwp has unit m, which is not conv"),
+        (
+            units["hwp"][:3],
+            ObservationError,
+            r"hwp has positions of shape \(3,\); allowed are \(40",
+        ),
+    ):
+        with pytest.raises(error, match=words):
+            Measurement(chain, observations, positions=[units | {"hwp": wrong}])
 
 
 def test_observable_may_be_an_object(chain, observations):
@@ -384,6 +411,24 @@ def test_bounds_are_converted(chain, observations):
     measurement.polarizer_theta.bounds = (1.5, 1.6) * u.rad
     np.testing.assert_allclose(measurement.polarizer_theta.bounds, np.rad2deg([1.5, 1.6]))
     assert measurement.wollaston_efficiency_1.bounds == (0.0, 1.0)
+
+
+def test_the_quantity_of_a_parameter_may_be_set_in_any_unit(chain, observations):
+    measurement, curve = Measurement(chain, observations), chain["hwp"].curve("retardance")
+    for model, name in (
+        (measurement, "hwp_w_sio2"),
+        (chain["hwp"], "w_sio2"),
+        (chain, "w_sio2_1"),
+        (curve, "w_sio2"),
+    ):
+        parameter = getattr(model, name)
+        parameter.quantity = 1640 * u.um
+        assert parameter.value == pytest.approx(1.64), name
+        assert parameter.unit == u.mm, name
+        with pytest.raises(ParameterError, match="unit deg, which is not convertible to mm"):
+            parameter.quantity = 1 * u.deg
+    expected = Measurement(chain, observations).predict(measurement.vector())
+    np.testing.assert_allclose(measurement(measurement.index), expected, rtol=0, atol=1e-12)
 
 
 def test_fixed_parameters_are_left_out(chain, observations):
@@ -578,6 +623,9 @@ def test_what_a_fit_does_not_take_is_refused(chain, observations):
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="the data are in %; observables are plain numbers"):
         TRFLSQFitter()(measurement, measurement.index, measurement.observed * u.percent)
+    measurement.polarizer_theta.value = np.nan
+    with pytest.raises(ParameterError, match="polarizer_theta = nan; a fit starts at finite"):
+        LevMarLSQFitter()(measurement, measurement.index, measurement.observed)
     # a callable tie, when it is set
     measurement = Measurement(chain, observations)
     with pytest.raises(ParameterError, match="hwp_w_sio2: a measurement takes no callable tie"):

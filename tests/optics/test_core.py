@@ -41,6 +41,34 @@ def test_an_optic_of_ones_own():
     np.testing.assert_allclose(optic.mueller(1.6 * u.um), expected, rtol=0, atol=1e-14)
 
 
+def test_copies_with_other_values_keep_a_keyword_of_ones_own():
+    class Stack(TwoParameters):
+        """Several plates, a number that is no setting which the package knows."""
+
+        def __init__(self, count, **keywords):
+            super().__init__(**keywords)
+            self.count = count
+
+        def _matrix(self, dispersion, first, second):
+            return super()._matrix(dispersion, first, self.count * second)
+
+    stack = Stack(3, second=[0.1, 0.2, 0.3] * u.um, wavelength=WAVELENGTH, name="stack")
+    stack.second.std = [0.01, 0.02, 0.03]
+    expected = stack.mueller(WAVELENGTH[1:])
+    for copy in (
+        stack.with_parameters(first=1.0),
+        stack.with_parameters(second=[0.2, 0.3] * u.um),
+        stack.resampled(WAVELENGTH[1:]),
+    ):
+        np.testing.assert_allclose(copy.mueller(WAVELENGTH[1:]), expected, rtol=0, atol=1e-14)
+    # what is known of the values stays with them alone
+    kept, other = stack.with_parameters(first=0.5), stack.with_parameters(second=0.1 * u.um)
+    assert kept.second.std == [0.01, 0.02, 0.03]
+    assert kept.second.wavelength[0] == WAVELENGTH[0]
+    assert other.second.std is None
+    assert other.second.wavelength is None
+
+
 # --- rotation ----------------------------------------------------------------------
 
 

@@ -96,6 +96,25 @@ def test_wavelengths_have_units_except_in_a_fit():
     assert through(plate()).input_units == {"wavelength": u.um}
 
 
+def test_what_no_fit_can_start_from_is_refused_by_every_fitter():
+    flux, curve = through(plate())(WAVELENGTH), plate().curve("retardance")
+    for fitter in (TRFLSQFitter(), LevMarLSQFitter(), DogBoxLSQFitter(), LMLSQFitter()):
+        for key, value, words in (
+            ("value", np.nan, r"w_sio2\w* = nan; a fit starts at finite numbers"),
+            ("bounds", (1.7, 1.5), r"bounds of w_sio2\w* = 1.7, 1.5; the lower one is first"),
+        ):
+            start, law = through(plate()), curve.copy()
+            setattr(start.w_sio2_1, key, value)
+            setattr(law.w_sio2, key, value)
+            for model, data in ((start, flux), (law, curve(WAVELENGTH))):
+                with pytest.raises(ParameterError, match=words):
+                    fitter(model, WAVELENGTH, data)
+        with pytest.raises(ParameterError, match="of 1 inputs and 5 outputs; fitters take one of"):
+            fitter(optics.Light(Q=1) | plate(), WAVELENGTH, flux)
+        with pytest.raises(ParameterError, match="of 5 inputs and 5 outputs; fitters take one of"):
+            fitter(plate(), WAVELENGTH, flux)
+
+
 def test_ties_are_in_the_unit_of_the_parameter():
     def chain(angle):
         first, second = (
@@ -123,7 +142,7 @@ def test_bounds_are_converted():
     optic.theta.max = 120 * u.arcmin
     assert optic.theta.bounds == (-1, 2)
     assert optic.copy().theta.bounds == (-1, 2)
-    with pytest.raises(u.UnitConversionError):
+    with pytest.raises(ParameterError, match="bounds of theta has unit mm, which is not conv"):
         optic.theta.bounds = (0, 1) * u.mm
 
     class Own(optics.Optic):

@@ -62,5 +62,8 @@ def test_a_diattenuation_of_more_than_one_is_refused():
             optic.mueller()
     with pytest.raises(ParameterError, match=r"it: the \w+ is 1\.5; allowed is 1"):
         StateAnalyser(efficiency=-1.5, name="it", mount="beam=a").mueller(position=1)
+    # as a fitter without bounds may leave it
+    with pytest.raises(ParameterError, match=r"it: the efficiency is 1\.0000001; allowed is 1"):
+        WollastonPrism(efficiency=1 + 1e-7, name="it").mueller()
     perfect = VectorDiattenuator(horizontal=0.6, diagonal=0.8)
     np.testing.assert_allclose(perfect.mueller()[3, 3], 0.0, atol=1e-7)

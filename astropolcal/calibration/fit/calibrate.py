@@ -21,7 +21,7 @@ from importlib.metadata import version as installed
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
-from astropy.modeling.fitting import TRFLSQFitter
+from astropy.modeling.fitting import LinearLSQFitter, TRFLSQFitter
 
 from astropolcal.calibration.fit.branches import ROUNDED, BinProblem, bent_valleys, undecided_signs
 from astropolcal.calibration.fit.strategies import (
@@ -62,7 +62,7 @@ from astropolcal.measurement.datasets import as_pairs, refuse_repeated
 from astropolcal.measurement.parameters import parameters_named, with_own
 from astropolcal.progress import in_one_thread, stage
 from astropolcal.units import to_unit
-from astropolcal.words import check_choice
+from astropolcal.words import check_choice, check_type
 
 __all__ = ["calibrate"]
 
@@ -74,6 +74,8 @@ DEFAULTS = {key: next(iter(allowed)) for key, allowed in _CHOICES.items()}
 _ROBUST_ROUNDS = 50
 # the optics of this package are tested; step, in degrees, micrometres or percent, for others
 _OWN, _DIFFERENCE, _DIFFERS = __name__.partition(".")[0], 1e-4, 1e-2
+# and how many of them away from bounds
+_INSIDE = 100
 
 
 @in_one_thread
@@ -257,9 +259,13 @@ def fitted(
 ):
     """Fit a measurement as `calibrate` does; ``held`` are the names of what was fixed for it."""
     started, chosen = time.perf_counter(), DEFAULTS if chosen is None else chosen
+    check_type("instrument", instrument, str | None, "its name is needed", FitError)
     fitter = TRFLSQFitter() if fitter is None else fitter
-    if isinstance(fitter, type) or not callable(fitter):
-        raise FitError(f"fitter = {fitter!r}; allowed are astropy's, such as TRFLSQFitter()")
+    # a linear one takes no steps
+    if isinstance(fitter, (type, LinearLSQFitter)) or not callable(fitter):
+        raise FitError(
+            f"fitter = {fitter!r}; allowed are astropy's non-linear ones, such as TRFLSQFitter()"
+        )
     measurement.note_inputs()
     weighting = first_weighting(measurement, weights)
     _check(measurement)
@@ -327,6 +333,7 @@ def _check(measurement):
         # fitters tell neither name nor value
         allowed = f"{low:.7g} to {high:.7g} {unit}".strip()
         raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
+    measurement.check_start()
     # fitters refuse a start that is outside by a rounding error, too
     measurement.stand_at(np.clip(measurement.vector(), *measurement.free.bounds()))
     _check_derivatives(measurement)
@@ -336,10 +343,13 @@ def _check_derivatives(measurement):
     """Hold derivatives of optics from elsewhere against differences: all errors stand on them."""
     found = (leaf for chain in measurement.chains for leaf in leaves(chain))
     foreign = {leaf.name for leaf in found if type(leaf).__module__.partition(".")[0] != _OWN}
-    free, vector = measurement.free, measurement.vector()
+    free, (low, high) = measurement.free, measurement.free.bounds()
     for slot in (s for s in free.slots if s.name.partition(".")[0] in foreign):
-        step = np.zeros(free.size)
+        step, vector = np.zeros(free.size), measurement.vector()
         step[slot.slice] = _DIFFERENCE * free.steps[slot.slice]
+        # beyond a bound there may be no matrix, and at it no derivative
+        room = np.minimum(_INSIDE * step, (high - low) / 2)
+        vector = np.clip(vector, low + room, high - room)
         change = (measurement.predict(vector + step) - measurement.predict(vector - step)) / 2
         told = step @ measurement.jacobian(vector)
         worst = int(np.argmax(np.abs(change - told)))

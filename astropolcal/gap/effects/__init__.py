@@ -115,8 +115,7 @@ def check_effect(effect, chains, observations):
     >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
     >>> check_effect("hwp_tilt", [charis.chain()], [observations])
     """
-    one = effect() if isinstance(effect, type) else get_effect(effect)
-    _check_declared(one)
+    one = get_effect(effect() if isinstance(effect, type) else effect)
     # the registered effect itself may be checked, a namesake may not
     if one.name in EFFECTS and type(EFFECTS[one.name]) is not type(one):
         raise GapError(_TAKEN.format(one.name))
@@ -149,6 +148,7 @@ def get_effect(name):
     'unequal gains of the two beams (flat field)'
     """
     if isinstance(name, Effect):
+        _check_declared(name)
         return name
     if name in EFFECTS:
         return EFFECTS[name]
@@ -168,6 +168,9 @@ def _check_declared(effect):
     if not isinstance(effect, Effect):
         raise GapError(f"{effect!r} is not an Effect")
     lacking = [key for key in _NEEDED if not getattr(effect, key)]
+    # one that neither inserts an optic nor edits chains in its own way
+    if not effect.kinds and effect.inserted is None and type(effect) is Effect:
+        lacking.append("kind")
     if lacking:
         raise GapError(f"effect {effect.name or type(effect).__name__} lacks {', '.join(lacking)}")
     check_choice(f"effect {effect.name}: kind", effect.kind, KINDS, GapError)

@@ -8,6 +8,7 @@ effect would do to the data; fitted, the edited chains are ordinary chains again
 
 import copy
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -24,7 +25,7 @@ from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.units import canonical_factor, to_unit
-from astropolcal.words import check_choice, did_you_mean, is_whole
+from astropolcal.words import check_choice, check_type, did_you_mean, is_whole
 
 __all__ = []
 
@@ -246,8 +247,9 @@ class Effect:
     degree : int, "number" or None
         Degree of the law in wavelength; "number" is one number for all wavelengths, and None one
         for each.
-    scale, limit : float or `~astropy.units.Quantity`
-        Size to expect, and the largest that is physical; by default those of the kind.
+    scale, limit : float or `~astropy.units.Quantity`, or dict of them
+        Size to expect, and the largest that is physical; by default those of the kind. Of an optic
+        whose parameters have different units, by the name of the parameter.
     shows, reference : str
         Where in the data, and which paper.
     **settings
@@ -332,7 +334,9 @@ class Effect:
         if self.place is None and self.where is not None:
             self.place = self.where.words
         for what in ("scale", "limit"):
-            self._check_size(what, getattr(self, what))
+            sizes = getattr(self, what)
+            for size in sizes.values() if isinstance(sizes, Mapping) else (sizes,):
+                self._check_size(what, size)
         if self.inserted is None:
             self._check_perturbation()
 
@@ -392,6 +396,7 @@ class Effect:
         >>> Effect.insert(film, before="wollaston", limit=0.1, degree=1)
         <Effect film: Diattenuator upstream of the wollaston>
         """
+        check_type("optic", optic, optics.Optic, "a single Optic is needed", GapError)
         given = {"after": after, "before": before, "in": inside}
         told = [Where(key, value) for key, value in given.items() if value is not None]
         name = settings.pop("name", optic.name)
@@ -574,21 +579,27 @@ class Effect:
         return Edit(edited, found, ties)
 
     def parameters(self, names, chains, context):
-        """Return the parameters of these names, with their sizes and laws."""
+        """Return the parameters of these names, perhaps with units, with their sizes and laws."""
         law = None if self.degree is None else self.law(context, chains)
-        return [EffectParameter(name, *self._sizes(), law) for name in names]
+        units = names if isinstance(names, Mapping) else dict.fromkeys(names)
+        return [
+            EffectParameter(name, *self._sizes(name, unit), law) for name, unit in units.items()
+        ]
 
-    def _sizes(self):
+    def _sizes(self, name="", unit=None):
         """Return size to expect and limit, a tenth of which is expected if none is given."""
-        kind = self.kinds[0] if self.kinds else ""
-        scale, limit = self.scale, self.limit
+        key = name.rpartition(".")[2]
+        scale, limit = (
+            x.get(key) if isinstance(x, Mapping) else x for x in (self.scale, self.limit)
+        )
         if limit is None:
             # those of a usual perturbation, in radian or as a share
-            cell = Cell("", kind, "")
-            scale, limit = cell.scale if scale is None else scale, cell.limit
-            if isinstance(self.inserted, optics.Optic):
-                unit = getattr(self.inserted, self.free_of(self.inserted)[0]).unit
-                return scale * (u.rad if unit else 1), limit * (u.rad if unit else 1)
+            cell, usual = Cell("", self.kinds[0] if self.kinds else "", ""), 1
+            if unit is not None and self.inserted is not None:
+                if not unit.is_equivalent(u.rad):
+                    raise GapError(f"effect {self.name}: give limit={{{key!r}: ...}}, in {unit}")
+                usual = u.rad
+            scale, limit = cell.scale * usual if scale is None else scale, cell.limit * usual
         sizes = limit / 10 if scale is None else scale, limit
         # perturbations are plain numbers, in radian where they are angles
         is_plain = self.inserted is None and type(self).put is Effect.put
