@@ -199,7 +199,7 @@ def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
     assert score_answer(case, to_dict(diagnosis)) == "right"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_listed_cause_is_exchanged_for_no_other_freedom_than_the_data_ask_for():
     """To first order much freedom does better; a law that is taken away asks for more causes."""
     for seed, number, snr in ((176, 509, 102.2), (311, 36, 100.6)):
