@@ -364,7 +364,7 @@ class RunsCalibration:
     runs : `~astropy.table.QTable`
         One row per run: ``date``, ``tables``, and the root mean square of its residuals with the
         parameters of all runs, ``rms``, and with those of this run alone, ``rms_alone``;
-        ``stands_out``, whether that is over 1.3 times the noise, or clearly so at a wavelength.
+        ``stands_out``, whether that is clearly above the noise, of all data or of a wavelength.
     converged : bool
         Whether the solution stayed where it was when the runs were linearized again.
 
