@@ -253,6 +253,9 @@ def _excess(calibration):
     tests = calibration.fit.get("lack_of_fit") or []
     # errors that stand on the noise given are as wrong as that
     tests = [test for test in tests if test.get("noise") == "given"] or tests
+    # what is far above a noise from few numbers, and may be chance, is excused by no other noise
+    far = [test for test in tests if test["times_noise"] > _CLEARLY]
+    tests = [test for test in tests if test["p_value"] < _UNLIKELY or test not in far]
     times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
     # with several estimates of the noise that which excuses most
     return min(times) if times and len(times) == len(tests) else 0.0
