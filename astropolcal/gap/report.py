@@ -21,7 +21,6 @@ from astropolcal import instruments, progress
 from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.identifiability.linearized import ranked
-from astropolcal.calibration.result.verdict import disagrees_with_priors
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
 from astropolcal.files import plain
@@ -55,8 +54,6 @@ _OF_EFFECT = ("place", "kind", "shows", "reference")
 ACCURACIES = ("s_res", "s_mean", "s_cv")
 # parameters correlated more than this with what is uncertain are named
 _STRONG, _MOST_TRADES = 0.5, 3
-# a fit is at odds with a prior that is so many of its standard deviations away
-_FAR = 4.0
 # perturbations that are angles
 ANGLES = ("retardance", "rotation")
 # directions below this share of the largest take nothing up
@@ -459,7 +456,7 @@ def accuracies(model, cross_validate=True):
     rms = np.sqrt(np.average(gap[known] ** 2, weights=count[known])) if known.any() else None
     return found | {
         "rms_percent": rms,
-        "against_prior": _against_prior(seen),
+        "against_prior": seen.fit["against_prior"],
         "datasets": [
             {"name": one.name, "source": one.source}
             | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}
@@ -513,20 +510,6 @@ def with_causes(model, instrument=None):
             mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
             own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
     return calibrate(chains, model.observations, **how, cross_validate=False)
-
-
-def _against_prior(calibration):
-    """Return the parameter farthest from its prior, where data and priors disagree."""
-    if not disagrees_with_priors(calibration):
-        return None
-    free, vector = calibration.measurement.free, calibration.measurement.vector()
-    off = {
-        slot.name: float(np.abs(prior.residual(vector[slot.slice])).max())
-        for slot, prior in free.priors
-        if not prior.is_flat
-    }
-    worst = max(off, key=off.get)
-    return {"parameter": worst, "sigma": off[worst]} if off[worst] > _FAR else None
 
 
 def _median(values):

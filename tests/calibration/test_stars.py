@@ -86,6 +86,29 @@ def test_accuracy_of_a_known_star():
     np.testing.assert_allclose(known["s_u"].to_value(u.percent), 0.1)
 
 
+@pytest.mark.slow
+def test_a_star_that_is_not_as_the_catalogue_says_is_told_by_what_it_moves():
+    """Its prior of 0 +- 0.025 % pulls at M3; the field turns, so that the data exclude it."""
+    source, kept = "unpolarized standard star", {"m3.diattenuation", "m3.theta"}
+    for q, usable in ((0.0, True), (0.003, False)):
+        truth, chain = (star_chain(source, target="HD 14069") for _ in range(2))
+        truth["m3"].diattenuation, truth["star"].q = [0.017, 0.014, 0.012], q
+        for leaf in leaves(chain):
+            for key in leaf.param_names:
+                if leaf.name != "star" and f"{leaf.name}.{key}" not in kept:
+                    getattr(leaf, key).fixed = True
+        data = observe_star(truth, 12, target="HD 14069", flux=1e6, seed=1)
+        cal = calibrate(chain, data, cross_validate=False)
+        told, against = cal.verdict(), cal.fit["against_prior"]
+        assert told.usable == (against is None) == usable, (q, told, against)
+        if not usable:
+            assert against["parameter"] == "star.q"
+            assert against["sigma"] > 4
+            assert against["moves"]["parameter"].startswith("m3.")
+            assert told.reasons[0].startswith("star.q is ")
+            assert "star's name" in told.advice
+
+
 def test_chain_without_a_star_is_an_error(simulated):
     cal, truth = simulated
     with pytest.raises(ChainError, match="begins with a PolarizedSource"):

@@ -375,6 +375,8 @@ _SPOILT = 1e-3
 _SILENT = 1e-12
 # a datum whose fit leaves less than this of what it departs says nothing but of itself
 _ALONE = 1e-6
+# a fit is at odds with a prior that is so many of its standard deviations away
+_FAR = 4.0
 
 
 def _at_gauge(measurement, weighting, origin, gauge):
@@ -532,6 +534,7 @@ def _result(fitted, covariance=None):
         fit["off_minimum"] = _moved(measurement, whitened, own)
         if len(outlying) and settings["loss"] == "linear":
             fit["outliers_move"] = _moved(measurement, whitened, own, outlying.meta["data"])
+        fit["against_prior"] = _against_prior(measurement, whitened, own)
     outliers = columns(outlying)
     rows = zip(*outliers.values(), strict=True)
     fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]
@@ -549,10 +552,31 @@ def _along_valleys(measurement, whitened, covariance, view):
     return wide, curved_directions(free, measurement.vector(), found, stds, sky_of)
 
 
-def _moved(measurement, whitened, covariance, data=None):
+def _against_prior(measurement, whitened, covariance):
+    """Return the parameter farthest from its prior, by ``sigma``, if that is far.
+
+    And which one of other optics such priors move most, as `_moved`: with them or without, one of
+    the two is wrong.
+    """
+    free = measurement.free
+    off = np.abs(free.prior_residuals(measurement.vector()))
+    far = np.flatnonzero(off > _FAR)
+    if not far.size:
+        return None
+    told = (np.arange(free.size)[slot.slice] for slot, prior in free.priors if not prior.is_flat)
+    names, own = [name.partition("[")[0] for name in free.names], np.concatenate([*told])
+    optics = {names[i].partition(".")[0] for i in own[far]}
+    others = np.array([name.partition(".")[0] not in optics for name in names])
+    moved = _moved(measurement, whitened, covariance, measurement.n_data + far, others)
+    worst = int(np.argmax(off))
+    return {"parameter": names[own[worst]], "sigma": float(off[worst]), "moves": moved}
+
+
+def _moved(measurement, whitened, covariance, data=None, among=True):
     """Return which parameter residuals move most, by how many errors; at the minimum none does.
 
-    Of some data: by how much it would move without them (Cook 1977, Technometrics 19, 15).
+    Of some data: by how much it would move without them (Cook 1977, Technometrics 19, 15). Priors
+    count as data after all others.
     """
     problem, free = Problem(measurement, measurement.weighting), measurement.free
     vector, factor = measurement.vector(), whitened.factor()
@@ -564,7 +588,7 @@ def _moved(measurement, whitened, covariance, data=None):
         pull = np.linalg.lstsq(np.eye(len(data)) - drawn @ drawn.T, pull, rcond=_ALONE)[0]
     # a step of Newton's; of data without noise residuals are rounding
     step = np.abs(factor.T @ (factor @ (rows.T @ pull))) * whitened.scale / free.factors()
-    known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED)
+    known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED) & among
     times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
     worst = int(np.argmax(times))
     return {"parameter": free.names[worst], "errors": float(times[worst])}

@@ -364,7 +364,7 @@ class RunsCalibration:
     runs : `~astropy.table.QTable`
         One row per run: ``date``, ``tables``, and the root mean square of its residuals with the
         parameters of all runs, ``rms``, and with those of this run alone, ``rms_alone``;
-        ``stands_out``, whether that is over three times the noise.
+        ``stands_out``, whether that is clearly above the noise, of all data or of a wavelength.
     converged : bool
         Whether the solution stayed where it was when the runs were linearized again.
 
@@ -531,9 +531,7 @@ class RunsCalibration:
         for row in self.runs:
             name = f"  run of {row['date']}" if row["date"] else f"  run of {row['tables']}"
             if row["stands_out"]:
-                lines.append(
-                    f"{name}: residuals over 3 times the noise by itself, a wrong minimum?"
-                )
+                lines.append(f"{name}: residuals stand out by themselves, a wrong minimum?")
             elif row["rms"] > _WORSE * row["rms_alone"]:
                 lines.append(f"{name}: {row['rms']:.3f} are left, by itself {row['rms_alone']:.3f}")
         return "\n".join(lines)

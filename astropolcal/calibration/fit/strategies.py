@@ -63,6 +63,8 @@ _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
 _STANDS_OUT, _STARTS, _BETTER = 1.3, 4, 0.9
+# so may fewer, of all data or a wavelength, beyond so many times what chi-square scatters by
+_BY_CHANCE = 5, 6
 # nor is one tried that leaves so many times as much before everything is fitted
 _HOPELESS = 100.0
 # of so many signs not all combinations are tried; sums of squares of the same minimum, over that
@@ -249,14 +251,19 @@ def known_noises(measurement):
 
 
 def stands_out(measurement):
-    """Whether the residuals are far above the noise that the frames show, or the table states."""
+    """Whether residuals, of all data or a wavelength, are clearly above the noise of the frames."""
     known = [*known_noises(measurement)]
     if not known:
         return False
     # a wrong minimum predicts a wrong null channel, so that this noise is too large as well
     noise = known[-1 if known[0].method == "null channel" else 0]
-    pulls = measurement.residuals() / np.maximum(noise.sigma_of_data, ROUNDED)
-    return bool(np.mean(pulls**2) > _STANDS_OUT**2)
+    squares = (measurement.residuals() / np.maximum(noise.sigma_of_data, ROUNDED)) ** 2
+    sizes, n = np.bincount(measurement.bins), squares.size
+    freedom = max(n - measurement.free.size, n / 2)
+    least = min(n * _STANDS_OUT**2, freedom + _BY_CHANCE[0] * np.sqrt(2 * freedom))
+    limit = np.maximum(sizes * _STANDS_OUT**2, sizes + _BY_CHANCE[1] * np.sqrt(2 * sizes))
+    beyond = np.bincount(measurement.bins, squares) > limit
+    return bool(np.sum(squares) > least or beyond.any())
 
 
 def _descend(measurement, weighting, fitter, search, options, origin, is_searched=False):

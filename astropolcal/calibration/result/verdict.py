@@ -39,7 +39,7 @@ _SHOWS = 0.005
 _CLEARLY = 2
 # values farther from the minimum, in units of the errors there, have larger errors
 _OFF = 0.5
-# data at odds with the fit that move a parameter by more of its errors spoil it
+# data or priors at odds with the fit that move a parameter by more of its errors spoil it
 _MOVED = 2
 # errors that rest on fewer numbers are themselves known to a third or worse
 _FEW_FREEDOM, _FEW_SETTINGS = 5, 6
@@ -130,7 +130,9 @@ def verdict(calibration, targets=TARGETS):
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
         if disagrees_with_priors(calibration):
-            cautions.append("data and priors disagree")
+            told = calibration.fit.get("against_prior")
+            which = f": {told['parameter']} by {told['sigma']:.0f} sigma" if told else ""
+            cautions.append(f"data and priors disagree{which}")
     advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
@@ -159,6 +161,7 @@ def _reasons(calibration, known, free, on_sky=((), ())):
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [_nothing(calibration), _angles(calibration, free)]
     wrong += [*_mirrors(calibration, known), _misfit(calibration), _carried_off(calibration)]
+    wrong.append(_drawn(calibration))
     # the constants of laws are where inputs are zero, far from all frames
     trains = map(leaves, calibration.chains)
     laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
@@ -205,6 +208,15 @@ def _carried_off(calibration):
     return f"frames at odds move {moved['parameter']} by {moved['errors']:.2g} of its errors"
 
 
+def _drawn(calibration):
+    """Name the prior that the data exclude, where it moves another optic by more than is known."""
+    told = calibration.fit.get("against_prior")
+    if not told or not told["moves"]["errors"] > _MOVED:
+        return ""
+    moved = "which moves {parameter} by {errors:.2g} of its errors".format(**told["moves"])
+    return f"{told['parameter']} is {told['sigma']:.0f} sigma off its prior, {moved}"
+
+
 def _stuck(free):
     """Name the parameters that are at a bound nearly everywhere."""
     stuck = [
@@ -245,6 +257,9 @@ def _excess(calibration):
     tests = calibration.fit.get("lack_of_fit") or []
     # errors that stand on the noise given are as wrong as that
     tests = [test for test in tests if test.get("noise") == "given"] or tests
+    # what is far above a noise from few numbers, and may be chance, is excused by no other noise
+    far = [test for test in tests if test["times_noise"] > _CLEARLY]
+    tests = [test for test in tests if test["p_value"] < _UNLIKELY or test not in far]
     times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
     # with several estimates of the noise that which excuses most
     return min(times) if times and len(times) == len(tests) else 0.0
@@ -452,6 +467,7 @@ def _next(calibration, free, wrong, sky):
     mask = "the frames at odds: mask them (mask_reason), or --loss bisquare"
     advice = (
         (_carried_off(calibration), mask),
+        (_drawn(calibration), "check the star's name, source and times, and what priors state"),
         (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
         (wrong, "check mounts, beams, angles, source; or run astropolcal diagnose"),
         (
