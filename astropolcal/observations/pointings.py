@@ -431,6 +431,10 @@ def frame_coordinate(observations, name):
         return passed / (passed.max() or 1.0)
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
+    if name.endswith("_rate"):
+        stage = name.removesuffix("_rate")
+        turn = _TURNS.get(stage, 2 * np.pi)
+        return angle_change(observations, observations.position(stage), turn)
     if name.endswith(MOVES):
         stage, _, what = name.rpartition("_")
         angle = observations.position(stage)
@@ -443,10 +447,6 @@ def frame_coordinate(observations, name):
             found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
             out[order] = found[what]
         return out
-    if name.endswith("_rate"):
-        stage = name.removesuffix("_rate")
-        turn = _TURNS.get(stage, 2 * np.pi)
-        return angle_change(observations, observations.position(stage), turn)
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
