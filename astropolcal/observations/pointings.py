@@ -414,7 +414,7 @@ def frame_coordinate(observations, name):
     Return one of `~astropolcal.optics.COORDINATES` of every frame, (F,), or (2, B, F) for fluxes.
 
     They are described in `Observations.position`. Persistence adds a share p of the frame before:
-    it multiplies the flux by 1 + p F_before / F_now, a `~astropolcal.optics.FluxGain` with
+    it multiplies the flux by 1 / (1 - p F_before / F_now), a `~astropolcal.optics.FluxGain` with
     ``power=-1`` and ``mount="previous_flux"``.
     """
     if "=" in name:
