@@ -16,6 +16,7 @@ from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.efficiency import demodulation
 from astropolcal.exceptions import AstropolcalWarning, ChainError, FitError, ObservationError
 from astropolcal.gap import diagnose
+from astropolcal.gap.effects import Context, adapted, get_effect
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.measurement import Measurement
@@ -459,6 +460,23 @@ def test_beams_of_an_exposure_are_taken_at_once():
         for duty in (0.5, None) if times else (0.5,):
             moved = [motion(one, one.position("hwp"), duty) for one in (two, three)]
             np.testing.assert_allclose(moved[1], np.repeat(moved[0], 3), atol=1e-12)
+
+
+def test_angles_of_any_stage_may_be_those_of_another_moment():
+    # a star behind two plates: the second is what elsewhere is a derotator, and may lag as one
+    turn = optics.Rotator(mount="parallactic", name="parallactic")
+    plates = [
+        optics.LinearRetarder(retardance=angle * u.deg, mount=stage, name=stage)
+        for stage, angle in (("hwp", 180), ("quarter", 90))
+    ]
+    chain = join([turn, *plates, optics.WollastonPrism(name="wollaston")])
+    angles = {"parallactic": np.arange(6.0), "hwp": np.arange(6) * 22.5, "quarter": [0, 10] * 3}
+    frames = QTable({stage: angle * u.deg for stage, angle in angles.items()})
+    run = simulate(chain, [0.6] * u.um, frames, seed=1)
+    for effect in adapted([get_effect("derotator_motion")], [chain]):
+        context = Context.of([0.6], [run])
+        late = effect.edit([chain], context).chains[0]
+        assert Measurement(late, run, observable="normalized_single_difference").n_data == 6
 
 
 def test_cycles_of_a_half_wave_plate_are_those_of_its_exposures():

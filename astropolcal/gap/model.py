@@ -345,6 +345,9 @@ class Model:
         if self.fit.converged:
             return self
         fit = self.problem.fit(self.fit.coefficients, **settings)
+        # what adds light changes the flux that it follows
+        if settings.get("steps") != 0 and self.problem.follow_fluxes(fit.coefficients):
+            fit = self.problem.fit(fit.coefficients, **settings)
         return Model(self.problem, fit, self.added)
 
     def is_physical(self, name):

@@ -311,14 +311,29 @@ class GapProblem:
         q = self.start if coefficients is None else coefficients
         without = without or [None] * len(self.datasets)
         seen = zip(self.channels, self.datasets, self.differences(q), without, strict=True)
-        found = []
         for channel, dataset, residual, out in seen:
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
             told = noise(channel, residual, angles, dataset.bins, out)
             channel.set_noise(told, residual, saturating, out)
-            found.append(expected_fluxes(channel, dataset.forward(self.vector(q))))
+        self._expect_fluxes(q)
+
+    def _expect_fluxes(self, coefficients):
+        vector, pairs = self.vector(coefficients), zip(self.channels, self.datasets, strict=True)
+        found = [expected_fluxes(channel, dataset.forward(vector)) for channel, dataset in pairs]
         self.fluxes, self.flickering = map(list, zip(*found, strict=True))
+
+    def follow_fluxes(self, coefficients):
+        """Let what follows the flux follow that of a fit; return whether there is such."""
+        follows = [any(leaf.stage in FLUXES for leaf in leaves(c)) for c in self.measurement.chains]
+        if any(follows):
+            self._expect_fluxes(coefficients)
+        for i in np.flatnonzero(follows):
+            dataset, chain = self.datasets[i], self.measurement.chains[i]
+            dataset._given = _positions(chain, dataset.observations, self.fluxes[i])
+            dataset._place(chain, dataset.frames.T.ravel())
+            self._flickering[i] = self._with_flicker(i, chain)
+        return any(follows)
 
     # ---- fit -------------------------------------------------------------------------
 

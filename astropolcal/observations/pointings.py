@@ -408,7 +408,7 @@ def frame_coordinate(observations, name):
     Return one of `~astropolcal.optics.COORDINATES` of every frame, (F,), or (2, B, F) for fluxes.
 
     They are described in `Observations.position`. Persistence adds a share p of the frame before:
-    it multiplies the flux by 1 + p F_before / F_now, a `~astropolcal.optics.FluxGain` with
+    it multiplies the flux by 1 / (1 - p F_before / F_now), a `~astropolcal.optics.FluxGain` with
     ``power=-1`` and ``mount="previous_flux"``.
     """
     if "=" in name:
@@ -425,6 +425,10 @@ def frame_coordinate(observations, name):
         return passed / (passed.max() or 1.0)
     if name == "frame":
         return np.arange(observations.n_frames, dtype=float)
+    if name.endswith("_rate"):
+        stage = name.removesuffix("_rate")
+        turn = _TURNS.get(stage, 2 * np.pi)
+        return angle_change(observations, observations.position(stage), turn)
     if name.endswith(MOVES):
         stage, _, what = name.rpartition("_")
         angle = observations.position(stage)
@@ -437,10 +441,6 @@ def frame_coordinate(observations, name):
             found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
             out[order] = found[what]
         return out
-    if name.endswith("_rate"):
-        stage = name.removesuffix("_rate")
-        turn = _TURNS.get(stage, 2 * np.pi)
-        return angle_change(observations, observations.position(stage), turn)
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":

@@ -397,17 +397,18 @@ class FluxGain(_BeamOptic, _Referenced, _Gain):
     r"""
     Gain of each beam that depends on its flux.
 
-    :math:`1 + k (F/F_0)^m`, with the coefficient k of the beam and its flux F in
-    the table (``mount="flux"``). With m = 1 a detector that is not linear. With
-    ``mount="previous_flux"``, F is the flux over that of the frame before, and
-    m = -1 is persistence, a share :math:`k F_0` of it. Where F = 0 the gain is one.
+    :math:`1 + k F/F_0`, with the coefficient k of the beam and its flux F in the table
+    (``mount="flux"``), is a detector that is not linear. With the exponent -1 it is
+    :math:`1 / (1 - k F_0/F)`: a flux :math:`k F_0` is added, which F contains, 99 % of it at
+    most. With ``mount="previous_flux"`` F is the flux over that of the frame before, and what is
+    added is persistence, a share :math:`k F_0` of it. Where F = 0 the gain is one.
 
     Parameters
     ----------
     right, left : float or array_like
         Coefficient k of each beam; scalars, or one value per wavelength.
     power : {1, -1}
-        Exponent m.
+        Exponent of the flux.
     reference : float
         :math:`F_0`, in the unit of the tables.
     beam : {"right", "left"}
@@ -439,6 +440,21 @@ class FluxGain(_BeamOptic, _Referenced, _Gain):
         # the other
         none = np.zeros_like(level)
         return (level, none) if self._beam == "right" else (none, level)
+
+    def _of(self, change):
+        # light that is added is in the flux of the table
+        return super()._of(change if self._power == 1 else 1 / _of_source(change) - 1)
+
+    def _slope(self, change):
+        if self._power == 1:
+            return super()._slope(change)
+        left = _of_source(change)
+        return scaled(np.where(left > _LEAST_OF_SOURCE, left**-2, 0.0))
+
+
+def _of_source(added):
+    """Return what of the light is not added, from the share that is."""
+    return np.maximum(1 - added, _LEAST_OF_SOURCE)
 
 
 class StrayLight(_Referenced):
@@ -473,11 +489,10 @@ class StrayLight(_Referenced):
         """Return the reference flux over that of the source, and its derivative to the amount."""
         flux = np.asarray(coordinate, dtype=float)
         share = np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
-        source = 1 - amount * share
         # the frame has some light of the source
-        left = np.maximum(source, _LEAST_OF_SOURCE)
+        left = _of_source(amount * share)
         share = share / left
-        return share, np.where(source > _LEAST_OF_SOURCE, share**2, 0.0)
+        return share, np.where(left > _LEAST_OF_SOURCE, share**2, 0.0)
 
     def _matrix(self, coordinate, *added):
         out = mueller.blank(coordinate, *added)

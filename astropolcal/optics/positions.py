@@ -15,12 +15,9 @@ __all__ = ["COORDINATES"]
 #: over the one in the frame before.
 FLUXES = ("flux", "total_flux", "previous_flux")
 
-#: By how much an angle changes from one frame to the next.
-RATES = ("parallactic_rate", "derotator_rate")
-
 #: What stands behind the name of a stage for its last move: 1 where it went backwards, else 0; how
-#: far, and how far the next one goes, in radian.
-MOVES = ("_direction", "_move", "_next")
+#: far, and how far the next one goes, in radian; by how much it changes from frame to frame.
+MOVES = ("_direction", "_move", "_next", "_rate")
 
 
 #: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
@@ -39,14 +36,14 @@ class _Coordinates(tuple):
 
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
-#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
+#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame and the
 #: last moves of stages (those of ``hwp`` and ``derotator``, and ``"STAGE_direction"`` and so on of
 #: any other), and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column has that state
 #: and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian Date or
 #: `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
 COORDINATES = _Coordinates(
     (
-        *("sequence", "flc_state", "frame", *RATES, *FLUXES),
+        *("sequence", "flc_state", "frame", "parallactic_rate", *FLUXES),
         *(f"{stage}{what}" for stage in ("hwp", "derotator") for what in MOVES),
     )
 )

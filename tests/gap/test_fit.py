@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from astropolcal.gap import problem as module
+from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import get_effect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.problem import Fit, GapProblem, _positions, law_basis
 
 EFFICIENCY, RETARDANCE = "wollaston.efficiency", "derotator.retardance"
@@ -66,6 +68,25 @@ def test_a_curved_valley_takes_few_steps():
     found = plain.with_effect(get_effect("background"), steps=10)
     assert found.fit.converged
     assert found.fit.chi2 < found.problem.n_data
+
+
+def test_added_light_is_fitted_to_faint_beams_too():
+    """A nominal fit takes up a part of it, and the flux that it expects is not that of a beam."""
+    clean = data.observed(noise=False, flux=1e7).to_table()
+    for kind, follows in (("background_of_one_beam", "flux"), ("persistence", "previous")):
+        table, rng = clean.copy(), np.random.default_rng(1)
+        for beam in ("right", "left"):
+            flux = clean[f"flux_{beam}"].value.reshape(-1, len(data.WAVELENGTH))
+            added = np.median(flux) * (beam == "right")
+            if kind == "persistence":
+                added = np.concatenate([flux[:1], flux[:-1]])
+            flux = (flux + 0.01 * added).ravel()
+            table[f"flux_{beam}"] = rng.normal(flux, np.sqrt(flux)) * clean["flux_right"].unit
+            table[f"flux_{beam}_err"] = np.sqrt(flux) * clean["flux_right"].unit
+        plain = data.fitted(data.Observations.from_table(table, name="lamp"))
+        found = plain.with_effect(CellEffect(Cell("detector", kind, follows)))
+        assert plain.p_value < 1e-9, kind
+        assert found.p_value > 0.01, kind
 
 
 def test_the_same_minimum_is_found_from_elsewhere(plain, fitted):

@@ -25,11 +25,11 @@ def optic(cls, **settings):
 
 def test_no_flux_has_no_gain():
     """Masked rows have no flux; they must neither warn nor become infinite."""
-    for power in [1, -1]:
+    for power, wanted in [(1, 1.2), (-1, 1.25)]:
         gain = FluxGain(right=0.2, power=power, mount="flux", name="gain")
         np.testing.assert_array_equal(gain.mueller(position=0.0), np.eye(4))
         found = gain.mueller(position=[0.0, 1.0])
-        np.testing.assert_allclose(found[:, 0, 0], [1.0, 1.2])
+        np.testing.assert_allclose(found[:, 0, 0], [1.0, wanted])
 
 
 def test_gain_of_one_beam_does_not_move_the_other():
@@ -40,6 +40,20 @@ def test_gain_of_one_beam_does_not_move_the_other():
     gain.beam = "left"
     other = gain.mueller_derivatives(position=3.0)
     np.testing.assert_array_equal(other["right"].value, 0)
+
+
+@given(share=SHARE, flux=FLUX, before=FLUX)
+def test_a_beam_gets_what_is_added_to_it_whatever_its_own_flux(share, flux, before):
+    """Faint beams get as much as bright ones: a constant flux, or a share of the frame before."""
+    assume(abs(share) * before < 0.98 * (flux + share * before))
+    seen = flux + share * before
+    for settings, position in (
+        ({"mount": "flux", "reference": before}, seen),
+        ({"mount": "previous_flux"}, seen / before),
+    ):
+        gain = FluxGain(right=share, power=-1, name="gain", **settings)
+        found = flux * gain.mueller(position=position)
+        np.testing.assert_allclose(found, seen * np.eye(4), rtol=1e-9)
 
 
 # --- added light --------------------------------------------------------------------------------

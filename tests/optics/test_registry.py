@@ -321,7 +321,7 @@ CASES = {
     ),
     "FluxGain, reciprocal": case(
         optics.FluxGain,
-        lambda x, right, left: gained(1 + left * 2 / x),
+        lambda x, right, left: gained(1 / np.maximum(1 - left * 2 / x, 0.01)),
         settings={"beam": "left", "power": -1, "reference": 2.0},
         mount="previous_flux",
         position=st.floats(1, 9),
