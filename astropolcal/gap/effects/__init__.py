@@ -10,7 +10,14 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.gap.effects.effect import KINDS, Context, Edit, Effect, EffectParameter
+from astropolcal.gap.effects.effect import (
+    KINDS,
+    CellEffect,
+    Context,
+    Edit,
+    Effect,
+    EffectParameter,
+)
 from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.where import Roles, adapted
 from astropolcal.gap.problem import GapProblem
@@ -148,7 +155,9 @@ def get_effect(name):
     'unequal gains of the two beams (flat field)'
     """
     if isinstance(name, Effect):
-        _check_declared(name)
+        # a cell of the diagnosis declares nothing
+        if not isinstance(name, CellEffect):
+            _check_declared(name)
         return name
     if name in EFFECTS:
         return EFFECTS[name]
