@@ -344,11 +344,17 @@ class Model:
         """Return the model with its fit carried on to the end, see `GapProblem.fit`."""
         if self.fit.converged:
             return self
-        fit = self.problem.fit(self.fit.coefficients, **settings)
-        # what adds light changes the flux that it follows
-        if settings.get("steps") != 0 and self.problem.follow_fluxes(fit.coefficients):
-            fit = self.problem.fit(fit.coefficients, **settings)
-        return Model(self.problem, fit, self.added)
+        problem, fit = self.problem, self.problem.fit(self.fit.coefficients, **settings)
+        if settings.get("steps") != 0 and any(problem.follows_flux):
+            # what adds light changes the flux that it follows
+            before = problem.fluxes, problem.flickering
+            problem.follow(*problem.expected(fit.coefficients))
+            again = problem.fit(fit.coefficients, **settings)
+            # which does not go on and on for more light
+            if again.chi2 < fit.chi2:
+                return Model(problem, again, self.added)
+            problem.follow(*before)
+        return Model(problem, fit, self.added)
 
     def is_physical(self, name):
         """Return whether the fitted values of an effect are possible.

@@ -316,24 +316,27 @@ class GapProblem:
             saturating = settings(angles, dataset.observations.n_frames)
             told = noise(channel, residual, angles, dataset.bins, out)
             channel.set_noise(told, residual, saturating, out)
-        self._expect_fluxes(q)
+        self.fluxes, self.flickering = self.expected(q)
 
-    def _expect_fluxes(self, coefficients):
+    def expected(self, coefficients):
+        """Return the fluxes that a fit expects, without and with flicker."""
         vector, pairs = self.vector(coefficients), zip(self.channels, self.datasets, strict=True)
         found = [expected_fluxes(channel, dataset.forward(vector)) for channel, dataset in pairs]
-        self.fluxes, self.flickering = map(list, zip(*found, strict=True))
+        return tuple(map(list, zip(*found, strict=True)))
 
-    def follow_fluxes(self, coefficients):
-        """Let what follows the flux follow that of a fit; return whether there is such."""
-        follows = [any(leaf.stage in FLUXES for leaf in leaves(c)) for c in self.measurement.chains]
-        if any(follows):
-            self._expect_fluxes(coefficients)
-        for i in np.flatnonzero(follows):
+    @property
+    def follows_flux(self):
+        """Whether an optic follows the flux, for each dataset."""
+        return [any(leaf.stage in FLUXES for leaf in leaves(c)) for c in self.measurement.chains]
+
+    def follow(self, fluxes, flickering):
+        """Let what follows the flux follow other ones, see `expected`."""
+        self.fluxes, self.flickering = fluxes, flickering
+        for i in np.flatnonzero(self.follows_flux):
             dataset, chain = self.datasets[i], self.measurement.chains[i]
-            dataset._given = _positions(chain, dataset.observations, self.fluxes[i])
+            dataset._given = _positions(chain, dataset.observations, fluxes[i])
             dataset._place(chain, dataset.frames.T.ravel())
             self._flickering[i] = self._with_flicker(i, chain)
-        return any(follows)
 
     # ---- fit -------------------------------------------------------------------------
 
