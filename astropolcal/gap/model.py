@@ -69,6 +69,8 @@ _FEW = 3
 # what alternatives leave is told after so many searches and steps: further ones lower it by less
 # than a quarter, mostly
 _SEARCHES, _STEPS = 2, 15
+# a fit is repeated so often with the fluxes that the one before expects
+_FLUXES = 4
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
 # a retardance as near to half a wave as this (radian) is at it
@@ -345,15 +347,15 @@ class Model:
         if self.fit.converged:
             return self
         problem, fit = self.problem, self.problem.fit(self.fit.coefficients, **settings)
-        if settings.get("steps") != 0 and any(problem.follows_flux):
-            # what adds light changes the flux that it follows
+        # what adds light changes the flux that it follows; for much light that does not settle
+        for _ in range(_FLUXES if settings.get("steps") != 0 and any(problem.follows_flux) else 0):
             before = problem.fluxes, problem.flickering
             problem.follow(*problem.expected(fit.coefficients))
             again = problem.fit(fit.coefficients, **settings)
-            # which does not go on and on for more light
-            if again.chi2 < fit.chi2:
-                return Model(problem, again, self.added)
-            problem.follow(*before)
+            if again.chi2 >= fit.chi2:
+                problem.follow(*before)
+                break
+            fit = again
         return Model(problem, fit, self.added)
 
     def is_physical(self, name):
