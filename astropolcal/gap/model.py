@@ -70,7 +70,7 @@ _FEW = 3
 # than a quarter, mostly
 _SEARCHES, _STEPS = 2, 15
 # a fit is repeated so often with the fluxes that the one before expects
-_FLUXES = 4
+_FLUXES = 3
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
 # a retardance as near to half a wave as this (radian) is at it
