@@ -347,15 +347,12 @@ class Model:
         if self.fit.converged:
             return self
         problem, fit = self.problem, self.problem.fit(self.fit.coefficients, **settings)
-        # what adds light changes the flux that it follows; for much light that does not settle
-        for _ in range(_FLUXES if settings.get("steps") != 0 and any(problem.follows_flux) else 0):
-            before = problem.fluxes, problem.flickering
-            problem.follow(*problem.expected(fit.coefficients))
-            again = problem.fit(fit.coefficients, **settings)
-            if again.chi2 >= fit.chi2:
-                problem.follow(*before)
+        follows = settings.get("steps") != 0 and any(problem.follows_flux)
+        # what adds light changes the flux that it follows
+        for _ in range(_FLUXES if follows else 0):
+            before, fit = fit, _with_its_fluxes(problem, fit, settings)
+            if fit is before:
                 break
-            fit = again
         return Model(problem, fit, self.added)
 
     def is_physical(self, name):
@@ -424,6 +421,21 @@ class Model:
         at = self.problem.free.at_bounds(self.problem.vector(self.fit.coefficients))
         slots = [self.problem.free.by_name[p.name] for p in self.added.get(name) or ()]
         return sum(int(np.sum(at[slot.slice])) for slot in slots)
+
+
+def _with_its_fluxes(problem, fit, settings):
+    """Return a fit with the fluxes that another expects, or half way to them, if it is better."""
+    before, after = (problem.fluxes, problem.flickering), problem.expected(fit.coefficients)
+    pairs = [zip(*both, strict=True) for both in zip(before, after, strict=True)]
+    # where much light is added, the whole way leads too far
+    half = [[a if b is None else np.sqrt(a * b) for b, a in pair] for pair in pairs]
+    for fluxes in (after, half):
+        problem.follow(*fluxes)
+        again = problem.fit(fit.coefficients, **settings)
+        if again.chi2 < fit.chi2:
+            return again
+    problem.follow(*before)
+    return fit
 
 
 @dataclass

@@ -73,14 +73,15 @@ def test_a_curved_valley_takes_few_steps():
 def test_added_light_is_fitted_to_faint_beams_too():
     """A nominal fit takes up a part of it, and the flux that it expects is not that of a beam."""
     clean = data.observed(noise=False, flux=1e7).to_table()
-    for kind, follows in (("background_of_one_beam", "flux"), ("persistence", "previous")):
+    cases = (("background_of_one_beam", "flux", 0.03), ("persistence", "previous", 0.015))
+    for kind, follows, size in cases:
         table, rng = clean.copy(), np.random.default_rng(1)
         for beam in ("right", "left"):
             flux = clean[f"flux_{beam}"].value.reshape(-1, len(data.WAVELENGTH))
             added = np.median(flux) * (beam == "right")
             if kind == "persistence":
                 added = np.concatenate([flux[:1], flux[:-1]])
-            flux = (flux + 0.01 * added).ravel()
+            flux = (flux + size * added).ravel()
             table[f"flux_{beam}"] = rng.normal(flux, np.sqrt(flux)) * clean["flux_right"].unit
             table[f"flux_{beam}_err"] = np.sqrt(flux) * clean["flux_right"].unit
         plain = data.fitted(data.Observations.from_table(table, name="lamp"))
