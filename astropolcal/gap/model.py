@@ -69,8 +69,9 @@ _FEW = 3
 # what alternatives leave is told after so many searches and steps: further ones lower it by less
 # than a quarter, mostly
 _SEARCHES, _STEPS = 2, 15
-# a fit is repeated so often with the fluxes that the one before expects
-_FLUXES = 3
+# a fit is repeated so often with the fluxes that the one before expects, and counts if chi-square
+# is below so many times the number of data
+_FLUXES, _DESCRIBES = 3, 1.5
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
 # a retardance as near to half a wave as this (radian) is at it
@@ -347,12 +348,17 @@ class Model:
         if self.fit.converged:
             return self
         problem, fit = self.problem, self.problem.fit(self.fit.coefficients, **settings)
+        first, told = fit, (problem.fluxes, problem.flickering)
         follows = settings.get("steps") != 0 and any(problem.follows_flux)
         # what adds light changes the flux that it follows
         for _ in range(_FLUXES if follows else 0):
             before, fit = fit, _with_its_fluxes(problem, fit, settings)
             if fit is before:
                 break
+        # what a model that misses the data expects is not what was there
+        if fit is not first and fit.chi2 > _DESCRIBES * problem.n_data:
+            problem.follow(*told)
+            fit = first
         return Model(problem, fit, self.added)
 
     def is_physical(self, name):
