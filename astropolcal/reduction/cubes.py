@@ -153,6 +153,14 @@ class DetectorModel:
         )
         return how, per_wavelength("background", self.background, n_wavelengths)[:, None, None]
 
+    def _pixels(self, rng, shape):
+        """Return the response of the pixels of a cube, and which of them are bad."""
+        spread = number("flat_error", self.flat_error, most=0.5)
+        share = number("bad_pixels", self.bad_pixels, most=0.9)
+        # negative responses do not exist; beyond 2 sigma at the most allowed spread
+        flat = (1 + spread * rng.standard_normal(shape)).clip(0.0) if spread else 1.0
+        return flat, rng.random(shape) < share
+
 
 @dataclass(frozen=True)
 class CubeFiles:
@@ -307,11 +315,7 @@ def simulate_cubes(
     *seeds, of_pixels, of_star = map(np.random.default_rng, seeds)
     # all that may be refused is, before the first file
     centres, widths = image._places(of_star, scene, layout, n_frames)
-    spread = number("flat_error", detector.flat_error, most=0.5)
-    share = number("bad_pixels", detector.bad_pixels, most=0.9)
-    # negative responses do not exist; beyond 2 sigma at the most allowed spread
-    flat = (1 + spread * of_pixels.standard_normal(layout.shape)).clip(0.0) if spread else 1.0
-    bad = of_pixels.random(layout.shape) < share
+    flat, bad = detector._pixels(of_pixels, layout.shape)
     names = file_names(Path(directory), layout, files, n_frames)
     # part of the saturation, and both
     fullest = (0.0, 0.0, 0.0)
