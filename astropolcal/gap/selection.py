@@ -710,8 +710,11 @@ def _exchanged(task, best, first):
                 best = new
                 break
     needed = best.chosen if best is start else _needed(best.model, best.chosen)
-    # an exchange may do what another cause did
-    return best if len(needed) == len(best.chosen) else task.quickly(needed, best.model), scans
+    if len(needed) < len(best.chosen):
+        # an exchange may do what another cause did; derivatives alone do not tell
+        fewer = task.quickly(needed, best.model)
+        best = max(fewer, best, key=lambda state: state.worth(_temper(fewer, best)))
+    return best, scans
 
 
 def _beside(task, best, one, like):
