@@ -58,7 +58,7 @@ __all__ = []
 
 # equal but for rounding
 _SAME = 1e-9
-_MAX_EVALUATIONS = 500
+_MAX_EVALUATIONS, _ON_THE_WAY = 500, 20
 _MAX_ROUNDS = 4
 # residuals this many times the noise may be those of a wrong minimum: so many others are tried, and
 # one counts that leaves less than this share
@@ -108,18 +108,23 @@ def run(measurement, weighting, fitter):
 
 def until_settled(measurement, weighting, fitter, updated, rounds, what):
     """Fit in place, with a noise that comes from the fit before, until it stays as it is."""
-    # weights from the residuals of a fit that has these weights: a fixed point
-    for _ in range(rounds):
-        outcome = fit_once(measurement, weighting, fitter)
+    # weights from the residuals of a fit that has these weights: a fixed point, on the way to which
+    # no fit need be carried to the end
+    is_last = False
+    for left in reversed(range(rounds)):
+        is_last |= 2 * left < rounds
+        outcome = fit_once(measurement, weighting, fitter, None if is_last else _ON_THE_WAY)
         before, weighting = weighting, updated(weighting)
         if weighting.agrees(before):
-            return outcome, weighting
+            if outcome["converged"] or is_last:
+                return outcome, weighting
+            is_last = True
     message = f"{what} did not settle in {rounds} fits"
     return outcome | {"converged": False, "message": message}, weighting
 
 
-def fit_once(measurement, weighting, fitter):
-    """Fit in place; return whether it arrived, what it said, and how long it took."""
+def fit_once(measurement, weighting, fitter, most=None):
+    """Fit in place; return whether it arrived, what it said, and after how many evaluations."""
     stage(f"fitting {measurement.free.size} parameters")
     if type(fitter) is TRFLSQFitter and measurement.n_data > _TALL:
         # the same steps by triangular factors, for which the fitter has no place
@@ -128,7 +133,7 @@ def fit_once(measurement, weighting, fitter):
         return {"converged": found.success, "message": found.message, "evaluations": found.nfev}
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     canonical = measurement.canonical()
-    how = {"weights": weights, "maxiter": _MAX_EVALUATIONS, "inplace": True}
+    how = {"weights": weights, "maxiter": most or _MAX_EVALUATIONS, "inplace": True}
     with warnings.catch_warnings(record=True) as caught:
         # recorded, not shown: whether the fit arrived is told once, in the words of this package
         warnings.simplefilter("always", AstropyWarning)
