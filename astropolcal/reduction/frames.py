@@ -57,6 +57,9 @@ _SINGLE = "single pixels far off their neighbours were left out"
 # share of the light inside the beams of a lamp that is worth a word where it is outside them; from
 # the second on the lamp itself fills the field
 _OUTSIDE = (0.01, 0.5)
+# pixels of a twentieth are below the first percentile and above the second; below zero by so many
+# times the read noise, and by such a share of the light, they are not by noise
+_SPAN, _BELOW, _WORTH_A_WORD = (5, 95), 5.0, 0.005
 
 
 def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, options=None):
@@ -88,7 +91,9 @@ def reduce_frame(path, layout, *, source="internal", raw=None, masters=None, opt
                 frame.values["parts"] = light_in_parts(cube, good, layout).tolist()
                 frame.doubts += _background(cube, good, layout, frame.photometry) if even else []
                 dark = masters is not None and masters.dark is not None
-                frame.doubts += [] if dark else _raw(cube, good, frame, layout)
+                frame.doubts += (
+                    _overdone(cube[good], detector) if dark else _raw(cube, good, frame, layout)
+                )
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame
@@ -112,6 +117,17 @@ def _background(cube, good, layout, result):
         f"outside the beams there is {100 * share:.2g} % of the light inside, on the same area; "
         "where it is under the beams, too, they seem less polarized (background='outside', "
         "--background outside, subtracts it)"
+    ]
+
+
+def _overdone(pixels, detector):
+    """Say that a dark has left less than no light."""
+    low, high = np.percentile(pixels, _SPAN) if pixels.size else (0.0, 0.0)
+    if low >= -max(_BELOW * detector.read_noise, _WORTH_A_WORD * high):
+        return []
+    return [
+        f"less the dark, a twentieth of the pixels are below {low:.3g} {detector.unit}: the "
+        "dark is too high, or was subtracted before; beams seem more polarized than they are"
     ]
 
 
@@ -386,6 +402,8 @@ class Masters:
         raw, cube = cube, np.asarray(cube, dtype=float)
         if self.dark is not None:
             dark, unit = _image(self.dark, layout.file_shape)
+            if not dark[np.isfinite(dark)].any():
+                raise ObservationError(f"{self.dark}: all its pixels are 0; give a dark, or none")
             if not detector.counts_in(unit):
                 raise ObservationError(f"{self.dark} is in {unit}, the frame in {detector.unit}")
             cube, good = cube - dark, good & np.isfinite(dark)

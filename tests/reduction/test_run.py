@@ -333,7 +333,7 @@ def test_headers_say_which_optics_are_in_the_beam(tmp_path, small):
 def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
     rng = np.random.default_rng(5)
     clean, raw = tmp_path / "clean", tmp_path / "raw"
-    dark = rng.uniform(20, 60, (201, 201))
+    dark = rng.uniform(60, 100, (201, 201))
     flat = rng.uniform(0.5, 1.5, (201, 201))
     paths = []
     for folder in (clean, raw):
@@ -357,6 +357,14 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
     np.testing.assert_allclose(np.median(ratio), np.median(flat), rtol=5e-3)
     spoilt = reduce_run(paths[1], small).observations
     assert abs(spoilt.flux_right / wanted.flux_right - 1).max() > 0.05
+    # the dark was subtracted before, as pixels without light show
+    for path in paths[0]:
+        with fits.open(path, mode="update") as hdus:
+            hdus[1].data[:, :20] = rng.normal(0.0, 5.0, (20, 201))
+    told = reduce_run(paths[0], small, dark=masters["dark"]).doubts
+    assert all("was subtracted before" in "; ".join(why) for why in told.values())
+    assert len(told) == len(CYCLE)
+    assert "before" not in str(reduce_run(paths[1], small, **masters).doubts)
     # a journal, and a session, know when a dark was made again
     journal = {"resume": tmp_path / "journal"}
     for level in (0.0, 30.0):
@@ -364,7 +372,12 @@ def test_dark_and_flat_are_taken_out_with_their_bad_pixels(tmp_path, small):
         again = reduce_run(paths[1], small, **masters, **journal).observations
         np.testing.assert_allclose(again.flux_right > found.flux_right, level > 0)
     fits.writeto(tmp_path / "other.fits", np.ones((20, 20)))
-    for path, words in (("other.fits", r"\(20, 20\); .* is needed"), ("none.fits", "no such file")):
+    fits.writeto(tmp_path / "empty.fits", np.zeros((201, 201)))
+    for path, words in [
+        ("other.fits", r"\(20, 20\); .* is needed"),
+        ("none.fits", "no such file"),
+        ("empty.fits", "all its pixels are 0"),
+    ]:
         with pytest.raises(AstropolcalError, match=words):
             reduce_run(paths[1], small, dark=tmp_path / path)
 
