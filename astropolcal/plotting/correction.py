@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Corrected science: images of the Stokes parameters, spectra, how well they are determined."""
+"""Corrected science: images of the Stokes parameters."""
 
 import numpy as np
 
@@ -8,17 +8,7 @@ from astropolcal.plotting import _style as st
 
 __all__ = ["plot_images"]
 
-_COLORS = {"q": st.BLUE, "u": st.VERMILION, "v": st.GREEN}
-_MARKERS = {"q": "o", "u": "s", "v": "^"}
-# statistical and systematic error of the degree
-_LINES = (("o-", st.BLACK), ("s--", st.GREEN))
 _POLARIZED = ("Q", "U", "Q$_\\phi$", "U$_\\phi$")
-
-
-def plot_corrected(corrected, **options):
-    """Draw corrected images or spectra, with the options of `plot_images` or `plot_spectrum`."""
-    draw = plot_images if corrected.stokes.ndim == 4 else plot_spectrum
-    return draw(corrected, **options)
 
 
 def plot_images(corrected, *, wavelength=None, figure=None):
@@ -61,7 +51,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
     ['I', 'Q']
     """
     if corrected.stokes.ndim != 4:
-        raise ParameterError("these are spectra; plot_spectrum draws them")
+        raise ParameterError("these are spectra; plot_images draws images")
     panels = _panels(corrected, _chosen(corrected, wavelength))
     # Q, U and their azimuthal components hold the same flux: one scale for all four
     limit = _top(np.abs([panels[name] for name in _POLARIZED]))
@@ -167,60 +157,3 @@ def _heading(corrected, wavelength):
 
 
 _MODES = {"stokes": "full Mueller matrices", "ip": "instrumental polarization only"}
-
-
-def plot_spectrum(corrected, *, figure=None):
-    """Draw q and u of a point source, their errors, and how well they are determined."""
-    if corrected.stokes.ndim != 2:
-        raise ParameterError("these are images; take an aperture, or draw them with plot_images")
-    nm = st.nanometres(corrected.wavelength)
-    with st.canvas(figure, 9.0, 9.5) as figure:
-        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.3))
-        for name in corrected.components[1:].lower():
-            _values(top, nm, corrected, name)
-        top.axhline(0, color=st.GREY, linewidth=0.8)
-        top.set_ylabel("fraction of I (%)")
-        known = corrected.polarization()
-        errors = [100 * known[f"s_p_{kind}"] for kind in ("statistical", "systematic")]
-        for values, label, look in zip(errors, ("statistical", "systematic"), _LINES, strict=True):
-            if np.isfinite(values).any():
-                middle.plot(nm, values, look[0], color=look[1], label=f"$s_p$, {label}")
-        middle.set_ylabel("error of the degree (%)")
-        if middle.lines:
-            middle.set_yscale("log")
-            st.plain_numbers(middle)
-        else:
-            st.note(middle, "no errors are known")
-        bottom.plot(nm, corrected.condition, "o-", color=st.PURPLE)
-        bottom.set_ylabel("condition")
-        if np.nanmax(corrected.condition) >= 1e3:
-            bottom.set_yscale("log")
-        else:
-            # 1 is the condition of an ideal instrument, the best there is
-            bottom.set_ylim(bottom=1)
-        st.wavelength_label(bottom)
-        figure.suptitle(f"Corrected polarization ({_MODES[corrected.mode]})")
-        handles = []
-        for axes in (top, middle):
-            entries = st.legend_entries([axes])
-            # the errors of each quantity below each other, the statistical one first
-            order = sorted(entries, key=lambda label: (label.split(",")[0], "systematic" in label))
-            handles += [entries[label] for label in order]
-        st.legend_outside(figure, handles, columns=len(corrected.components))
-        figure.align_ylabels()
-    return figure
-
-
-def _values(axes, nm, corrected, name):
-    value, color = 100 * getattr(corrected, name), _COLORS[name]
-    statistical, systematic = (
-        100 * corrected.fractional_errors(kind)[name] for kind in ("statistical", "systematic")
-    )
-    known = np.isfinite(statistical)
-    label = f"{name}, statistical error" if known.any() else name
-    # a point without an error keeps its place and has no bar
-    bars = np.where(known, statistical, 0.0)
-    axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
-    if (known := np.isfinite(systematic)).any():
-        band = np.where(known, systematic, np.nan)
-        st.draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")

@@ -218,9 +218,9 @@ def _write(result, star, arguments):
         write_table(star.table(), arguments.spectrum, overwrite=True)
     if arguments.plot:
         from astropolcal.plotting._style import save
-        from astropolcal.plotting.correction import plot_corrected
+        from astropolcal.plotting.correction import plot_images
 
-        save(plot_corrected(result), arguments.plot, ObservationError)
+        save(plot_images(result), arguments.plot, ObservationError)
 
 
 def _sorted(files, instrument):

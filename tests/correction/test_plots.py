@@ -6,7 +6,7 @@ import pytest
 
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting.correction import plot_corrected, plot_images, plot_spectrum
+from astropolcal.plotting.correction import plot_images
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ def test_images_show_the_data(images):
 
 
 def test_the_mean_is_over_all_wavelengths(images):
-    panels = {axes.get_title(): axes for axes in plot_corrected(images).axes if axes.images}
+    panels = {axes.get_title(): axes for axes in plot_images(images).axes if axes.images}
     np.testing.assert_allclose(panels["Q"].images[0].get_array(), images["Q"].mean(axis=0))
-    assert "mean of 22 wavelengths" in plot_corrected(images).get_suptitle()
+    assert "mean of 22 wavelengths" in plot_images(images).get_suptitle()
 
 
 def test_east_is_left_where_north_is_up(images):
@@ -46,24 +46,8 @@ def test_east_is_left_where_north_is_up(images):
     assert "north (arcsec)" in axes.get_ylabel()
 
 
-def test_a_spectrum_shows_both_errors(images):
-    star = images.aperture(6)
-    figure = plot_spectrum(star)
-    top, middle, bottom = figure.axes
-    data = [line for line in top.lines if len(line.get_xdata()) == 22]
-    np.testing.assert_allclose(data[0].get_ydata(), 100 * star.q)
-    assert len(top.collections) >= 2
-    assert len(middle.lines) == 2
-    np.testing.assert_array_equal(bottom.lines[0].get_ydata(), star.condition)
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "q, systematic error" in labels
-    assert "$s_p$, statistical" in labels
-
-
 def test_what_is_asked_of_the_wrong_kind(images):
-    with pytest.raises(ParameterError, match="plot_images"):
-        plot_spectrum(images)
-    with pytest.raises(ParameterError, match="plot_spectrum"):
+    with pytest.raises(ParameterError, match="these are spectra; plot_images draws images"):
         plot_images(images.aperture(5))
     with pytest.raises(ParameterError, match="wavelength = 40"):
         plot_images(images, wavelength=40)

@@ -11,7 +11,7 @@ from astropolcal import optics
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting import _style, correction
-from astropolcal.plotting.correction import plot_corrected, plot_images, plot_spectrum
+from astropolcal.plotting.correction import plot_images
 
 HWP = [0, 45, 22.5, 67.5] * u.deg
 WAVELENGTH = [1.6, 1.2, 2.2] * u.um
@@ -31,16 +31,6 @@ def beams(q, u_, intensity):
 
 
 @pytest.fixture(scope="module")
-def star():
-    intensity = np.array([1e6, 2e6, 0.5e6])
-    right, left = beams(Q, U, intensity)
-    frames = ScienceFrames.from_arrays(
-        right, left, WAVELENGTH, {"hwp": HWP}, variance_right=right, variance_left=left
-    )
-    return correct(chain(), frames)
-
-
-@pytest.fixture(scope="module")
 def images():
     y, x = np.mgrid[-6:7, -6:7]
     intensity = 1e4 * np.exp(-np.hypot(x, y) / 4) * np.ones((3, 1, 1))
@@ -49,90 +39,6 @@ def images():
         right, left, WAVELENGTH, {"hwp": HWP}, variance_right=right, variance_left=left
     )
     return correct(chain(), frames)
-
-
-def bars(container):
-    line, _, (segments,) = container.lines
-    return (
-        line.get_xdata(),
-        line.get_ydata(),
-        np.array([np.ptp(s[:, 1]) / 2 for s in segments.get_segments()]),
-    )
-
-
-def legend(figure):
-    return [text.get_text() for text in figure.legends[0].get_texts()]
-
-
-# ---- spectra -------------------------------------------------------------------------------
-
-
-def test_fractions_are_drawn_in_percent_with_photon_noise(star):
-    figure = plot_spectrum(star)
-    top = figure.axes[0]
-    found = {c.get_label().split(",")[0]: bars(c) for c in top.containers}
-    for name, sign in (("q", Q), ("u", U)):
-        x, y, error = found[name]
-        np.testing.assert_allclose(x, [1600, 1200, 2200])
-        np.testing.assert_allclose(np.abs(y), 100 * abs(sign), rtol=1e-6)
-        # two of the four frames tell q, with the photons of both beams
-        expected = 100 / np.sqrt(2 * np.array([1e6, 2e6, 0.5e6]))
-        np.testing.assert_allclose(error, expected, rtol=0.01)
-    # looks of q and u differ by more than colour
-    looks = {(c.lines[0].get_marker(), c.lines[0].get_color()) for c in top.containers}
-    assert len({marker for marker, _ in looks}) == len({color for _, color in looks}) == 2
-
-
-def test_the_error_of_the_degree_is_drawn_on_a_logarithmic_axis(star):
-    figure = plot_spectrum(star)
-    middle = figure.axes[1]
-    (line,) = middle.lines
-    np.testing.assert_allclose(line.get_ydata(), 100 * star.polarization()["s_p_statistical"])
-    assert middle.get_yscale() == "log"
-    assert (middle.get_ylabel(), figure.axes[0].get_ylabel()) == (
-        "error of the degree (%)",
-        "fraction of I (%)",
-    )
-    assert figure.axes[2].get_xlabel() == "wavelength (nm)"
-    assert legend(figure) == ["q, statistical error", "u, statistical error", "$s_p$, statistical"]
-
-
-def test_condition_is_drawn_by_its_logarithm_beyond_a_thousand(star, monkeypatch):
-    bottom = plot_spectrum(star).axes[2]
-    np.testing.assert_allclose(bottom.lines[0].get_ydata(), star.condition)
-    assert bottom.get_yscale() == "linear"
-    assert bottom.get_ylim()[0] == 1
-    monkeypatch.setattr(star, "condition", np.array([2.0, 5.0, 1e6]))
-    assert plot_spectrum(star).axes[2].get_yscale() == "log"
-
-
-def test_errors_that_are_not_known_are_said_to_be_so(star, monkeypatch):
-    nothing = {name: np.full(3, np.nan) for name in "quv"}
-    monkeypatch.setattr(star, "fractional_errors", lambda kind="statistical": nothing)
-    degree = {f"s_p_{kind}": np.full(3, np.nan) for kind in ("statistical", "systematic")}
-    monkeypatch.setattr(star, "polarization", lambda: degree)
-    figure = plot_spectrum(star)
-    assert [text.get_text() for text in figure.axes[1].texts] == ["no errors are known"]
-    assert legend(figure) == ["q", "u"]
-    np.testing.assert_array_equal(bars(figure.axes[0].containers[0])[2], 0)
-
-
-def test_systematic_errors_are_bands(star, monkeypatch):
-    plain = star.fractional_errors()
-    known = plain | {name: np.full(3, 0.003) for name in "qu"}
-    monkeypatch.setattr(
-        star, "fractional_errors", lambda kind="statistical": known if kind[1] == "y" else plain
-    )
-    figure = plot_spectrum(star)
-    bands = figure.axes[0].collections
-    bands = [band for band in bands if "systematic" in band.get_label()]
-    assert [band.get_label() for band in bands] == ["q, systematic error", "u, systematic error"]
-    edges = bands[0].get_paths()[0].vertices[:, 1]
-    assert np.ptp(edges) == pytest.approx(0.6, rel=1e-3)
-    # the statistical error of each comes first
-    assert legend(figure)[:4] == [
-        f"{name}, {kind} error" for name in "qu" for kind in ("statistical", "systematic")
-    ]
 
 
 # ---- images --------------------------------------------------------------------------------
@@ -183,15 +89,6 @@ def test_the_star_is_at_the_origin(images):
     assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (0, 0)
     assert axes.get_ylabel() in ("y (pixels)", "offset to the north (pixels)", "")
     assert figure.get_supxlabel() == "+ star; grey: no value"
-
-
-def test_kind_of_the_product_decides_what_is_drawn(star, images):
-    assert len(panels(plot_corrected(images))) == 6
-    assert not panels(plot_corrected(star))
-    with pytest.raises(ParameterError, match="these are spectra; plot_spectrum draws them"):
-        plot_images(star)
-    with pytest.raises(ParameterError, match="these are images; take an aperture"):
-        plot_spectrum(images)
 
 
 # ---- small things --------------------------------------------------------------------------
