@@ -8,6 +8,7 @@ written to files and the answers of any tool can be scored.
 """
 
 import json
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
@@ -22,6 +23,7 @@ from astropolcal.files import append_line, atomic_path, read_lines, understood
 from astropolcal.gap._bench import DETECTOR, Bench, Fault, Setup
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS, get_effect
+from astropolcal.pipeline.tasks import ended_tasks
 from astropolcal.progress import shown, steps
 from astropolcal.units import check_seed
 from astropolcal.words import check_choice, counted
@@ -291,8 +293,8 @@ def _run_one(index, settings):
 
 
 def make_cases(
-    folder, n, seed=0, *, snr=(12.0, 120.0), kinds=tuple(KINDS), setup=None, client=None,
-    progress=False,
+    folder, n, seed=0, *, snr=(12.0, 120.0), kinds=tuple(KINDS), setup=None, workers=1,
+    cluster=None, progress=False,
 ):  # fmt: skip
     """Make challenges and write them to files, for any tool to answer."""
     settings = _settings(n, seed, snr, kinds, setup)
@@ -301,7 +303,8 @@ def make_cases(
         raise GapError(f"{path}: is there already; remove it, or name another folder")
     with understood(folder, GapError, "cannot be written", reads=False):
         path.parent.mkdir(parents=True, exist_ok=True)
-    made = _each(partial(_write_one, folder=str(folder)), range(n), n, settings, client, progress)
+    function = partial(_write_one, settings=settings, folder=str(folder))
+    made = _each(function, range(n), n, workers, cluster, progress)
     key = {f"case{one['index']:03d}": one["case"] for one in made}
     with atomic_path(path, GapError) as new:
         Path(new).write_text(json.dumps(dict(sorted(key.items())), indent=1) + "\n")
@@ -328,8 +331,8 @@ def score_cases(folder, outputs):
 
 
 def run_challenge(
-    n, seed=0, *, snr=(12.0, 120.0), kinds=tuple(KINDS), setup=None, client=None, checkpoint=None,
-    progress=False,
+    n, seed=0, *, snr=(12.0, 120.0), kinds=tuple(KINDS), setup=None, workers=1, cluster=None,
+    checkpoint=None, progress=False,
 ):  # fmt: skip
     """
     Make challenges, diagnose each blind, and score the answers.
@@ -346,9 +349,10 @@ def run_challenge(
         Of ``KINDS``, drawn with the frequencies given there.
     setup : Setup, optional
         What is simulated.
-    client : optional
-        A ``dask.distributed.Client``, or an executor of ``concurrent.futures``;
-        by default they run here, one after the other.
+    workers : int
+        Number of processes.
+    cluster : str, optional
+        Address of a ``dask.distributed`` scheduler, in place of processes.
     checkpoint : path-like, optional
         File to which each record is appended as a line of JSON. A run with the
         same settings goes on from it.
@@ -374,7 +378,7 @@ def run_challenge(
     settings = _settings(n, seed, snr, kinds, setup)
     records = _journal(checkpoint, settings)
     todo = [i for i in range(n) if i not in records]
-    for record in _each(_run_one, todo, n, settings, client, progress):
+    for record in _each(partial(_run_one, settings=settings), todo, n, workers, cluster, progress):
         records[record["index"]] = record
         _append(checkpoint, record)
     return ChallengeResult([records[i] for i in range(n)], settings)
@@ -395,20 +399,24 @@ def _settings(n, seed, snr, kinds, setup):
     return {"seed": int(seed), "snr": [low, high], "kinds": list(kinds), "setup": setup}
 
 
-def _each(function, todo, n, settings, client, progress):
+def _each(function, todo, n, workers, cluster, progress):
     """Yield what a function gives for each number, as it is ready, and say how far it is."""
-    if client is None:
-        found = (function(index, settings) for index in todo)
+    if workers == 1 and cluster is None:
+        found = map(function, todo)
     else:
-        if type(client).__module__.startswith("distributed"):
-            from distributed import as_completed
-        else:
-            from concurrent.futures import as_completed
-        # in any order: each record carries its number
-        futures = [client.submit(function, index, settings) for index in todo]
-        found = (future.result() for future in as_completed(futures))
+        found = _elsewhere(function, todo, workers, cluster)
     with shown(progress):
         yield from steps(found, "challenges", n, n - len(todo))
+
+
+def _elsewhere(function, todo, workers, cluster):
+    """Yield the same from other processes, in any order: each record carries its number."""
+    ended = ended_tasks(function, todo, workers=workers, cluster=cluster, preload=[__name__])
+    with closing(ended):
+        for each in ended:
+            if each.reason is not None:
+                raise GapError(f"challenge {each.task}: {each.reason}")
+            yield each.result
 
 
 def _journal(path, settings):

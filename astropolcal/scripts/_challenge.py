@@ -15,13 +15,7 @@ A run that was interrupted goes on if it is started again with the same
 checkpoint.
 """
 
-import multiprocessing
-import signal
-import sys
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-
-from astropolcal.exceptions import AstropolcalError, GapError
+from astropolcal.exceptions import GapError
 from astropolcal.progress import in_one_thread
 from astropolcal.scripts import _common as common
 from astropolcal.words import counted
@@ -40,6 +34,7 @@ folders FOLDER *  of the cases, and of the answers
 --derotator-angles N int =8  default: 8
 --checkpoint FILE Continued  append each outcome of a run to this file, and go on from it
 --workers N int =1  processes; default: 1
+--cluster ADDRESS  scheduler of dask.distributed, in place of processes
 --figure FILE Drawing  draw the rates (PNG, PDF or SVG)
 --reliability FILE Drawing  draw how many causes are right against their probability (PNG, PDF or
     SVG)
@@ -83,14 +78,13 @@ def run(arguments):
                 n_derotator=arguments.derotator_angles,
             ),
         }
-        # processes are started once for all challenges
-        with _workers(arguments.workers) as client:
-            if action == "make":
-                key = make_cases(folders[0], **options, client=client)
-                words = f"{counted(len(key), 'case')} and key.json written to {folders[0]}"
-                common.say(arguments, words)
-                return
-            result = run_challenge(**options, client=client, checkpoint=arguments.checkpoint)
+        options |= {"workers": arguments.workers, "cluster": arguments.cluster}
+        if action == "make":
+            key = make_cases(folders[0], **options)
+            words = f"{counted(len(key), 'case')} and key.json written to {folders[0]}"
+            common.say(arguments, words)
+            return
+        result = run_challenge(**options, checkpoint=arguments.checkpoint)
     figures = {arguments.figure: result.plot, arguments.reliability: result.plot_reliability}
     for path, draw in figures.items():
         if path:
@@ -98,32 +92,6 @@ def run(arguments):
 
             save(draw(), path)
     common.give(arguments, [_report(result)], result.to_dict())
-
-
-@contextmanager
-def _workers(count):
-    """Return a pool of processes, or nothing where one is enough."""
-    if count < 1:
-        raise AstropolcalError(f"--workers {count}: allowed are whole numbers from 1 up")
-    if count == 1:
-        yield None
-        return
-    others = multiprocessing.active_children()
-    # what is forked from a process with threads may hang
-    context = multiprocessing.get_context("spawn")
-    # an interruption from the keyboard goes to all processes; this one ends the others
-    ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-    pool = ProcessPoolExecutor(count, mp_context=context, **ignored)
-    try:
-        yield pool
-    except BaseException as problem:
-        if isinstance(problem, KeyboardInterrupt):
-            common.show("astropolcal: stopping ...", file=sys.stderr)
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - set(others):
-            process.terminate()
-        raise
-    pool.shutdown()
 
 
 def _report(result):

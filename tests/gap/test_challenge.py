@@ -2,7 +2,6 @@
 """Challenges: what is made, how answers are scored, what many of them tell, how a run goes on."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -11,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from astropolcal.chain import system_mueller, with_beam
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.gap import challenge
 from astropolcal.gap._bench import _COURSES, _MECHANISMS, ACTIONS, Bench, Fault
 from astropolcal.gap.challenge import (
@@ -344,19 +343,18 @@ def test_the_diagnosis_keeps_quiet_where_there_is_nothing():
 
 def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     made, path = [], tmp_path / "run.jsonl"
-    monkeypatch.setattr(challenge, "_run_one", lambda i, s: made.append(i) or record(i))
+    monkeypatch.setattr(challenge, "_run_one", lambda i, settings: made.append(i) or record(i))
     run_challenge(2, 5, checkpoint=path)
     whole = path.read_text()
     path.write_text(whole + '{"index": 2, "ki')
-    with ThreadPoolExecutor(2) as pool:
-        result = run_challenge(4, 5, checkpoint=path, client=pool)
+    result = run_challenge(4, 5, checkpoint=path)
     assert sorted(made) == [0, 1, 2, 3]
     assert [r["index"] for r in result.records] == [0, 1, 2, 3]
     assert path.read_text().startswith(whole)
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(challenge, "_run_one", lambda i, s: record(i))
+    monkeypatch.setattr(challenge, "_run_one", lambda i, settings: record(i))
     path = tmp_path / "run.jsonl"
     run_challenge(1, 1, checkpoint=path)
     with pytest.raises(GapError, match="other settings \\(seed\\)"):
@@ -385,11 +383,14 @@ def test_a_run_that_makes_no_sense_is_refused():
 
 
 @pytest.mark.long
-def test_a_cluster_of_dask_gives_the_same_answers():
+def test_processes_and_a_cluster_give_the_same_answers():
     distributed = pytest.importorskip("distributed")
     options = {"seed": 3, "kinds": ["none"], "setup": SMALL}
     here = run_challenge(2, **options).records
-    with distributed.Client(processes=False, n_workers=1, dashboard_address=None) as client:
-        there = run_challenge(2, client=client, **options).records
-    for one, two in zip(here, there, strict=True):
-        assert one | {"seconds": 0} == two | {"seconds": 0}
+    with distributed.LocalCluster(processes=False, n_workers=1, dashboard_address=None) as cluster:
+        for where in ({"workers": 2}, {"cluster": cluster.scheduler_address}):
+            there = run_challenge(2, **where, **options).records
+            for one, two in zip(here, there, strict=True):
+                assert one | {"seconds": 0} == two | {"seconds": 0}, where
+    with pytest.raises(AstropolcalError, match="workers = 0; a number above zero"):
+        run_challenge(2, workers=0, **options)
