@@ -313,7 +313,7 @@ COMMANDS = {
     ],
     "challenge -n 1 --kinds none --wavelengths 5 --derotator-angles 3": [
         "--checkpoint {new}",
-        "--figure {old}.png",
+        "--reliability {old}.png",
         "--json {old}",
     ],
     "efficiency": ["-o {old}.png", "--json {old}"],

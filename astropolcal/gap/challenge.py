@@ -51,8 +51,6 @@ _ENOUGH, _HALF = 0.9, 0.5
 _STEP = 4
 #: What an answer may be; what is wrong is confidently wrong.
 RESULTS = ("right", "silent", "wrong")
-# Okabe & Ito (2008), distinct for all kinds of colour vision, and in grey
-_COLORS = {"right": "#0072B2", "silent": "#D9D9D9", "wrong": "#D55E00"}
 _WORDS = {"right": "right", "silent": "silent", "wrong": "confidently wrong"}
 _SNR_EDGES = np.array([0, 3, 10, 20, 40, 80, np.inf])
 _EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1])
@@ -580,59 +578,18 @@ class ChallengeResult:
             lines.append(f"{given} {row['n']:5}{_percent(row, 'right')}")
         return "\n".join(lines)
 
-    def plot(self, figure=None):
-        """
-        Draw the rates by kind and by signal-to-noise ratio.
-
-        Parameters
-        ----------
-        figure : `~matplotlib.figure.Figure`, optional
-            An empty figure to draw into.
-
-        Returns
-        -------
-        `~matplotlib.figure.Figure`
-        """
-        table = self.rates
-        by_snr = np.array([name.startswith("SNR") for name in table["challenges"]], dtype=bool)
-        heights = [max(np.sum(~by_snr), 1), max(np.sum(by_snr), 1)]
-        figure = _figure(figure, (7.5, 1.6 + 0.3 * sum(heights)))
-        axes = figure.subplots(2, 1, height_ratios=heights, sharex=True)
-        for ax, rows in zip(axes, (table[~by_snr], table[by_snr]), strict=True):
-            left = np.zeros(len(rows))
-            for name in RESULTS:
-                width = 100 * np.asarray(rows[name])
-                looks = {"color": _COLORS[name], "label": _WORDS[name]}
-                bars = ax.barh(range(len(rows)), width, 0.75, left, **looks)
-                numbers = [f"{w:.0f}" if w > 6 else "" for w in width]
-                dark = "black" if name == "silent" else "white"
-                ax.bar_label(bars, numbers, label_type="center", color=dark)
-                left += width
-            labels = [f"{row['challenges']} ({row['n']})" for row in rows]
-            ax.set_yticks(range(len(rows)), labels)
-            ax.invert_yaxis()
-            ax.spines[["top", "right"]].set_visible(False)
-        axes[1].set(xlim=(0, 100), xlabel="answers (%); in brackets: number of challenges")
-        if len(table):
-            handles = axes[0].get_legend_handles_labels()
-            figure.legend(*handles, loc="outside upper center", ncols=3, frameon=False)
-        return figure
-
-    def plot_reliability(self, figure=None):
+    def plot_reliability(self):
         """
         Draw how many of the causes are right against the probability that was given.
-
-        Parameters
-        ----------
-        figure : `~matplotlib.figure.Figure`, optional
-            An empty figure to draw into.
 
         Returns
         -------
         `~matplotlib.figure.Figure`
             Points with the interval of Wilson (1927) at 68 %, numbers of causes below.
         """
-        figure, table = _figure(figure, (7.5, 5.5)), self.reliability
+        from matplotlib.figure import Figure
+
+        figure, table = Figure((7.5, 5.5), layout="constrained"), self.reliability
         top, below = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
         top.plot([0, 100], [0, 100], color="0.5", linestyle="--", label="as it should be")
         x, y, low, high = (
@@ -640,7 +597,7 @@ class ChallengeResult:
             for name in ("probability", "right", "right_low", "right_high")
         )
         bars = np.maximum([y - low, high - y], 0)
-        top.errorbar(x, y, bars, fmt="o", color=_COLORS["right"], capsize=3, label="causes given")
+        top.errorbar(x, y, bars, fmt="o", color="#0072B2", capsize=3, label="causes given")
         top.set(ylim=(-3, 103), ylabel="of them right (%)")
         top.legend(loc="upper left", frameon=False)
         left, right = 100 * np.asarray(table["from"]), 100 * np.asarray(table["to"])
@@ -652,12 +609,6 @@ class ChallengeResult:
             ax.grid(color="0.9", linewidth=0.7)
             ax.set_axisbelow(True)
         return figure
-
-
-def _figure(figure, size):
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=size, layout="constrained") if figure is None else figure
 
 
 def _rows(table):

@@ -9,7 +9,7 @@ For example::
   astropolcal challenge -n 20
   astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
   astropolcal challenge make cases --count 100 --seed 7
-  astropolcal challenge score cases outputs --figure rates.png
+  astropolcal challenge score cases outputs
 
 A run that was interrupted goes on if it is started again with the same
 checkpoint.
@@ -35,7 +35,6 @@ folders FOLDER *  of the cases, and of the answers
 --checkpoint FILE Continued  append each outcome of a run to this file, and go on from it
 --workers N int =1  processes; default: 1
 --cluster ADDRESS  scheduler of dask.distributed, in place of processes
---figure FILE Drawing  draw the rates (PNG, PDF or SVG)
 --reliability FILE Drawing  draw how many causes are right against their probability (PNG, PDF or
     SVG)
 @ json quiet
@@ -59,7 +58,7 @@ def run(arguments):
         raise GapError(
             f"challenge {action} takes {counted(wanted, 'folder')}, {len(folders)} given"
         )
-    for name in {"make": ("figure", "reliability", "checkpoint", "json")}.get(action, ()):
+    for name in {"make": ("reliability", "checkpoint", "json")}.get(action, ()):
         if (path := getattr(arguments, name)) is not None:
             raise GapError(
                 f"--{name} {path}: is for challenge run; what is made is written to {folders[0]}"
@@ -85,12 +84,10 @@ def run(arguments):
             common.say(arguments, words)
             return
         result = run_challenge(**options, checkpoint=arguments.checkpoint)
-    figures = {arguments.figure: result.plot, arguments.reliability: result.plot_reliability}
-    for path, draw in figures.items():
-        if path:
-            from astropolcal.plotting._style import save
+    if arguments.reliability:
+        from astropolcal.plotting._style import save
 
-            save(draw(), path)
+        save(result.plot_reliability(), arguments.reliability)
     common.give(arguments, [_report(result)], result.to_dict())
 
 

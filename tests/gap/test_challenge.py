@@ -302,10 +302,7 @@ def test_probabilities_are_held_against_how_often_they_are_right(result):
     np.testing.assert_allclose(points.lines[0].get_xdata(), 100 * table["probability"])
     # certainty is in the last bin, and nothing at all is a picture too
     assert ChallengeResult([record(claims=[(1.0, True)])], {}).reliability["to"][0] == 1
-    for figure in (ChallengeResult([], {}).plot_reliability(), ChallengeResult([], {}).plot()):
-        figure.canvas.draw()
-    bars = [bar for ax in result.plot().axes for bar in ax.patches]
-    assert sum(bar.get_width() for bar in bars) == pytest.approx(100 * len(result.rates))
+    ChallengeResult([], {}).plot_reliability().canvas.draw()
 
 
 # ---- how a run goes on ------------------------------------------------------------------------

@@ -23,17 +23,16 @@ def command():
 
 @pytest.mark.slow
 def test_it_prints_rates_and_writes_what_is_asked_for(command, tmp_path, capsys):
-    names = ("c.jsonl", "s.json", "f.png", "r.png")
-    checkpoint, summary, figure, reliability = (tmp_path / name for name in names)
-    options = ["--checkpoint", checkpoint, "--json", summary, "--figure", figure]
+    names = ("c.jsonl", "s.json", "r.png")
+    checkpoint, summary, reliability = (tmp_path / name for name in names)
+    options = ["--checkpoint", checkpoint, "--json", summary]
     command(*SMALL, *options, "--reliability", reliability)
     assert "2 challenges" in capsys.readouterr().out
     content = json.loads(summary.read_text())
     assert content["rates"][0] | {"right": 1.0, "n": 2} == content["rates"][0]
     assert content["settings"]["kinds"] == ["none"]
     assert len(checkpoint.read_text().splitlines()) == 3
-    for picture in (figure, reliability):
-        assert picture.read_bytes().startswith(b"\x89PNG")
+    assert reliability.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
@@ -68,7 +67,7 @@ def test_bad_input_is_refused(command):
         (["-n", "0"], "n = 0"),
         (["score", "cases"], "challenge score takes 2 folders, 1 given"),
         (["score", "nowhere", "outputs"], "no such file"),
-        (["make", "x", "--figure", "f.png"], "--figure f.png: is for challenge run; .* to x"),
+        (["make", "x", "--reliability", "f.png"], "--reliability f.png: is for .* to x"),
         (["make", "x", "--json", "-"], "--json -: is for challenge run"),
         (["make", "x", "--checkpoint", "c.jsonl"], "--checkpoint c.jsonl: is for challenge run"),
     ]:
@@ -79,4 +78,4 @@ def test_bad_input_is_refused(command):
 @pytest.mark.slow
 def test_an_unknown_format_of_the_figure_is_refused(command, tmp_path):
     with pytest.raises(AstropolcalError, match="odd"):
-        command(*SMALL, "-n", "1", "--figure", tmp_path / "f.odd")
+        command(*SMALL, "-n", "1", "--reliability", tmp_path / "f.odd")
