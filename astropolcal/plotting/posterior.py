@@ -1,19 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Samples of a posterior: corner plot, traces, and autocorrelation."""
+"""Samples of a posterior: the corner plot."""
 
 import numpy as np
 
-from astropolcal.calibration.posterior.samples import ENOUGH, autocorrelation, need
+from astropolcal.calibration.posterior.samples import ENOUGH, need
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas
+from astropolcal.plotting._style import BLUE, MINUS, VERMILION, canvas
 
-__all__ = ["plot_corner", "plot_traces"]
+__all__ = ["plot_corner"]
 
 __doctest_requires__ = {"plot_corner": ["corner"]}
 
 # more panels than this cannot be read
 MAX_CORNER = 12
-MAX_TRACES = 16
 # behind words that stand on data
 _PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 _MARGIN = 1.35
@@ -171,104 +170,3 @@ def _heading(posterior, marked):
     if marked:
         lines.append("orange: fitted values")
     return "\n".join(lines)
-
-
-def plot_traces(posterior, parameters=None, *, figure=None):
-    r"""
-    Draw the walkers against steps, and the autocorrelation, one row per parameter.
-
-    Of a posterior that is thinned the autocorrelation is not known; instead
-    of it the samples are counted, with their quantiles 0.16, 0.5 and 0.84.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        The samples.
-    parameters : sequence of str, optional
-        Names, such as ``hwp.w_sio2``; by default all, up to 16.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If a parameter is unknown, or there are more than 16.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import astropy.units as u
-    >>> from astropolcal.calibration.posterior import Posterior
-    >>> from astropolcal.plotting import plot_traces
-    >>> chain = np.random.default_rng(1).normal(size=(500, 8, 1))
-    >>> plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes[0].get_ylabel()
-    'hwp\ntheta (deg)'
-    """
-    columns = _columns(posterior, parameters, MAX_TRACES)
-    thinned = posterior.is_thinned
-    with canvas(figure, 10, 1.6 + 1.7 * len(columns)) as figure:
-        panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
-        for (trace, right), column in zip(panels, columns, strict=True):
-            chain, steps = posterior.chain[:, :, column], posterior.steps
-            # so many points of a walker, and of all walkers, which become a solid band far earlier
-            every = max(len(chain) // 2000, chain.size // 50_000, 1)
-            trace.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
-            middle = np.median(chain[::every], axis=1)
-            trace.plot(steps[::every], middle, color=BLACK, linewidth=1.0)
-            if posterior.burn_in:
-                # steps are counted before thinning
-                end = posterior.burn_in * posterior.thin
-                trace.axvspan(0, end, color=GREY, alpha=0.25, linewidth=0)
-            # the chain begins at the axis, so that a burn-in is seen as such
-            trace.margins(x=0)
-            trace.set_ylabel(_label(posterior, column), fontsize=9.5)
-            (_histogram if thinned else _correlation)(right, posterior, column)
-            time = posterior.autocorrelation_times[column]
-            if np.isfinite(time):
-                look = {"xycoords": "axes fraction", "ha": "right", "va": "top", "bbox": _PAPER}
-                right.annotate(f"τ = {time:.0f}", (0.97, 0.9), **look)
-        burn_in = "burn-in left out" if thinned else "grey: burn-in, left out"
-        _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
-        if thinned:
-            panels[0, 1].set_title("samples and their quantiles")
-        else:
-            _join(panels[:, 1], "autocorrelation", "lag (steps)")
-        figure.suptitle(_heading(posterior, marked=False))
-    return figure
-
-
-def _join(panels, title, label):
-    """Name a column and give its panels one scale."""
-    panels[0].set_title(title)
-    panels[-1].set_xlabel(label)
-    for axes in panels[:-1]:
-        axes.sharex(panels[-1])
-        axes.tick_params(labelbottom=False)
-
-
-def _histogram(axes, posterior, column):
-    """Count the samples sideways, on the scale of the trace beside it."""
-    values = posterior.chain[:, :, column].ravel()
-    axes.hist(values, bins=40, orientation="horizontal", color=BLUE, alpha=0.5)
-    found = posterior.convergence
-    for key, dashes in (("lower", "--"), ("median", "-"), ("upper", "--")):
-        axes.axhline(getattr(found, key)[column], color=BLACK, linewidth=1.0, linestyle=dashes)
-    axes.set_xticks([])
-    axes.tick_params(labelleft=False)
-    axes.grid(False)
-
-
-def _correlation(axes, posterior, column):
-    """Draw the autocorrelation out to ten of the longest times, or as far as it goes."""
-    values = autocorrelation(posterior.chain[posterior.burn_in :, :, column])
-    longest = np.nanmax(posterior.autocorrelation_times, initial=1.0) / posterior.thin
-    shown = values[: max(int(10 * longest), 10)]
-    time = posterior.autocorrelation_times[column]
-    axes.plot(np.arange(len(shown)) * posterior.thin, shown, color=BLUE)
-    axes.axhline(0, color=BLACK, linewidth=0.7)
-    if np.isfinite(time):
-        axes.axvline(time, color=VERMILION, linewidth=1.2)

@@ -25,7 +25,7 @@ from astropolcal.plotting.parameters import (
     plot_parameters,
     plot_retardances,
 )
-from astropolcal.plotting.posterior import MAX_CORNER, MAX_TRACES, plot_corner, plot_traces
+from astropolcal.plotting.posterior import MAX_CORNER, plot_corner
 from astropolcal.plotting.residuals import plot_double_differences, plot_residuals
 from astropolcal.progress import stage, steps
 
@@ -39,9 +39,8 @@ def save_all(calibration, folder):
     Figures for which the chain has no such optic, or the calibration no data (when it was read from
     a file), are left out. Each file appears complete or not at all; existing ones are replaced.
 
-    Where the calibration has a posterior, ``corner.png`` shows the parameters
-    common to all wavelengths, and ``traces.png`` these and, as far as there is
-    room, those of the longest autocorrelation times.
+    Where the calibration has a posterior, ``corner.png`` shows the parameters common to all
+    wavelengths, or else those of the longest autocorrelation times.
 
     Parameters
     ----------
@@ -56,13 +55,13 @@ def save_all(calibration, folder):
         The files: of ``double_differences.png`` (``double_differences_2.png`` for the second
         dataset, and so on), ``residuals.png``, ``accuracy.png``, ``targets.png``, ``mirrors.png``,
         ``star.png`` (one per star that was checked), ``retardances.png``, ``efficiency.png``,
-        ``correlations.png``, ``identifiability.png``, ``other_parameters.png``, ``traces.png`` and
+        ``correlations.png``, ``identifiability.png``, ``other_parameters.png`` and
         ``corner.png`` those that could be drawn.
 
     Warns
     -----
     AstropolcalWarning
-        If a figure of the posterior cannot be drawn, for instance as corner is not installed.
+        If the figure of the posterior cannot be drawn, for instance as corner is not installed.
 
     Raises
     ------
@@ -94,32 +93,27 @@ def save_all(calibration, folder):
         # no such optic, no data in a file, or no datum left: the figure has nothing to show
         with suppress(ChainError, CalibrationFileError, ObservationError):
             paths.append(save(draw(), folder / f"{name}.png"))
-    kinds = {"traces": (plot_traces, MAX_TRACES), "corner": (plot_corner, MAX_CORNER)}
-    for name, (draw, most) in kinds.items() if calibration.posterior is not None else ():
-        path, posterior = folder / f"{name}.png", calibration.posterior
+    if (posterior := calibration.posterior) is not None:
+        path = folder / "corner.png"
+        # a package that is not installed, or a parameter that did not move
         try:
-            figure = draw(posterior, _drawn(posterior, most, fill=draw is plot_traces))
-        # a package that is not installed, or a parameter that did not move, costs one figure, not
-        # all
+            paths.append(save(plot_corner(posterior, _drawn(posterior)), path))
         except AstropolcalError as error:
             warn(f"{path} is not drawn: {error}")
-        else:
-            paths.append(save(figure, path))
     return paths
 
 
-def _drawn(posterior, most, fill):
-    """Return what is common to all wavelengths, then the slowest of the others where wanted."""
+def _drawn(posterior):
+    """Return what is common to all wavelengths, or else the slowest, as many as a figure holds."""
     names = posterior.names
-    if len(names) <= most:
+    if len(names) <= MAX_CORNER:
         return names
     # one per wavelength ends in its index: hwp.retardance[3]
-    common = [name for name in names if not name.endswith("]")][:most]
+    common = [name for name in names if not name.endswith("]")]
     times = posterior.autocorrelation_times
     # what does not move comes first
     order = np.argsort(-np.where(np.isnan(times), np.inf, times), kind="stable")
-    others = [names[i] for i in order if names[i] not in common]
-    return common + others[: most - len(common)] if fill or not common else common
+    return (common or [names[i] for i in order])[:MAX_CORNER]
 
 
 def _figures(calibration):

@@ -57,7 +57,6 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
         "targets.png",
         "efficiency.png",
         "correlations.png",
-        "traces.png",
         "corner.png",
     ]
     # nothing half-written or temporary stays behind
@@ -134,21 +133,17 @@ def with_posterior(calibration, names=None, seed=1):
 
 @pytest.fixture
 def drawn(monkeypatch, unpainted):
-    """What the figures of a posterior were asked to show."""
+    """What the figure of a posterior was asked to show."""
     pytest.importorskip("corner")
     from astropolcal.plotting import saving
 
-    shown = {}
+    shown = []
 
-    def remember(draw):
-        def remembering(posterior, parameters):
-            shown[draw.__name__] = parameters
-            return Figure(figsize=(2, 2))
+    def remembering(posterior, parameters):
+        shown[:] = parameters
+        return Figure(figsize=(2, 2))
 
-        return remembering
-
-    for draw in (saving.plot_traces, saving.plot_corner):
-        monkeypatch.setattr(saving, draw.__name__, remember(draw))
+    monkeypatch.setattr(saving, "plot_corner", remembering)
     return shown
 
 
@@ -158,35 +153,29 @@ def test_posterior_of_a_file_is_drawn(elliptical, tmp_path):
     pytest.importorskip("corner")
     sampled = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2", "wollaston.efficiency[0]"])
     stored = replace(sampled, posterior=sampled.posterior.thinned(), measurement=None)
-    assert names(save_all(stored, tmp_path))[-2:] == ["traces.png", "corner.png"]
+    assert names(save_all(stored, tmp_path))[-1] == "corner.png"
 
 
 @pytest.mark.slow
 def test_few_parameters_are_all_drawn_and_of_many_the_slowest(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical, elliptical.covariance.names[:12])
     save_all(sampled, tmp_path)
-    assert drawn["plot_traces"] == drawn["plot_corner"] == sampled.posterior.names
+    assert drawn == sampled.posterior.names
     # of many without common ones the slowest
     sampled = with_posterior(elliptical, [n for n in elliptical.covariance.names if "[" in n])
     save_all(sampled, tmp_path)
-    assert len(drawn["plot_corner"]) == 12
-    assert drawn["plot_corner"] == drawn["plot_traces"][:12]
+    times = dict(zip(sampled.posterior.names, sampled.posterior.autocorrelation_times, strict=True))
+    assert len(drawn) == 12
+    assert [times[name] for name in drawn] == sorted(times.values(), reverse=True)[:12]
 
 
-def test_of_many_parameters_the_common_and_the_slowest_are_drawn(elliptical, tmp_path, drawn):
+def test_of_many_parameters_the_common_ones_are_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical)
     posterior = sampled.posterior
     common = [name for name in posterior.names if not name.endswith("]")]
     assert 0 < len(common) < 12 < len(posterior.names) - len(common)
     save_all(sampled, tmp_path)
-    assert drawn["plot_corner"] == common
-    assert drawn["plot_traces"][: len(common)] == common
-    others = drawn["plot_traces"][len(common) :]
-    assert len(others) + len(common) == 16
-    times = dict(zip(posterior.names, posterior.autocorrelation_times, strict=True))
-    assert [times[name] for name in others] == sorted((times[n] for n in others), reverse=True)
-    left_out = set(posterior.names) - set(common) - set(others)
-    assert max(times[name] for name in left_out) <= times[others[-1]]
+    assert drawn == common
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -197,7 +186,7 @@ def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkey
     message = r"corner\.png is not drawn: the corner plot needs the package corner, .*pip install"
     with pytest.warns(AstropolcalWarning, match=message):
         found = names(save_all(sampled, tmp_path))
-    assert found[-1] == "traces.png"
+    assert found[-1] == "correlations.png"
     assert not (tmp_path / "corner.png").exists()
 
 
@@ -208,7 +197,7 @@ def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path
     stuck = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2"])
     stuck.posterior.chain[:, :, 0] = 1.65
     with pytest.warns(AstropolcalWarning, match=r"corner\.png is not drawn: .* did not move"):
-        assert names(save_all(stuck, tmp_path))[-1] == "traces.png"
+        assert names(save_all(stuck, tmp_path))[-1] == "correlations.png"
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -279,11 +268,12 @@ def test_importing_the_package_does_not_import_matplotlib():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_what_does_not_move_is_drawn_first():
+def test_what_does_not_move_is_drawn_first(monkeypatch):
     names = [f"a.x[{i}]" for i in range(4)] + ["hwp.theta"]
-    posterior = SimpleNamespace(
-        names=names, autocorrelation_times=np.array([3.0, np.nan, 9.0, 5.0, 1.0])
-    )
-    assert saving._drawn(posterior, 5, True) == names
-    assert saving._drawn(posterior, 3, True) == ["hwp.theta", "a.x[1]", "a.x[2]"]
-    assert saving._drawn(posterior, 3, False) == ["hwp.theta"]
+    times = np.array([3.0, np.nan, 9.0, 5.0, 1.0])
+    posterior = SimpleNamespace(names=names, autocorrelation_times=times)
+    assert saving._drawn(posterior) == names
+    monkeypatch.setattr(saving, "MAX_CORNER", 3)
+    assert saving._drawn(posterior) == ["hwp.theta"]
+    own = SimpleNamespace(names=names[:4], autocorrelation_times=times[:4])
+    assert saving._drawn(own) == ["a.x[1]", "a.x[2]", "a.x[3]"]

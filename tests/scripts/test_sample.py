@@ -143,7 +143,7 @@ def test_json_has_the_calibration_and_its_posterior(sampled, calibration):
 def test_figures_have_those_of_the_posterior(sampled):
     found = {path.name for path in (sampled / "p").iterdir()}
     # the data are there too
-    assert {"corner.png", "traces.png", "residuals.png", "accuracy.png"} <= found
+    assert {"corner.png", "residuals.png", "accuracy.png"} <= found
 
 
 @pytest.mark.slow
@@ -252,7 +252,7 @@ def test_missing_corner_costs_one_figure(calibration, table, tmp_path, capsys, m
     assert "corner.png is not drawn: the corner plot needs the package corner" in error
     assert 'pip install "astropolcal[mcmc]"' in error
     names = {path.name for path in folder.iterdir()}
-    assert "traces.png" in names
+    assert "correlations.png" in names
     assert "corner.png" not in names
 
 
