@@ -317,7 +317,6 @@ COMMANDS = {
         "--json {old}",
     ],
     "efficiency": ["-o {old}.png", "--json {old}"],
-    "standards 'HD 293396' --site subaru --night 2025-11-03": ["--plot {old}.png"],
     "standards": ["--json {old}"],
     "info few.ecsv": ["--json {old}"],
 }

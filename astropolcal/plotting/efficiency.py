@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What instruments can measure: polarimetric efficiency, optics side by side, stars of a night."""
+"""What instruments can measure: polarimetric efficiency, optics side by side."""
 
 from functools import partial
 
@@ -10,10 +10,9 @@ from astropy.table import QTable
 from astropolcal.calibration.result.comparison import compare
 from astropolcal.chain import stages
 from astropolcal.efficiency import has_derotator, polarimetric_efficiency
-from astropolcal.exceptions import ParameterError
 from astropolcal.plotting import _style as st
 
-__all__ = ["plot_comparison", "plot_observability"]
+__all__ = ["plot_comparison"]
 
 _DEROTATOR = np.arange(0, 181, 2.5)
 _ALTITUDE = np.arange(20, 91, 5.0)
@@ -262,106 +261,3 @@ def _draw_member(axes, rows, label, color, marker):
         for x in lam[np.isinf(std)]:
             axes[panel].axvline(x, color=color, linewidth=1.0, alpha=0.6)
     return handles[0]
-
-
-# ---- standard stars over a night ---------------------------------------------------------------
-_MOST = 8
-_TICK = 45
-
-
-def plot_observability(seen, *, total=None, figure=None):
-    """
-    Draw altitude and parallactic angle of stars against time.
-
-    The curves are thick while a star is above its lowest altitude, thin and
-    dotted below; only dark hours are drawn. The parallactic angle has no jumps, as
-    in the table of a star: the axis goes beyond 180 deg where a star does.
-
-    Parameters
-    ----------
-    seen : sequence of Observability
-        Up to eight stars of one night at one site.
-    total : int, optional
-        Of how many stars these are the first, for the title.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If there is no star, are too many, or they are of different nights or sites.
-
-    Examples
-    --------
-    >>> from astropolcal import standards
-    >>> from astropolcal.plotting import plot_observability
-    >>> seen = [standards.observability(n, "subaru", "2025-11-03") for n in
-    ...         ("HD 293396", "HD 30675")]
-    >>> len(plot_observability(seen).axes)
-    2
-    """
-    seen = list(seen)
-    if not 1 <= len(seen) <= _MOST:
-        raise ParameterError(f"{len(seen)} stars cannot be drawn; allowed are 1 to {_MOST}")
-    first = seen[0]
-    for star in seen:
-        if star.night != first.night or not np.all(star.site == first.site):
-            raise ParameterError(
-                f"{star.name} and {first.name} are of different nights or sites; draw them apart"
-            )
-    # UTC, before the first dark hour of the first star
-    midnight = np.floor(seen[0].table["time"][0].mjd)
-    stars = list(zip(seen, st.looks(len(seen)), strict=True))
-    with st.canvas(figure, 8.0, 6.4) as figure:
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        for star, look in stars:
-            hours = (star.table["time"].mjd - midnight) * 24
-            for axes, key in ((upper, "altitude"), (lower, "parallactic")):
-                _curve(axes, hours, star.table[key].value, star.table["observable"], *look)
-        _finish(upper, lower, seen)
-        handles = [
-            upper.plot([], [], color=color, marker=marker, label=star.name)[0]
-            for star, (color, marker) in stars
-        ]
-        dotted = upper.plot([], [], color=st.GREY, ls=":", label="too low to observe")
-        st.legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
-        few = total is not None and total > len(seen)
-        which = f"The first {len(seen)} of {total} standard stars" if few else "Standard stars"
-        figure.suptitle(f"{which}, night of {seen[0].night}\n{_place(seen[0].site)}")
-    return figure
-
-
-def _place(site):
-    lon, lat = site.lon.wrap_at(180 * u.deg).deg, site.lat.deg
-    name = f"{site.info.name}, " if site.info.name else ""
-    east, north = "E" if lon >= 0 else "W", "N" if lat >= 0 else "S"
-    return f"{name}{abs(lon):.2f}° {east}, {abs(lat):.2f}° {north}"
-
-
-def _curve(axes, hours, values, good, color, marker):
-    """Draw one star: faint below the limit, with markers where it is observable."""
-    seen = np.where(good, values, np.nan)
-    axes.plot(hours, values, color=color, linestyle=":", linewidth=1)
-    axes.plot(hours, seen, color=color, linewidth=2)
-    # a marker every hour tells the curves apart without colour
-    every = max(len(hours) // max(int(hours[-1] - hours[0]), 1), 1)
-    axes.plot(hours[::every], seen[::every], color=color, marker=marker, ls="")
-
-
-def _finish(upper, lower, seen):
-    for limit in {float(star.min_altitude.value) for star in seen}:
-        upper.axhline(limit, color=st.GREY, linestyle="--", linewidth=1)
-    upper.set(ylabel="altitude (deg)", ylim=(0, 90), yticks=np.arange(0, 91, 15))
-    angles = np.concatenate([star.table["parallactic"].value for star in seen])
-    low = min(_TICK * np.floor(angles.min() / _TICK), -180)
-    high = max(_TICK * np.ceil(angles.max() / _TICK), 180)
-    # twice as wide where the labels would crowd
-    step = _TICK if high - low <= 405 else 2 * _TICK
-    lower.set(ylabel="parallactic angle (deg)", ylim=(low, high))
-    lower.set_yticks(np.arange(low, high + 1, step))
-    date = seen[0].table["time"][0].to_value("iso", "date")
-    lower.set_xlabel(f"time on {date} (hours UTC)")

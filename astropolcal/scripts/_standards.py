@@ -8,7 +8,7 @@ diattenuation of the telescope first. With a name, all that is known of a star.
 For example::
 
   astropolcal standards --kind polarized --band H --magnitude 4,8
-  astropolcal standards --site subaru --night 2025-11-03 --plot night.png
+  astropolcal standards --site subaru --night 2025-11-03
   astropolcal standards HD30675
 """
 
@@ -37,7 +37,6 @@ name NAME ?  a star, such as 'HD 293396'
 --night YYYY-MM-DD  date of the evening at the site
 --min-altitude DEG float  goes with --night: lowest altitude (default: 30)
 --limit N int  how many to list, the best first (default: 20 of a night, else all)
---plot FILE Drawing  draw altitude and parallactic angle over the night
 @ json online quiet
 """
 TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.numbers, 2)}
@@ -48,13 +47,7 @@ def run(arguments):
     _check(arguments)
     if arguments.min_altitude is None:
         arguments.min_altitude = 30.0
-    # text for people, content for machines, nights for the figure
-    lines, content, seen, total = (_one if arguments.name else _many)(arguments)
-    if arguments.plot:
-        from astropolcal.plotting import plot_observability
-        from astropolcal.plotting._style import save
-
-        save(plot_observability(seen, total=total), arguments.plot)
+    lines, content = (_one if arguments.name else _many)(arguments)
     common.give(arguments, lines, content)
 
 
@@ -62,8 +55,6 @@ def _check(arguments):
     """Refuse options that lack their companion or do nothing."""
     if (arguments.site is None) != (arguments.night is None):
         raise ParameterError("--site and --night go together")
-    if arguments.plot and arguments.night is None:
-        raise ParameterError("--plot needs --site and --night")
     if arguments.min_altitude is not None and arguments.night is None:
         raise ParameterError("--min-altitude needs --site and --night")
     if arguments.radius is not None and arguments.near is None:
@@ -83,7 +74,7 @@ def _one(arguments):
     content = _facts(star)
     lines = _describe(star, content["known"])
     if arguments.night is None:
-        return lines, content, [], 1
+        return lines, content
     seen = _observability(star.name, arguments)
     (low, high), (first, last) = seen.altitude.value, seen.parallactic.value
     content |= {"site": arguments.site, "night": seen.night, "hours": seen.hours.value}
@@ -103,7 +94,7 @@ def _one(arguments):
         f"  parallactic  {first:z.1f} to {last:z.1f} deg",
         f"  M3 error     {with_error(error, '.3f')} of one frame's error (32 frames)",
     ]
-    return lines, content, [seen], 1
+    return lines, content
 
 
 def _observability(name, arguments):
@@ -176,11 +167,7 @@ def _many(arguments):
     lines += _band_lines(shown, arguments)
     if more := len(found) - len(shown):
         lines += ["", f"{counted(more, 'more star')}; --limit {len(found)} lists all"]
-    # ordered by the score already; more than five make a figure unreadable
-    best = shown["name"][:5] if arguments.plot else []
-    if 0 < len(best) < len(shown):
-        lines += ["", f"The figure shows the first {len(best)} of {len(shown)} stars."]
-    return lines, content, [_observability(str(name), arguments) for name in best], len(shown)
+    return lines, content
 
 
 def _band_lines(shown, arguments):

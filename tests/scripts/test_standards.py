@@ -88,19 +88,11 @@ def test_json_of_many_to_the_standard_output(capsys):
     assert {"altitude_min_deg", "parallactic_max_deg", "hours"} <= set(content["stars"][0])
 
 
-def test_plot_is_written(capsys, tmp_path):
-    path = tmp_path / "night.png"
-    call("--kind", "unpolarized", "--magnitude", "9,10", *NIGHT, "--plot", str(path))
-    assert path.read_bytes()[:4] == b"\x89PNG"
-    assert "HD 14069" in capsys.readouterr().out
-
-
 def test_bad_input_is_refused_with_what_is_allowed(tmp_path, monkeypatch):
     for argv, words in [
         (["HD 30676"], "did you mean HD 30675"),
         (["HD 30675", "--kind", "polarized"], "--kind selects among stars"),
         (["HD 30675", "--site", "subaru"], "go together"),
-        (["HD 30675", "--plot", "x.png"], "--plot needs --site and --night"),
         (["HD 30675", "--site", "subaru", "--night", "2025-02-30"], "night = '2025-02-30'"),
         (["HD 30675", "--site", "atlantis", "--night", "2025-11-03"], "--site atlantis: not known"),
         (["--site", "3", "--night", "2025-11-03"], "--site 3: .*, or LON,LAT,HEIGHT in deg, deg"),
@@ -131,9 +123,7 @@ def test_a_range_of_magnitudes_is_two_numbers(capsys):
         assert f"'{text}' is not 2 numbers" in capsys.readouterr().err
 
 
-def test_an_unknown_format_or_folder_leaves_no_file(tmp_path):
-    with pytest.raises(AstropolcalError, match=r"night\.xyz"):
-        call("HD 30675", *NIGHT, "--plot", str(tmp_path / "night.xyz"))
+def test_an_unknown_folder_leaves_no_file(tmp_path):
     with pytest.raises(AstropolcalError, match="no folder"):
         call("HD 30675", "--json", str(tmp_path / "no" / "star.json"))
     assert list(tmp_path.iterdir()) == []
@@ -202,14 +192,6 @@ def test_a_column_of_zero_has_no_sign():
         columns[f"parallactic_{end}"] = [value] * u.deg
     line = _night_table(QTable(columns))[1]
     assert "   0 to    0" in line
-
-
-@pytest.mark.slow
-def test_a_figure_of_fewer_stars_than_are_listed_says_so(capsys, tmp_path):
-    plot = ["--plot", str(tmp_path / "night.png")]
-    text = printed(capsys, *NIGHT, "--limit", "6", *plot)
-    assert "The figure shows the first 5 of 6 stars." in text
-    assert "figure" not in printed(capsys, *NIGHT, "--limit", "5", *plot)
 
 
 def test_what_is_of_another_band_is_said(capsys):
