@@ -77,48 +77,6 @@ def plot_polarimetric_efficiency(
     return fig
 
 
-def plot_derotator_offsets(best, *, title=None, figure=None):
-    """
-    Draw mean and least efficiency of an observation, a ``BestDerotator``, against the offset.
-
-    Over its times, wavelengths and angles of polarization; the best offset is marked.
-    """
-    # offsets may have been tried in any order
-    table = best.table[np.argsort(best.table["offset"])]
-    offset = table["offset"].to_value(u.deg)
-    # markers tell the lines apart without colour; at all offsets they would be a band
-    every = max(1, len(offset) // 12)
-    with st.canvas(figure, 6.5, 5.2) as fig:
-        ax = fig.subplots()
-        for (color, marker), name in zip(st.looks(2), ("mean", "least"), strict=True):
-            ax.plot(offset, table[name], color=color, marker=marker, markevery=every, label=name)
-        words = f"best offset, {_degree(best.offset)}"
-        marked = best.offset.to_value(u.deg)
-        ax.axvline(marked, color="black", linestyle="--", label=words, zorder=1)
-        # optics before the analyzer may add polarization of their own
-        ax.set(xlabel="derotator offset (deg)", ylabel=_SHARE)
-        ax.set(ylim=(-0.02, 1.02 * max(1.0, np.max(table["mean"]))))
-        ax.set_title(f"{best.law} stabilized; over all times and wavelengths")
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
-        fig.suptitle(title or "Polarimetric efficiency of an observation")
-    return fig
-
-
-def plot_efficiencies(found, wavelength, *, title=None, figure=None):
-    """Draw the efficiency of each Stokes parameter of a ``Demodulation`` by wavelength."""
-    lam = st.nanometres(wavelength)
-    with st.canvas(figure, 5.5, 4.5) as fig:
-        ax = fig.subplots()
-        for (color, marker), name, values in zip(
-            st.looks(len(found.components)), found.components, found.efficiency.T, strict=True
-        ):
-            st.draw_line(ax, lam, values, color=color, marker=marker, label=name)
-        ax.set(xlabel="wavelength (nm)", ylabel="efficiency", ylim=(0, 1.05))
-        ax.legend(ncols=len(found.components))
-        fig.suptitle(title or "Efficiency of each Stokes parameter")
-    return fig
-
-
 def _degree(angle):
     return f"{u.Quantity(angle).to_value(u.deg):g}°"
 

@@ -49,8 +49,7 @@ file CAL.asdf ? Input  calibration
 --law MODE  what the derotator stabilizes, such as field (default: pupil); with --target, or where
     the law of the half-wave plate depends on it
 --date DATE  of the telescope's mirrors, where that matters
--o --output FILE Drawing  save the figure (PNG, PDF, SVG); with --target that of the derotator
-    offsets
+-o --output FILE Drawing  save the figure (PNG, PDF, SVG), of instruments with a half-wave plate
 @ json online quiet
 """
 
@@ -64,17 +63,16 @@ def run(arguments):
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
     arguments.parallactic = arguments.parallactic or 0.0
     instrument, (chain, *others), grid, settings = _chains(arguments)
-    found = None
     if not efficiency.has_plate(chain):
         chains = [chain, *others]
-        content, lines, found = _any_modulation(arguments, instrument, chains, grid, settings)
+        content, lines = _any_modulation(arguments, instrument, chains, grid, settings)
     else:
         content, lines = _table(arguments, instrument, chain, grid)
         if planned:
-            found, content["best_derotator"], words = _best(arguments, instrument, chain, grid)
+            content["best_derotator"], words = _best(arguments, instrument, chain, grid)
             lines = [*lines, "", *words] if tabulated else words
     if arguments.output:
-        _draw(arguments, instrument, chain, grid, found)
+        _draw(arguments, instrument, chain, grid)
     common.give(arguments, lines, content, arguments.output, arguments.json)
 
 
@@ -101,9 +99,10 @@ def _any_modulation(arguments, instrument, chains, grid, settings):
     """Return the efficiencies of the frames that were calibrated, of any modulator."""
     from astropolcal.calibration.identifiability.sky import chain_from_sky, sequence_of
 
-    for option in ("derotator", "target", "night", "law"):
+    for option in ("derotator", "target", "night", "law", "output"):
         if getattr(arguments, option):
-            raise ParameterError(f"--{option}: is for instruments with a half-wave plate")
+            label = common.label_of(option)
+            raise ParameterError(f"{label}: is for instruments with a half-wave plate")
     chain = chain_from_sky(chains, instrument, grid, arguments.date)[0]
     own = [stage for stage in stages(chain) if stage not in ("altitude", "parallactic")]
     placed = sequence_of(own, settings)
@@ -132,7 +131,7 @@ def _any_modulation(arguments, instrument, chains, grid, settings):
     content["efficiency"] = found.efficiency.T[:, rows]
     words = f"Efficiencies of {counted(len(frames), 'frame')} of {instrument.name} "
     words += "(del Toro Iniesta & Collados 2000)"
-    return content, _table_lines(words, " ", found.components, content), found
+    return content, _table_lines(words, " ", found.components, content)
 
 
 def _table_lines(title, corner, names, content):
@@ -223,7 +222,7 @@ def _rows(wanted, grid):
 
 
 def _best(arguments, instrument, chain, grid):
-    """Return the best derotator offset, the statements on it, and the same in words."""
+    """Return the statements on the best derotator offset, and the same in words."""
     if not (arguments.target and arguments.night):
         raise ParameterError("--target and --night belong together")
     if instrument.location is None:
@@ -258,7 +257,7 @@ def _best(arguments, instrument, chain, grid):
         f"  mean {found['mean']:z.3f}; with the worst offset the least is "
         f"{found['least_of_any_offset']:z.3f}",
     ]
-    return best, found, words
+    return found, words
 
 
 def _times(text):
@@ -276,22 +275,15 @@ def _times(text):
     return moments
 
 
-def _draw(arguments, instrument, chain, grid, found):
-    """Draw what was found: the efficiencies of any modulator, of derotator offsets, or the map."""
-    from astropolcal.plotting import efficiency as figures
+def _draw(arguments, instrument, chain, grid):
+    """Draw the efficiency against derotator angle, wavelength and pointing."""
     from astropolcal.plotting._style import save
+    from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
 
+    settings = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
+    shown = None if arguments.wavelength is None else arguments.wavelength * u.um
+    # one angle a figure, the last that was asked for
+    settings |= {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
+    settings |= {"instrument": instrument, "mode": _mode(arguments, instrument)}
     title = _TITLE.format(instrument.name)
-    if not efficiency.has_plate(chain):
-        figure = figures.plot_efficiencies(found, grid, title=title)
-    elif found is not None:
-        title = f"{title}\ntarget {arguments.target}, {arguments.night}"
-        figure = figures.plot_derotator_offsets(found, title=title)
-    else:
-        settings = {key: getattr(arguments, key) * u.deg for key in ("altitude", "parallactic")}
-        shown = None if arguments.wavelength is None else arguments.wavelength * u.um
-        # one angle a figure, the last that was asked for
-        settings |= {"derotator": (arguments.derotator or [90.0])[-1] * u.deg, "shown": shown}
-        settings |= {"instrument": instrument, "mode": _mode(arguments, instrument)}
-        figure = figures.plot_polarimetric_efficiency(chain, grid, title=title, **settings)
-    save(figure, arguments.output)
+    save(plot_polarimetric_efficiency(chain, grid, title=title, **settings), arguments.output)

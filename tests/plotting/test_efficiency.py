@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from astropolcal import instruments, optics
 from astropolcal.chain import remove_optic
-from astropolcal.efficiency import best_derotator, polarimetric_efficiency
+from astropolcal.efficiency import polarimetric_efficiency
 from astropolcal.instruments import SkyLaw
 from astropolcal.plotting import efficiency
-from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
+from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
 
 CHARIS = instruments.get("charis")
 
@@ -88,22 +88,6 @@ def test_without_a_derotator_the_sky_turns():
     inside = remove_optic(chain, "sky")
     (ax,) = plot_polarimetric_efficiency(inside, [1.2, 1.6] * u.um).axes
     assert ax.get_xlabel() == "wavelength (nm)"
-
-
-def test_offsets_are_those_of_the_table_with_the_best_marked():
-    offsets = np.array([90, 0, 45, 135, 60, 20]) * u.deg
-    chain, angles = CHARIS.on_sky(CHARIS.published()), ([60, 65] * u.deg, [-30, -20] * u.deg)
-    best = best_derotator(chain, CHARIS.wavelength, *angles, offsets=offsets)
-    figure = plot_derotator_offsets(best, title="A night")
-    (ax,) = figure.axes
-    mean, least, marked = ax.get_lines()
-    order = np.argsort(offsets)
-    np.testing.assert_allclose(mean.get_xdata(), offsets[order].value)
-    np.testing.assert_array_equal(mean.get_ydata(), best.table["mean"][order])
-    np.testing.assert_array_equal(least.get_ydata(), best.table["least"][order])
-    assert set(marked.get_xdata()) == {best.offset.value}
-    assert marked.get_label() == f"best offset, {best.offset.value:g}°"
-    assert (ax.get_xlabel(), figure.get_suptitle()) == ("derotator offset (deg)", "A night")
 
 
 def test_lines_of_the_efficiency():
