@@ -11,7 +11,7 @@ from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.calibration.uncertainty.refits import bootstrap, profile
 from astropolcal.calibration.validation.cross_validation import add_standard
 from astropolcal.calibration.validation.stars import fitted_stars, star_check
-from astropolcal.calibration.validation.targets import four_accuracies, target_accuracies
+from astropolcal.calibration.validation.targets import target_accuracies
 
 __all__ = [
     "Calibration",
@@ -23,7 +23,6 @@ __all__ = [
     "compare",
     "examine",
     "fitted_stars",
-    "four_accuracies",
     "profile",
     "propagate",
     "sample",

@@ -10,15 +10,11 @@ from astropy.table import QTable, Table
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.calibration import Calibration, calibrate, four_accuracies
+from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
 from astropolcal.calibration.validation import paper_accuracies, target_accuracy
-from astropolcal.calibration.validation.cross_validation import (
-    add_standard,
-    cross_validated_residuals,
-)
 from astropolcal.calibration.validation.targets import propagate_accuracy
-from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
+from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations.observables import get_observable
 
@@ -358,83 +354,3 @@ def test_nights_predict_each_other(make, chain, measurement):
         rms = [np.sqrt(np.mean(residuals[cal.measurement.bins[:96] == b] ** 2)) for b in range(3)]
         found = percent(cal.datasets[i].accuracy["s_cv"])
         np.testing.assert_allclose(found, 100 * np.array(rms), rtol=1e-4)
-
-
-# --- four accuracies ----------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def calibrated(chain, measurement):
-    return calibrate(chain, measurement.datasets[0].observations)
-
-
-def test_four_accuracies_side_by_side(make, chain, calibrated):
-    standard = make.observe(chain, wavelength=LAM, seed=8)
-    table = four_accuracies(calibrated, standard)
-    for column in ("s_res", "s_mean", "s_cv"):
-        np.testing.assert_array_equal(table[column], calibrated.accuracy[column])
-    new = calibrated.measurement_of(standard)
-    rms = [np.sqrt(np.mean(new.residuals()[new.bins == b] ** 2)) for b in range(3)]
-    np.testing.assert_allclose(percent(table["s_standard"]), 100 * np.array(rms))
-    # photon noise alone: an unseen dataset is as noisy as the fitted one
-    np.testing.assert_allclose(table["s_standard"] / table["s_res"], 1, atol=0.5)
-    assert table.meta["standard"] == "simulated"
-    # no standard gives nan
-    table = four_accuracies(calibrated)
-    assert np.isnan(table["s_standard"]).all()
-    assert table.meta["groups"] == "as in the calibration"
-
-
-def test_standard_may_be_a_measurement_at_some_wavelengths(make, chain, calibrated):
-    part = make.chain(wavelength=LAM[:2])
-    for name in ("hwp", "calibration_polarizer"):
-        for key in part[name].param_names:
-            setattr(part[name], key, getattr(chain[name], key).quantity)
-    m = Measurement(part, make.observe(part, wavelength=LAM[:2], seed=3))
-    found = percent(four_accuracies(calibrated, m)["s_standard"])
-    assert np.isfinite(found[:2]).all()
-    assert np.isnan(found[2])
-
-
-def test_standards_that_the_calibration_remembers_are_the_default(make, chain, measurement):
-    cal = calibrate(chain, measurement.datasets[0].observations)
-    table = add_standard(cal, chain, make.observe(chain, wavelength=LAM, seed=8, name="other"))
-    found = four_accuracies(cal)
-    np.testing.assert_allclose(found["s_standard"], table["s_standard"])
-    assert found.meta["standard"] == "other"
-    # a table from before the column existed
-    cal.datasets[0].accuracy.remove_column("s_standard")
-    assert np.isnan(four_accuracies(cal)["s_standard"]).all()
-
-
-def test_standard_that_was_fitted_is_refused(measurement, calibrated):
-    with pytest.raises(FitError, match="simulated is not an independent standard"):
-        four_accuracies(calibrated, measurement.datasets[0].observations)
-
-
-def test_cross_validation_by_chosen_groups(make, chain):
-    data = make.observe(chain, make.frames([45, 45, 80, 80, 110, 110] * u.deg), LAM, seed=1)
-    cal = calibrate(chain, data)
-    before = cal.accuracy["s_cv"].copy()
-    table = four_accuracies(cal, groups="cycle")
-    m = cal.measurement
-    held_out = cross_validated_residuals(m, groups=groups_by(m, "cycle"))
-    rms = [np.sqrt(np.mean(held_out[m.bins == b] ** 2)) for b in range(3)]
-    np.testing.assert_allclose(percent(table["s_cv"]), 100 * np.array(rms), rtol=1e-6)
-    assert table.meta["groups"] == "cycle"
-    np.testing.assert_array_equal(cal.accuracy["s_cv"], before)
-    given = four_accuracies(cal, groups=np.arange(m.n_data) % 4)
-    assert given.meta["groups"] == "as given"
-    assert np.isfinite(given["s_cv"]).all()
-
-
-def test_calibration_from_a_file_has_accuracies_but_no_data(tmp_path, make, chain, calibrated):
-    calibrated.write(tmp_path / "cal.asdf")
-    read = Calibration.read(tmp_path / "cal.asdf")
-    standard = make.observe(chain, wavelength=LAM, seed=8)
-    np.testing.assert_allclose(
-        percent(four_accuracies(read, standard)["s_standard"]),
-        percent(four_accuracies(calibrated, standard)["s_standard"]),
-    )
-    with pytest.raises(CalibrationFileError, match="holds no observations"):
-        four_accuracies(read, groups="cycle")

@@ -13,17 +13,11 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import settings_of, view_of_calibration, weights_of
-from astropolcal.calibration.noise.estimates import mean_of_known, rms
+from astropolcal.calibration.noise.estimates import mean_of_known
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
-from astropolcal.calibration.validation.cross_validation import (
-    accuracy_table,
-    add_percent,
-    held_out_residuals,
-    refuse_fitted,
-)
 from astropolcal.chain import leaves
-from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.files import columns
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
@@ -31,7 +25,7 @@ from astropolcal.stokes import angle_error
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
 
-__all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
+__all__ = ["paper_accuracies", "target_accuracies", "target_accuracy"]
 
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 # of a sum of products, relative to its terms
@@ -443,77 +437,3 @@ def _tables_of_kinds(calibration, column):
             mean = np.sqrt(mean_of_known(rows.T)) * u.percent
             tables[kind] = QTable({"wavelength": grid, column: mean})
     return tables
-
-
-# ---- four accuracies ------------------------------------------------------------------------
-
-
-def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
-    """
-    Return s_res, s_mean, s_cv and s_standard at each wavelength, side by side.
-
-    They answer four questions: how well the model follows the data it was fitted to; how well the
-    mean residual would be known, were residuals independent (the paper's s_rel); how well settings
-    left out of the fit are predicted; and how well a dataset is predicted that no fit has seen.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one that was read from a file has its data no more, so
-        ``groups`` cannot be chosen.
-    standard : Observations or Measurement, optional
-        The dataset the fit did not use: observations with the set-up of ``dataset``, or a
-        measurement with a chain of its own, at its current parameters. By default those that the
-        calibration remembers, see `~astropolcal.calibration.add_standard`.
-    dataset : int
-        Which dataset of the calibration.
-    groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
-        Cross-validate again by what makes a group, or by the group of each datum; by
-        default ``s_cv`` is what the calibration remembers (derotator angles).
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        Columns ``wavelength``, ``s_res``, ``s_mean``, ``s_cv``, ``s_standard``, in
-        percent; NaN where there is none. meta ``groups`` and ``standard``.
-
-    Raises
-    ------
-    FitError
-        If the standard was part of the fit, or groups are too few or have a single member.
-
-    Examples
-    --------
-    >>> from astropolcal.calibration import four_accuracies
-    >>> from astropolcal.testing import example_calibration
-    >>> standard = example_calibration(seed=3).measurement.datasets[0].observations
-    >>> four_accuracies(example_calibration(), standard).colnames
-    ['wavelength', 's_res', 's_mean', 's_cv', 's_standard']
-    """
-    record = calibration.datasets[dataset]
-    table = result = record.accuracy
-    if groups is not None:
-        held_out = held_out_residuals(calibration, groups)
-        if np.isnan(held_out).all():
-            raise FitError("the groups are too few for cross-validation")
-        live = calibration.measurement
-        result = accuracy_table(live, dataset, live.residuals(), held_out)
-    result = result["wavelength", "s_res", "s_mean", "s_cv"].copy()
-    unknown = np.full(len(table), np.nan) * u.percent
-    result["s_standard"] = table["s_standard"] if "s_standard" in table.colnames else unknown
-    known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
-    name = ", ".join(entry["name"] for entry in known) or None
-    if standard is not None:
-        measurement = standard
-        if not hasattr(standard, "datasets"):
-            measurement = calibration.measurement_of(standard, dataset)
-        for part in measurement.datasets:
-            refuse_fitted(calibration, part.observations)
-        name = ", ".join(part.observations.name for part in measurement.datasets)
-        residuals, own = measurement.residuals(), measurement.wavelength[measurement.bins]
-        grid = result["wavelength"].to_value(u.um)
-        near = (np.abs(own - lam) <= SAME_WAVELENGTH * lam for lam in grid)
-        add_percent(result, s_standard=[rms(residuals[one]) for one in near])
-    chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
-    result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
-    return result
