@@ -11,7 +11,6 @@ For example::
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
   astropolcal calibrate t1.ecsv t2.ecsv --own hwp.theta
-  astropolcal calibrate run.ecsv --follow "hwp.theta:Polynomial1D(1):time"
   astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
   astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
   astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
@@ -55,9 +54,6 @@ files FILE * Input  observation tables (ECSV)
 @ fix free
 --own NAME[=GROUP,...] ...  a parameter with a value of its own in each table, or in each group of
     tables, such as hwp.theta=july,july,october; all others are shared
---follow NAME:LAW:INPUTS[:SINCE] ...  let a parameter follow Polynomial1D(DEGREE) of an input, or
-    Polynomial2D(DEGREE) of two: time (zero on the first day of the tables, or SINCE), x, y,
-    wavelength or a stage, such as hwp.theta:Polynomial1D(1):time:2026-03-01
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
 --prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
@@ -111,7 +107,6 @@ def run(arguments):
     chains = instrument.chains_for(tables[:n], **exact, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in tables[n:]]
-    chains = common.follow_laws(chains, arguments.follow, datasets)
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     if arguments.start:
         edits["free"] = []
@@ -205,7 +200,7 @@ def _check_start(arguments):
     if not arguments.start:
         return
     # they would contradict what the old calibration holds
-    keys = ("fix", "prior", "without", "own", "follow", "exact", *common.MODEL)
+    keys = ("fix", "prior", "without", "own", "exact", *common.MODEL)
     given = [f"--{key}" for key in keys if getattr(arguments, key)]
     given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
     if given:

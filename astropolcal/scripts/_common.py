@@ -18,16 +18,15 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.modeling import models
 
 from astropolcal import instruments
-from astropolcal.chain import find_optic, follow, leaves, remove_optic
+from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError, warn
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import sky_angle
 from astropolcal.progress import clear
-from astropolcal.units import mjd_of, plain_number
+from astropolcal.units import plain_number
 from astropolcal.words import HEIGHT, WIDTH, counted, listed, shortened
 
 # the first bytes of files that may be taken for tables, and where they belong instead
@@ -514,9 +513,6 @@ def begins(path, mark):
 
 # ---- the model ------------------------------------------------------------------------------
 
-# what a typed law may be
-_LAWS = {"Polynomial1D": models.Polynomial1D, "Polynomial2D": models.Polynomial2D}
-
 
 def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     """
@@ -550,33 +546,6 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
         for parameter in _parameters(chains, name, f"--prior {text}"):
             parameter.prior = _normal(name, parameter, value)
             parameter.fixed = False
-    return chains
-
-
-def follow_laws(chains, texts, tables):
-    """
-    Return the chains in which parameters follow laws, each NAME:MODEL(DEGREE):INPUTS[:SINCE].
-
-    Time is zero on the first day of the tables where no date is given.
-    """
-    dated = [mjd_of(table.frames["time"]) for table in tables if "time" in table.frame_columns]
-    for text in texts:
-        # a time of day has colons too
-        match = re.fullmatch(r"([^:]+):(\w+)\((\d{1,2})\):([\w,]+)(?::(.+))?", text, re.ASCII)
-        model = match and _LAWS.get(match[2])
-        if not model or int(match[3]) < 1:
-            raise ParameterError(
-                f"--follow {text}: write NAME:MODEL(DEGREE):INPUTS[:SINCE], such as "
-                f"hwp.theta:Polynomial1D(1):time:2026-03-01; allowed are {' and '.join(_LAWS)}"
-            )
-        name, _, degree, of, since = match.groups()
-        law, of = model(int(degree)), of.split(",")
-        if "time" in of and not dated:
-            raise ParameterError(f"--follow {text}: no table has a column time")
-        if "time" in of and since is None:
-            since = np.floor(min(one.min() for one in dated))
-        add = partial(follow, name=name, model=law, of=of, since=since)
-        chains = _changed(chains, name.rpartition(".")[0], add)
     return chains
 
 

@@ -560,30 +560,20 @@ def nights(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_parameters_of_each_night_and_a_drift(nights, tmp_path):
+def test_parameters_of_each_night(nights, tmp_path):
     held = ["-q", "--fix", "derotator.theta=0", "--fix", "calibration_polarizer.theta"]
     out = tmp_path / "cal.asdf"
-    for options, name, value, tolerance in (
-        (["--own", "hwp.theta"], ("hwp_night10", "theta"), 0.5, 0.02),
-        (["--own", "hwp.theta=march,april"], ("hwp_april", "theta"), 0.5, 0.02),
-        (["--follow", "hwp.theta:Polynomial1D(1):time"], ("hwp", "theta_c1"), 0.05, 0.002),
-        (["--follow", "hwp.theta:Polynomial1D(1):time:61090"], ("hwp", "theta_c1"), 0.05, 0.002),
-    ):
-        assert main(["calibrate", *map(str, nights), *held, *options, "-o", str(out)]) == 0
+    for options, name in (("hwp.theta", "hwp_night10"), ("hwp.theta=march,april", "hwp_april")):
+        argv = ["calibrate", *map(str, nights), *held, "--own", options, "-o", str(out)]
+        assert main(argv) == 0
         found = {leaf.name: leaf for chain in Calibration.read(out).chains for leaf in chain}
-        seen = getattr(found[name[0]], name[1]).value
         # only the turn between the nights is known
-        seen -= found["hwp"].theta.value if name[0] != "hwp" else 0
-        assert seen == pytest.approx(value, abs=tolerance)
+        seen = found[name].theta.value - found["hwp"].theta.value
+        assert seen == pytest.approx(0.5, abs=0.02)
 
 
-def test_laws_and_groups_that_do_not_fit_get_one_line(nights, capsys):
+def test_groups_that_do_not_fit_get_one_line(nights, capsys):
     for options, words in (
-        (["--follow", "hwp.theta:__import__('os')(1):time"], "write NAME:MODEL"),
-        (["--follow", "hwp.theta:Gaussian1D(1):time"], "allowed are Polynomial1D and Polynomial2D"),
-        (["--follow", "hwq.theta:Polynomial1D(1):time"], "did you mean 'hwp'"),
-        (["--follow", "hwp.theta:Polynomial2D(1):time"], "Polynomial2D has 2 inputs"),
-        (["--follow", "hwp.theta:Polynomial1D(1):time:soon"], "is not a date"),
         (["--own", "hwp.thetta"], "did you mean 'hwp.theta'"),
         (["--own", "hwp.theta=march"], "has 1 group for 2 datasets"),
         (["--own", "hwp.theta=march,"], "--own hwp.theta=...: each group needs a name"),
@@ -591,6 +581,3 @@ def test_laws_and_groups_that_do_not_fit_get_one_line(nights, capsys):
         (["--own", "hwp.theta", "--start", "old.asdf"], "--own cannot be combined with --start"),
     ):
         assert words in complaint(capsys, *nights, *options)
-    # the packaged example has no times
-    line = complaint(capsys, "--follow", "hwp.theta:Polynomial1D(1):time")
-    assert "no table has a column time" in line
