@@ -10,7 +10,7 @@ from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.noise.scatter import what_is_left_out
 from astropolcal.calibration.validation import paper_accuracies
 from astropolcal.calibration.validation.targets import TARGETS
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import ObservationError
 from astropolcal.plotting import _style as st
 
 __all__ = ["plot_accuracy", "plot_star_check", "plot_target_accuracy"]
@@ -23,11 +23,10 @@ _CURVES = {
 }
 # what a standard of another source is compared with
 _COMPARED = "s_cv of the data that were fitted, for comparison"
-_DASHES = ("--", ":", "-.")
 _PREDICTED = "s_standard: rms error when predicting {}, which was not fitted"
 
 
-def plot_accuracy(calibration, reference=None, *, figure=None):
+def plot_accuracy(calibration, *, figure=None):
     """
     Draw the accuracies of a calibration against wavelength, one panel per dataset.
 
@@ -40,20 +39,12 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     ----------
     calibration : Calibration
         The calibration; one read from a file will do.
-    reference : dict of str to (`~astropy.units.Quantity`, `~astropy.units.Quantity`), optional
-        Curves to compare with: label to wavelengths and accuracies, the
-        latter with a unit (``u.percent``, or dimensionless).
     figure : `~matplotlib.figure.Figure`, optional
         An empty figure to draw into.
 
     Returns
     -------
     `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If a reference has other units or shapes.
 
     Notes
     -----
@@ -63,22 +54,18 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
 
     Examples
     --------
-    >>> import astropy.units as u
     >>> from astropolcal.plotting import plot_accuracy
     >>> from astropolcal.testing import example_calibration
-    >>> cal = example_calibration()
-    >>> goal = {"goal": ([1200, 2300] * u.nm, [0.1, 0.1] * u.percent)}
-    >>> plot_accuracy(cal, goal).axes[0].get_ylabel()
+    >>> plot_accuracy(example_calibration()).axes[0].get_ylabel()
     'accuracy (% of polarization)'
     """
-    curves = {label: _reference(label, pair) for label, pair in (reference or {}).items()}
     records, standards = calibration.datasets, calibration.fit.get("standards", [])
     sources = {record.source for record in records}
     # a standard of a source that was not fitted has no panel to be drawn into
     others = [entry for entry in standards if entry["source"] not in sources]
     count = len(records) + len(others)
     grids = [r.accuracy for r in records] + [entry["wavelength_nm"] for entry in standards]
-    one_panel = len(records) > 1 and not curves and all(len(lam) == 1 for lam in grids)
+    one_panel = len(records) > 1 and all(len(lam) == 1 for lam in grids)
     size = (max(8.5, 2.5 + 0.6 * len(grids)), 7.0) if one_panel else (8.5, 2.4 + 3.6 * count)
     with st.canvas(figure, *size) as figure:
         # one scale, so that datasets can be compared by eye
@@ -87,13 +74,12 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
         if one_panel:
             _draw_side_by_side(panels[0], calibration, records, standards)
         else:
-            _draw_panels(panels, calibration, records, standards, others, curves)
+            _draw_panels(panels, calibration, records, standards, others)
             st.wavelength_label(panels[-1])
         for axes in panels:
             axes.set_ylabel("accuracy (% of polarization)")
         values = [record.accuracy[key].to_value(u.percent) for record in records for key in _CURVES]
         values += [np.array(entry["s_standard_percent"]) for entry in standards]
-        values += [value for _, value in curves.values()]
         st.scale_axis(panels[0], np.concatenate(values))
         st.heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
         # by label, for the curves of all panels look alike and share one legend
@@ -101,7 +87,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     return figure
 
 
-def _draw_panels(panels, calibration, records, standards, others, curves):
+def _draw_panels(panels, calibration, records, standards, others):
     """Draw the accuracies of the datasets, then of what was not fitted, over the wavelength."""
     for axes, record in zip(panels, records, strict=False):
         name = f"{record.name}\n" if len(panels) > 1 else ""
@@ -126,29 +112,11 @@ def _draw_panels(panels, calibration, records, standards, others, curves):
         axes.set_title(f"{entry['name']}\nn = {_span(entry['n'])} data per wavelength, predicted")
         look = {"color": st.GREEN, "alpha": 0.6, "label": _COMPARED}
         st.draw_line(axes, entry["wavelength_nm"], entry["s_cv_percent"], **look)
-    for axes in panels:
-        for (label, (lam, value)), line in zip(curves.items(), cycle(_DASHES), strict=False):
-            st.draw_line(axes, lam, value, color=st.BLACK, linestyle=line, label=label)
 
 
 def _label(key, values, calibration):
     label = _CURVES[key][2].format(what_is_left_out(calibration))
     return label if np.isfinite(values).any() else f"{key}: not known (too few data or groups)"
-
-
-def _reference(label, pair):
-    """Return a reference curve in nm and percent."""
-    try:
-        wavelength, accuracy = pair
-        lam, value = st.nanometres(wavelength), np.atleast_1d(accuracy.to_value(u.percent))
-        if lam.shape != value.shape:
-            raise ValueError(f"it has {lam.size} wavelengths but {value.size} accuracies")
-    except (AttributeError, TypeError, ValueError, u.UnitConversionError) as error:
-        raise ParameterError(
-            f"reference {label!r} must be a pair (wavelength, accuracy) of quantities, "
-            f"the second in percent: {error}"
-        ) from None
-    return lam, value
 
 
 def _draw_side_by_side(axes, calibration, records, standards):

@@ -16,8 +16,6 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting import plot_accuracy, plot_star_check, plot_target_accuracy
 
-PUBLISHED = {"goal": ([1200, 2200] * u.nm, [0.1, 0.001] * u.percent)}
-
 
 def lines(axes):
     return {line.get_label().split(" ")[0].rstrip(":"): line for line in axes.lines}
@@ -56,16 +54,6 @@ def test_legend_defines_every_curve_outside_the_axes(elliptical, single_angle):
     cycles = replace(elliptical, fit=elliptical.fit | {"groups": "cycle"})
     texts = [text.get_text() for text in plot_accuracy(cycles).legends[0].get_texts()]
     assert "half-wave-plate cycles left out" in texts[2]
-
-
-def test_reference_curves_and_logarithmic_axis(elliptical):
-    (axes,) = plot_accuracy(elliptical, PUBLISHED).axes
-    reference = lines(axes)["goal"]
-    np.testing.assert_allclose(reference.get_ydata(), [0.1, 0.001])
-    assert axes.get_yscale() == "log"
-    low, high = axes.get_ylim()
-    assert low < 0.001
-    assert high > elliptical.accuracy["s_res"].value.max()
 
 
 def test_one_panel_a_dataset(several):
@@ -127,21 +115,6 @@ def test_standard_of_another_source_has_its_own_panel(elliptical):
     drawn = {line.get_label().split(" ")[0].rstrip(":"): line for line in second.lines}
     assert list(drawn) == ["s_standard", "s_cv"]
     np.testing.assert_allclose(drawn["s_cv"].get_ydata(), 0.1)
-
-
-def test_reference_without_units_or_of_other_length_is_refused(elliptical):
-    for curve in [
-        ([1200, 2200] * u.nm, [0.1, 0.2]),
-        ([1200, 2200] * u.nm, [0.1, 0.2] * u.deg),
-        ([1200, 2200], [0.1, 0.2] * u.percent),
-        ([1200, 2200] * u.nm,),
-        None,
-    ]:
-        with pytest.raises(ParameterError, match="reference 'mine' must be a pair"):
-            plot_accuracy(elliptical, {"mine": curve})
-    curve = ([1200, 1500, 2200] * u.nm, [0.1, 0.2] * u.percent)
-    with pytest.raises(ParameterError, match="3 wavelengths but 2 accuracies"):
-        plot_accuracy(elliptical, {"mine": curve})
 
 
 def test_datasets_of_one_wavelength_share_a_panel(several):
